@@ -1,0 +1,25 @@
+"""Exceptions whose text tells the user what is wrong and what to do."""
+
+
+class MapperError(Exception):
+    """Base of all errors that are the user's to mend; shown without a traceback."""
+
+
+class ParameterError(MapperError):
+    """A parameter is unknown, of the wrong type or out of range."""
+
+
+class BagError(MapperError):
+    """A bag is missing, damaged, or lacks what mapping needs."""
+
+
+class InputError(MapperError):
+    """The messages were read, but no map can be made from them."""
+
+
+class OutputError(MapperError):
+    """A result cannot be written."""
+
+
+class Cancelled(MapperError):
+    """The work was stopped on request; nothing was changed."""

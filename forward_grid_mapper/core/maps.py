@@ -1,0 +1,53 @@
+"""What mapping returns: three maps on one grid, and how they came about."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .grid import Grid
+from .parameters import Parameters
+from .readings import Readings
+
+UNKNOWN = -1
+
+
+@dataclass(frozen=True)
+class MapSet:
+    """The three maps of one set of readings. Arrays have shape `grid.shape`; row 0 has the smallest y.
+
+    Attributes
+    ----------
+    grid : Grid
+    live : float32
+        Occupancy probability of the standard log-odds map, NaN where no reading says anything.
+    ml : int8
+        Maximum likelihood map: 0 free, 1 occupied, -1 not observed.
+    uncertainty : float32
+        The α-mixed marginals of eq 45, NaN where not observed.
+    readings : Readings
+        The readings that the maps explain.
+    unexplained : bool, shape (N,)
+        Readings whose most likely cause, given the ML map, is chance (eq 12's e_* above one half).
+    log_likelihood : float
+        log p(Z | ml) in nats.
+    objective : float
+        The log-likelihood plus the log prior odds of the occupied cells.
+    parameters : Parameters
+    statistics : dict
+        Plain numbers about the run: pairs, flips, shifts, sweeps, converged, seconds by stage.
+    """
+
+    grid: Grid
+    live: NDArray[np.float32]
+    ml: NDArray[np.int8]
+    uncertainty: NDArray[np.float32]
+    readings: Readings
+    unexplained: NDArray[np.bool_]
+    log_likelihood: float
+    objective: float
+    parameters: Parameters
+    statistics: dict[str, Any] = field(default_factory=dict)

@@ -1,0 +1,285 @@
+"""The parameter table: every name, default, unit, range and help text, once.
+
+The dataclasses below are the table. The YAML file, the command line, the ROS parameters and `docs/parameters.md` are
+made from `TABLE`, which is read off their fields.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, get_type_hints
+
+from .errors import ParameterError
+
+
+def _param(
+    default: Any,
+    help: str,
+    unit: str = '',
+    low: float = -math.inf,
+    high: float = math.inf,
+    choices: tuple[str, ...] = (),
+) -> Any:
+    return dataclasses.field(
+        default=default, metadata={'help': help, 'unit': unit, 'low': low, 'high': high, 'choices': choices}
+    )
+
+
+@dataclass(frozen=True)
+class PlacingParameters:
+    """From messages to readings in the map frame."""
+
+    max_pose_gap: float = _param(
+        1.0,
+        'Longest gap between two odometry messages that is bridged; readings in a longer one are rejected.',
+        's',
+        0.001,
+        60.0,
+    )
+    pose_timeout: float = _param(
+        2.0,
+        'How long, in message time, a reading waits for odometry after its stamp; keep it above max_pose_gap.',
+        's',
+        0.01,
+        600.0,
+    )
+    over_range: str = _param(
+        'no_echo',
+        'What +inf and ranges at or beyond max_range mean: no echo within max_range (informative), or nothing.',
+        choices=('no_echo', 'discard'),
+    )
+    field_of_view: float = _param(
+        0.0, "Full cone angle used instead of the messages'; 0 takes theirs.", 'rad', 0.0, 3.1
+    )
+    max_range: float = _param(
+        0.0, "Largest range used instead of the messages'; 0 takes theirs.", 'm', 0.0, 1000.0
+    )
+
+
+@dataclass(frozen=True)
+class GridParameters:
+    """The lattice of cells; its extent follows the readings."""
+
+    resolution: float = _param(0.1, 'Edge length of a cell.', 'm', 0.005, 2.0)
+    max_cells: int = _param(
+        50_000_000,
+        'Bound on the cells of a map; a reading that would make the grid larger is rejected.',
+        'cells',
+        10_000,
+        1_000_000_000,
+    )
+
+
+@dataclass(frozen=True)
+class ModelParameters:
+    """The forward sensor model (ALGORITHM: eq 20-24 of the paper, and lost echoes)."""
+
+    p_hit: float = _param(
+        0.9, 'Probability that an occupied cell in the cone returns the echo.', 'probability', 0.01, 0.98
+    )
+    p_rand: float = _param(
+        0.05, 'Probability that a reading is random, whatever the map.', 'probability', 1e-4, 0.9
+    )
+    p_lost: float = _param(
+        0.0,
+        "Probability that an echo is lost and the sensor reports no echo, whatever the map; 0 is the paper's model.",
+        'probability',
+        0.0,
+        0.9,
+    )
+    sigma: float = _param(
+        0.05,
+        'Standard deviation of a range where the message states none; never below half a cell.',
+        'm',
+        0.001,
+        5.0,
+    )
+    cut: float = _param(5.0, 'The noise density is cut off at this many sigma.', 'sigma', 3.0, 40.0)
+    cell_distance: str = _param(
+        'center',
+        'Distance from the sensor to a cell: to its center or to its nearest point.',
+        choices=('center', 'nearest'),
+    )
+
+
+@dataclass(frozen=True)
+class SearchParameters:
+    """The search for the maximum likelihood map, and its uncertainty."""
+
+    prior: float = _param(
+        0.5,
+        "Prior probability that a cell is occupied; 0.5 is the paper's plain maximum likelihood, less thins walls and removes dots.",
+        'probability',
+        1e-6,
+        0.999999,
+    )
+    shift_moves: bool = _param(
+        True, 'Also try to move an occupied cell to a neighbouring one in a single step.'
+    )
+    max_sweeps: int = _param(
+        200, 'Bound on the sweeps over the map; the search says when it was reached.', 'sweeps', 1, 100_000
+    )
+    alpha: float = _param(
+        0.5,
+        'Weight of the evidence in the uncertainty map (eq 45); 0 leaves only the prior, 1 trusts the one map found.',
+        '',
+        0.0,
+        1.0,
+    )
+    uncertainty_prior: float = _param(
+        0.5, 'Prior occupancy used in the uncertainty map.', 'probability', 1e-6, 0.999999
+    )
+
+
+@dataclass(frozen=True)
+class LiveMapParameters:
+    """The standard log-odds map (eq 1-4), updated reading by reading."""
+
+    live_p_occupied: float = _param(
+        0.7,
+        'Occupancy of the cells on the axis at the measured range, given one reading.',
+        'probability',
+        0.5,
+        0.999,
+    )
+    live_p_free: float = _param(
+        0.3,
+        'Occupancy of the cells on the axis before the measured range, given one reading.',
+        'probability',
+        0.001,
+        0.5,
+    )
+    live_p_free_no_echo: float = _param(
+        0.4, 'The same for a reading without echo.', 'probability', 0.001, 0.5
+    )
+    live_depth: float = _param(
+        0.1, 'Half the depth of the arc that an echo marks as occupied.', 'm', 0.001, 5.0
+    )
+    live_limit: float = _param(
+        5.0, 'Bound on the log-odds of a cell, so that the map can still change.', 'log-odds', 0.1, 100.0
+    )
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One row of the table; `low` and `high` are infinite where there is no bound."""
+
+    name: str
+    group: str
+    type: type
+    default: Any
+    unit: str
+    low: float
+    high: float
+    choices: tuple[str, ...]
+    help: str
+
+    @property
+    def range(self) -> str:
+        """The admitted values, for people."""
+        if self.choices:
+            return ' | '.join(self.choices)
+        if self.type is bool:
+            return 'true | false'
+        return f'{self.low:g} … {self.high:g}'
+
+    def check(self, value: Any) -> Any:
+        """Return `value` as this parameter's type.
+
+        Raises
+        ------
+        ParameterError
+            If it has the wrong type or is out of range.
+        """
+        wanted = {float: 'a number', int: 'a whole number', bool: 'true or false', str: 'a word'}[self.type]
+        if self.type is float and isinstance(value, int) and not isinstance(value, bool):
+            value = float(value)
+        if type(value) is not self.type:
+            raise ParameterError(
+                f'{self.name}: {value!r} is not {wanted}; admitted: {self.range} {self.unit}'.rstrip()
+            )
+        if self.choices and value not in self.choices:
+            raise ParameterError(f'{self.name}: {value!r} is not one of {", ".join(self.choices)}')
+        if self.type in (int, float) and not self.low <= value <= self.high:
+            raise ParameterError(
+                f'{self.name}: {value!r} is out of range; admitted: {self.range} {self.unit}'.rstrip()
+            )
+        return value
+
+
+@dataclass(frozen=True)
+class Parameters:
+    """All parameters, in groups."""
+
+    placing: PlacingParameters = PlacingParameters()
+    grid: GridParameters = GridParameters()
+    model: ModelParameters = ModelParameters()
+    search: SearchParameters = SearchParameters()
+    live: LiveMapParameters = LiveMapParameters()
+
+    @classmethod
+    def from_flat(cls, values: Mapping[str, Any], base: Parameters | None = None) -> Parameters:
+        """Return `base` (the defaults, unless given) with the named values changed.
+
+        Raises
+        ------
+        ParameterError
+            For an unknown name, a wrong type or a value out of range.
+        """
+        changes: dict[str, dict[str, Any]] = {}
+        for name, value in values.items():
+            row = find(name)
+            changes.setdefault(row.group, {})[name] = row.check(value)
+        base = base or cls()
+        return dataclasses.replace(
+            base,
+            **{
+                group: dataclasses.replace(getattr(base, group), **change)
+                for group, change in changes.items()
+            },
+        )
+
+    def flat(self) -> dict[str, Any]:
+        """Return every value by name, in the table's order."""
+        return {row.name: getattr(getattr(self, row.group), row.name) for row in TABLE}
+
+
+def _read_table() -> tuple[Parameter, ...]:
+    rows = []
+    for group in dataclasses.fields(Parameters):
+        kind = type(group.default)
+        hints = get_type_hints(kind)
+        for field in dataclasses.fields(kind):
+            rows.append(
+                Parameter(
+                    name=field.name,
+                    group=group.name,
+                    type=hints[field.name],
+                    default=field.default,
+                    **field.metadata,
+                )
+            )
+    return tuple(rows)
+
+
+TABLE = _read_table()
+_BY_NAME = {row.name: row for row in TABLE}
+
+
+def find(name: str) -> Parameter:
+    """Return the row of the table called `name`.
+
+    Raises
+    ------
+    ParameterError
+        If there is none; names the nearest ones.
+    """
+    if name in _BY_NAME:
+        return _BY_NAME[name]
+    near = difflib.get_close_matches(name, _BY_NAME, n=3, cutoff=0.5)
+    hint = f'did you mean {" or ".join(near)}?' if near else f'there are: {", ".join(_BY_NAME)}'
+    raise ParameterError(f'no parameter is called {name!r}; {hint}')
