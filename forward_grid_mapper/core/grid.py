@@ -54,9 +54,7 @@ class Grid:
         x, y = self.origin
         return x, x + self.width * self.resolution, y, y + self.height * self.resolution
 
-    def cells_of(
-        self, x: NDArray[np.float64], y: NDArray[np.float64]
-    ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    def cells_of(self, x: NDArray[np.float64], y: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Return (rows, columns) in this grid of points in metres; they may lie outside."""
         rows = np.floor(np.asarray(y) / self.resolution).astype(np.int64) - self.row
         columns = np.floor(np.asarray(x) / self.resolution).astype(np.int64) - self.column
@@ -64,8 +62,8 @@ class Grid:
 
     def centers(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the x of each column and the y of each row in metres."""
-        x = (self.column + np.arange(self.width) + 0.5) * self.resolution
-        y = (self.row + np.arange(self.height) + 0.5) * self.resolution
+        x: NDArray[np.float64] = (self.column + np.arange(self.width) + 0.5) * self.resolution
+        y: NDArray[np.float64] = (self.row + np.arange(self.height) + 0.5) * self.resolution
         return x, y
 
     def union(self, other: Grid) -> Grid:

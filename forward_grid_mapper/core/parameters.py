@@ -55,9 +55,7 @@ class PlacingParameters:
     field_of_view: float = _param(
         0.0, "Full cone angle used instead of the messages'; 0 takes theirs.", 'rad', 0.0, 3.1
     )
-    max_range: float = _param(
-        0.0, "Largest range used instead of the messages'; 0 takes theirs.", 'm', 0.0, 1000.0
-    )
+    max_range: float = _param(0.0, "Largest range used instead of the messages'; 0 takes theirs.", 'm', 0.0, 1000.0)
 
 
 @dataclass(frozen=True)
@@ -81,9 +79,7 @@ class ModelParameters:
     p_hit: float = _param(
         0.9, 'Probability that an occupied cell in the cone returns the echo.', 'probability', 0.01, 0.98
     )
-    p_rand: float = _param(
-        0.05, 'Probability that a reading is random, whatever the map.', 'probability', 1e-4, 0.9
-    )
+    p_rand: float = _param(0.05, 'Probability that a reading is random, whatever the map.', 'probability', 1e-4, 0.9)
     p_lost: float = _param(
         0.0,
         "Probability that an echo is lost and the sensor reports no echo, whatever the map; 0 is the paper's model.",
@@ -112,14 +108,12 @@ class SearchParameters:
 
     prior: float = _param(
         0.5,
-        "Prior probability that a cell is occupied; 0.5 is the paper's plain maximum likelihood, less thins walls and removes dots.",
+        "Prior probability of an occupied cell; 0.5 is the paper's plain ML, less removes dots and thins walls.",
         'probability',
         1e-6,
         0.999999,
     )
-    shift_moves: bool = _param(
-        True, 'Also try to move an occupied cell to a neighbouring one in a single step.'
-    )
+    shift_moves: bool = _param(True, 'Also try to move an occupied cell to a neighbouring one in a single step.')
     max_sweeps: int = _param(
         200, 'Bound on the sweeps over the map; the search says when it was reached.', 'sweeps', 1, 100_000
     )
@@ -153,12 +147,8 @@ class LiveMapParameters:
         0.001,
         0.5,
     )
-    live_p_free_no_echo: float = _param(
-        0.4, 'The same for a reading without echo.', 'probability', 0.001, 0.5
-    )
-    live_depth: float = _param(
-        0.1, 'Half the depth of the arc that an echo marks as occupied.', 'm', 0.001, 5.0
-    )
+    live_p_free_no_echo: float = _param(0.4, 'The same for a reading without echo.', 'probability', 0.001, 0.5)
+    live_depth: float = _param(0.1, 'Half the depth of the arc that an echo marks as occupied.', 'm', 0.001, 5.0)
     live_limit: float = _param(
         5.0, 'Bound on the log-odds of a cell, so that the map can still change.', 'log-odds', 0.1, 100.0
     )
@@ -199,15 +189,11 @@ class Parameter:
         if self.type is float and isinstance(value, int) and not isinstance(value, bool):
             value = float(value)
         if type(value) is not self.type:
-            raise ParameterError(
-                f'{self.name}: {value!r} is not {wanted}; admitted: {self.range} {self.unit}'.rstrip()
-            )
+            raise ParameterError(f'{self.name}: {value!r} is not {wanted}; admitted: {self.range} {self.unit}'.rstrip())
         if self.choices and value not in self.choices:
             raise ParameterError(f'{self.name}: {value!r} is not one of {", ".join(self.choices)}')
-        if self.type in (int, float) and not self.low <= value <= self.high:
-            raise ParameterError(
-                f'{self.name}: {value!r} is out of range; admitted: {self.range} {self.unit}'.rstrip()
-            )
+        if isinstance(value, (int, float)) and not self.low <= value <= self.high:
+            raise ParameterError(f'{self.name}: {value!r} is out of range; admitted: {self.range} {self.unit}'.rstrip())
         return value
 
 
@@ -237,10 +223,7 @@ class Parameters:
         base = base or cls()
         return dataclasses.replace(
             base,
-            **{
-                group: dataclasses.replace(getattr(base, group), **change)
-                for group, change in changes.items()
-            },
+            **{group: dataclasses.replace(getattr(base, group), **change) for group, change in changes.items()},
         )
 
     def flat(self) -> dict[str, Any]:
@@ -251,7 +234,7 @@ class Parameters:
 def _read_table() -> tuple[Parameter, ...]:
     rows = []
     for group in dataclasses.fields(Parameters):
-        kind = type(group.default)
+        kind: Any = type(group.default)
         hints = get_type_hints(kind)
         for field in dataclasses.fields(kind):
             rows.append(

@@ -86,9 +86,7 @@ class Readings:
 class ReadingBuffer:
     """Append-only columns that double their room as they fill; 68 bytes a reading."""
 
-    _TYPES = {
-        f.name: np.float64 for f in fields(Readings) if f.name not in ('stamp', 'sensor', 'sensor_names')
-    } | {
+    _TYPES = {f.name: np.float64 for f in fields(Readings) if f.name not in ('stamp', 'sensor', 'sensor_names')} | {
         'stamp': np.int64,
         'sensor': np.int32,
     }
