@@ -62,8 +62,8 @@ class Grid:
 
     def centers(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the x of each column and the y of each row in metres."""
-        x: NDArray[np.float64] = (self.column + np.arange(self.width) + 0.5) * self.resolution
-        y: NDArray[np.float64] = (self.row + np.arange(self.height) + 0.5) * self.resolution
+        x = np.multiply(self.column + 0.5 + np.arange(self.width), self.resolution, dtype=np.float64)
+        y = np.multiply(self.row + 0.5 + np.arange(self.height), self.resolution, dtype=np.float64)
         return x, y
 
     def union(self, other: Grid) -> Grid:

@@ -1,0 +1,105 @@
+"""The geometry of one cone on the lattice: which cells belong to a reading, and how far away they are.
+
+A cell belongs to a cone if its centre lies within the half angle of the axis and within reach. Near the sensor a thin
+cone has no centre in it at all, so the cells that the axis crosses belong too (ALGORITHM §2). In every row of the
+lattice each of the two kinds forms one run, which is found without testing cells one by one.
+
+All lengths here are in cells, relative to the grid's lower left corner.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+from .jit import kernel
+
+
+class Cone(NamedTuple):
+    """A circular sector: apex `x`, `y`, radius `reach`, unit vectors of its axis and its two edges, row limits."""
+
+    x: float
+    y: float
+    reach: float
+    axis_x: float
+    axis_y: float
+    right_x: float
+    right_y: float
+    left_x: float
+    left_y: float
+    bottom: int
+    top: int
+
+
+@kernel
+def make_cone(x: float, y: float, yaw: float, half_angle: float, reach: float) -> Cone:
+    """Return the sector of a reading; `half_angle` in (0, π/2)."""
+    right_x, right_y = math.cos(yaw - half_angle), math.sin(yaw - half_angle)
+    left_x, left_y = math.cos(yaw + half_angle), math.sin(yaw + half_angle)
+    cos_half = math.cos(half_angle)
+    top = 1.0 if math.sin(yaw) >= cos_half else max(0.0, right_y, left_y)
+    bottom = -1.0 if -math.sin(yaw) >= cos_half else min(0.0, right_y, left_y)
+    return Cone(
+        x,
+        y,
+        reach,
+        math.cos(yaw),
+        math.sin(yaw),
+        right_x,
+        right_y,
+        left_x,
+        left_y,
+        int(math.floor(y + reach * bottom)),
+        int(math.floor(y + reach * top)),
+    )
+
+
+@kernel
+def _clip(a: float, b: float, low: float, high: float) -> tuple[float, float]:
+    """Clip [low, high] to the u with a * u + b >= 0."""
+    if a > 0.0:
+        return max(low, -b / a), high
+    if a < 0.0:
+        return low, min(high, -b / a)
+    if b < 0.0:
+        return 1.0, 0.0
+    return low, high
+
+
+@kernel
+def wedge_run(cone: Cone, row: int) -> tuple[int, int]:
+    """Return the first and last column of a row whose cell centres lie in the sector; last < first if none does."""
+    v = row + 0.5 - cone.y
+    chord = cone.reach * cone.reach - v * v
+    if chord < 0.0:
+        return 0, -1
+    high = math.sqrt(chord)
+    low, high = _clip(-cone.right_y, cone.right_x * v, -high, high)
+    low, high = _clip(cone.left_y, -cone.left_x * v, low, high)
+    if low > high:
+        return 0, -1
+    return int(math.ceil(low + cone.x - 0.5)), int(math.floor(high + cone.x - 0.5))
+
+
+@kernel
+def axis_run(cone: Cone, row: int) -> tuple[int, int]:
+    """Return the first and last column of a row that the axis crosses; last < first if it crosses none."""
+    begin, end = 0.0, cone.reach
+    if abs(cone.axis_y) > 1e-12:
+        a, b = (row - cone.y) / cone.axis_y, (row + 1 - cone.y) / cone.axis_y
+        begin, end = max(begin, min(a, b)), min(end, max(a, b))
+    elif not row <= cone.y < row + 1:
+        return 0, -1
+    if begin > end:
+        return 0, -1
+    a, b = cone.x + begin * cone.axis_x, cone.x + end * cone.axis_x
+    return int(math.floor(min(a, b))), int(math.floor(max(a, b)))
+
+
+@kernel
+def distance(du: float, dv: float, nearest: bool) -> float:
+    """Return the distance to a cell whose centre is (du, dv) away: to its centre or to its nearest point."""
+    if nearest:
+        du = max(abs(du) - 0.5, 0.0)
+        dv = max(abs(dv) - 0.5, 0.0)
+    return math.sqrt(du * du + dv * dv)

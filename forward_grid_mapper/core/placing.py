@@ -1,0 +1,302 @@
+"""Placing of readings: messages in any interleaving → readings in the map frame, every rejection counted by reason.
+
+One `Placer` serves the offline tool and the node. It decides by message stamps alone, never by a clock, so the same
+messages give the same readings however fast they arrive.
+"""
+
+from __future__ import annotations
+
+import heapq
+import math
+from bisect import bisect_left
+from collections import Counter
+from collections.abc import Callable
+
+from .messages import NANOSECONDS, OdometryMessage, Pose2, RangeMessage
+from .parameters import Parameters, PlacingParameters
+from .readings import ReadingBuffer, Readings
+
+MountLookup = Callable[[str, str, int], Pose2 | None]
+"""(base frame, sensor frame, stamp in nanoseconds) → pose of the sensor in the base frame, or None if unknown."""
+
+REASONS = {
+    'nan_range': 'the range is not a number',
+    'too_near': 'the range is -inf: something too near to measure',
+    'below_min_range': 'the range is below min_range',
+    'over_range': 'no echo, and over_range is "discard"',
+    'bad_limits': 'min_range or max_range is negative, not finite, or max_range is not above min_range',
+    'bad_field_of_view': 'the field of view is not between 0 and 180 degrees; parameter field_of_view overrides it',
+    'empty_frame_id': 'the header has no frame_id, so the sensor is unknown',
+    'unknown_mount': 'nothing tells where this frame is on the robot: give --sensor, a YAML or a transform',
+    'before_odometry': 'the stamp is before the first odometry, or the message came more than 10 s late',
+    'after_odometry': 'the recording ended before odometry reached the stamp',
+    'no_odometry': 'odometry did not reach the stamp within pose_timeout',
+    'pose_gap': 'odometry has a gap longer than max_pose_gap here',
+    'time_jump': 'the clock jumped back while the reading waited for its pose',
+    'too_many_waiting': 'too many readings waited for odometry at once',
+    'too_far_away': 'the map would have more than max_cells cells; is the pose right?',
+    'paused': 'the mapper was paused',
+}
+"""Why a reading is rejected, in words."""
+
+ODOMETRY_REASONS = {
+    'bad_pose': 'the pose is not finite or its quaternion is not normalised',
+    'other_frame': 'the frame_id or child_frame_id differs from that of the first odometry message',
+}
+"""Why an odometry message is rejected, in words."""
+
+HISTORY = 10 * NANOSECONDS
+"""Odometry older than this, relative to the newest, is forgotten: Range messages are late by less."""
+
+JUMP = NANOSECONDS
+"""Odometry older than the newest by more than this means that the clock jumped back, not that messages overtook."""
+
+MOST_WAITING = 100_000
+"""Readings that may wait for odometry at once, so that memory stays bounded without any."""
+
+
+def interpolate(before: Pose2, after: Pose2, fraction: float) -> Pose2:
+    """Return the pose at `fraction` of the way: position linear, yaw by the shortest way."""
+    turn = math.remainder(after.yaw - before.yaw, 2 * math.pi)
+    return Pose2(
+        before.x + fraction * (after.x - before.x),
+        before.y + fraction * (after.y - before.y),
+        before.yaw + fraction * turn,
+    )
+
+
+class _Measurement:
+    """A Range that passed REP 117: what it says, before it is placed. Order is that of stamps, then of arrival."""
+
+    __slots__ = ('frame_id', 'half_angle', 'number', 'sigma', 'stamp', 'z', 'z_max')
+
+    def __init__(self, message: RangeMessage, z: float, z_max: float, half_angle: float, sigma: float) -> None:
+        self.stamp, self.frame_id = message.stamp, message.frame_id
+        self.z, self.z_max, self.half_angle, self.sigma = z, z_max, half_angle, sigma
+        self.number = 0
+
+    def __lt__(self, other: _Measurement) -> bool:
+        return (self.stamp, self.number) < (other.stamp, other.number)
+
+
+def measure(message: RangeMessage, parameters: PlacingParameters) -> _Measurement | str:
+    """Apply REP 117 and the overrides to one Range message; return what it says, or the reason of its rejection.
+
+    A fixed-distance ranger (min_range = max_range) answers -inf for "something within max_range" and +inf for
+    "nothing". The former says no more than that the range lies in (0, max_range), and is taken as half of it with a
+    σ of one twelfth, which spans most of the interval at ±5 σ.
+    """
+    if not message.frame_id:
+        return 'empty_frame_id'
+    angle = parameters.field_of_view or message.field_of_view
+    if not 0.0 < angle < math.pi:
+        return 'bad_field_of_view'
+    fixed = message.min_range == message.max_range
+    z_max = parameters.max_range or message.max_range
+    if not (0.0 < z_max < math.inf and 0.0 <= message.min_range and (fixed or message.min_range < z_max)):
+        return 'bad_limits'
+    z, sigma = message.range, 0.0
+    if 0.0 < message.variance < math.inf:
+        sigma = math.sqrt(message.variance)
+    if math.isnan(z):
+        return 'nan_range'
+    if z == -math.inf:
+        if not fixed:
+            return 'too_near'
+        z, sigma = z_max / 2, z_max / 12
+    elif z < (0.0 if fixed else message.min_range):
+        return 'below_min_range'
+    if z >= z_max:
+        if parameters.over_range == 'discard':
+            return 'over_range'
+        z = z_max
+    return _Measurement(message, z, z_max, angle / 2, sigma)
+
+
+class Placer:
+    """Takes Range and Odometry one at a time, in any interleaving, and keeps the readings it could place.
+
+    Attributes
+    ----------
+    received, odometry_received : int
+        Range and Odometry messages so far. ``received == len(buffer) + waiting + sum(rejected.values())``, always,
+        as long as the buffer is not cleared.
+    rejected, odometry_rejected : Counter of str
+        Messages by reason (`REASONS`, `ODOMETRY_REASONS`).
+    rejected_by_frame : dict of frame_id → Counter
+    unknown_frames : set of str
+        Sensor frames without a mounting pose.
+    map_frame, base_frame : str
+        The frames of the first odometry message; empty before it.
+    """
+
+    def __init__(self, mounts: MountLookup, parameters: Parameters | None = None, patient: bool = False) -> None:
+        """Prepare for messages.
+
+        Parameters
+        ----------
+        mounts : callable
+            Tells where a sensor sits on the robot.
+        parameters : Parameters, optional
+        patient : bool
+            Keep all odometry and let readings wait for it without a bound, as befits a file: then the readings placed
+            do not depend on how the two streams interleave.
+        """
+        self._mounts = mounts
+        self.parameters = (parameters or Parameters()).placing
+        self._grid = (parameters or Parameters()).grid
+        self._box = (math.inf, -math.inf, math.inf, -math.inf)
+        self._patient = patient
+        self.buffer = ReadingBuffer()
+        self.received = self.odometry_received = 0
+        self.rejected: Counter[str] = Counter()
+        self.odometry_rejected: Counter[str] = Counter()
+        self.rejected_by_frame: dict[str, Counter[str]] = {}
+        self.unknown_frames: set[str] = set()
+        self.map_frame = self.base_frame = ''
+        self.time_jumps = 0
+        self._waiting: list[_Measurement] = []
+        self._stamps: list[int] = []
+        self._poses: list[Pose2] = []
+        self._newest_range: int | None = None
+
+    @property
+    def waiting(self) -> int:
+        """Number of readings that wait for odometry."""
+        return len(self._waiting)
+
+    @property
+    def readings(self) -> Readings:
+        """All placed readings."""
+        return self.buffer.snapshot()
+
+    def add_range(self, message: RangeMessage) -> None:
+        """Take one Range message."""
+        self.received += 1
+        measured = measure(message, self.parameters)
+        if isinstance(measured, str):
+            self._reject(message.frame_id, measured)
+            return
+        if len(self._waiting) >= MOST_WAITING and not self._patient:
+            self._reject(message.frame_id, 'too_many_waiting')
+            return
+        measured.number = self.received
+        heapq.heappush(self._waiting, measured)
+        self._newest_range = max(message.stamp, self._newest_range or message.stamp)
+        self._settle()
+
+    def add_odometry(self, message: OdometryMessage) -> None:
+        """Take one Odometry message."""
+        self.odometry_received += 1
+        if message.pose is None:
+            self.odometry_rejected['bad_pose'] += 1
+            return
+        if not self.map_frame and not self.base_frame:
+            self.map_frame, self.base_frame = message.frame_id, message.child_frame_id
+        if (message.frame_id, message.child_frame_id) != (self.map_frame, self.base_frame):
+            self.odometry_rejected['other_frame'] += 1
+            return
+        stamps, poses = self._stamps, self._poses
+        if stamps and message.stamp < stamps[-1] - JUMP:
+            self._jump_back()
+        if not stamps or message.stamp > stamps[-1]:
+            stamps.append(message.stamp)
+            poses.append(message.pose)
+        else:
+            at = bisect_left(stamps, message.stamp)
+            if stamps[at] == message.stamp:
+                poses[at] = message.pose
+            else:
+                stamps.insert(at, message.stamp)
+                poses.insert(at, message.pose)
+        self._settle()
+        if self._patient:
+            return
+        # trimmed by halves, so that the cost a message is constant
+        old = bisect_left(stamps, stamps[-1] - HISTORY)
+        if old > 64 and old > len(stamps) // 2:
+            del stamps[: old - 1], poses[: old - 1]
+
+    def finish(self) -> None:
+        """Say that no more messages come: what still waits is rejected."""
+        for measured in sorted(self._waiting):
+            self._reject(measured.frame_id, 'after_odometry' if self._stamps else 'no_odometry')
+        self._waiting.clear()
+
+    def _reject(self, frame_id: str, reason: str) -> None:
+        self.rejected[reason] += 1
+        self.rejected_by_frame.setdefault(frame_id, Counter())[reason] += 1
+
+    def _jump_back(self) -> None:
+        self.time_jumps += 1
+        for measured in self._waiting:
+            self._reject(measured.frame_id, 'time_jump')
+        self._waiting.clear()
+        self._stamps.clear()
+        self._poses.clear()
+        self._newest_range = None
+
+    def _settle(self) -> None:
+        """Place or reject every waiting reading whose fate is known."""
+        newest = self._stamps[-1] if self._stamps else None
+        while self._waiting and newest is not None and self._waiting[0].stamp <= newest:
+            self._place(heapq.heappop(self._waiting))
+        if self._patient:
+            return
+        now = max(self._newest_range or 0, newest or 0)
+        # a gap that would be bridged must not time out first
+        patience = max(self.parameters.pose_timeout, self.parameters.max_pose_gap)
+        limit = now - round(patience * NANOSECONDS)
+        while self._waiting and self._waiting[0].stamp < limit:
+            self._reject(heapq.heappop(self._waiting).frame_id, 'no_odometry')
+
+    def _place(self, measured: _Measurement) -> None:
+        stamps = self._stamps
+        after = bisect_left(stamps, measured.stamp)
+        if stamps[after] == measured.stamp:
+            pose = self._poses[after]
+        elif after == 0:
+            self._reject(measured.frame_id, 'before_odometry')
+            return
+        else:
+            gap = stamps[after] - stamps[after - 1]
+            if gap > self.parameters.max_pose_gap * NANOSECONDS:
+                self._reject(measured.frame_id, 'pose_gap')
+                return
+            fraction = (measured.stamp - stamps[after - 1]) / gap
+            pose = interpolate(self._poses[after - 1], self._poses[after], fraction)
+        mount = self._mounts(self.base_frame, measured.frame_id, measured.stamp)
+        if mount is None:
+            self.unknown_frames.add(measured.frame_id)
+            self._reject(measured.frame_id, 'unknown_mount')
+            return
+        sensor = pose.compose(mount)
+        if not self._fits(sensor, measured.z_max):
+            self._reject(measured.frame_id, 'too_far_away')
+            return
+        self.buffer.append(
+            measured.frame_id,
+            x=sensor.x,
+            y=sensor.y,
+            yaw=sensor.yaw,
+            z=measured.z,
+            z_max=measured.z_max,
+            half_angle=measured.half_angle,
+            sigma=measured.sigma,
+            stamp=measured.stamp,
+        )
+
+    def _fits(self, sensor: Pose2, z_max: float) -> bool:
+        """Whether the map can grow to hold the reading; if so, it does."""
+        left, right, bottom, top = self._box
+        box = (
+            min(left, sensor.x - z_max),
+            max(right, sensor.x + z_max),
+            min(bottom, sensor.y - z_max),
+            max(top, sensor.y + z_max),
+        )
+        cell = self._grid.resolution
+        if not ((box[1] - box[0]) / cell + 1) * ((box[3] - box[2]) / cell + 1) <= self._grid.max_cells:
+            return False
+        self._box = box
+        return True
