@@ -100,24 +100,26 @@ def reach_of(readings: Readings, sigma: Floats, cut: float) -> Floats:
     return np.where(ends < readings.z_max, ends, readings.z_max)
 
 
-def grid_of(readings: Readings, model: ModelParameters, grid: GridParameters) -> Grid:
-    """Return the smallest grid that holds every cell that a reading touches.
+def grid_of(readings: Readings, model: ModelParameters, grid: GridParameters, within: Grid | None = None) -> Grid:
+    """Return the smallest grid that holds every cell that a reading touches, and all of `within`.
 
     Raises
     ------
     InputError
-        If there are no readings, or they are so far apart that the grid would exceed `max_cells`.
+        If there are no readings, or the grid would exceed `max_cells`.
     """
     if not len(readings):
         raise InputError('no reading was accepted, so there is nothing to map; the report says why each was rejected')
     reach = reach_of(readings, effective_sigma(readings, model, grid.resolution), model.cut)
     boxes = cone_boxes(readings.x, readings.y, readings.yaw, readings.half_angle, reach)
-    left, right, bottom, top = boxes[0].min(), boxes[1].max(), boxes[2].min(), boxes[3].max()
-    made = Grid.covering((left, right, bottom, top), grid.resolution)
+    box = (float(boxes[0].min()), float(boxes[1].max()), float(boxes[2].min()), float(boxes[3].max()))
+    made = Grid.covering(box, grid.resolution)
+    made = made.union(within) if within else made
     if made.size > grid.max_cells:
         raise InputError(
-            f'the readings span {right - left:.0f} x {top - bottom:.0f} m: {made.size} cells of {grid.resolution} m, '
-            f'more than max_cells = {grid.max_cells}; check the poses, or raise resolution or max_cells'
+            f'the map would be {made.width * grid.resolution:.0f} x {made.height * grid.resolution:.0f} m: {made.size} '
+            f'cells of {grid.resolution} m, more than max_cells = {grid.max_cells}; check the poses, or raise '
+            f'resolution or max_cells'
         )
     return made
 

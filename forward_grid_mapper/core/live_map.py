@@ -84,10 +84,10 @@ class LiveMap:
         if not len(readings):
             return
         p = self._parameters
-        self.grid = self.grid.union(grid_of(readings, p.model, p.grid))
+        self.grid = grid_of(readings, p.model, p.grid, within=self.grid)
         self._grow()
         table = cone_table(readings, self._stored, p.model)
-        depth = p.live.live_depth / p.grid.resolution
+        depth = max(p.live.live_depth / p.grid.resolution, 0.5)
         table = table._replace(free=np.where(readings.echo, table.z - depth, table.z), reach=table.z + depth)
         gains = tuple(
             math.log(q / (1 - q)) for q in (p.live.live_p_occupied, p.live.live_p_free, p.live.live_p_free_no_echo)

@@ -134,23 +134,16 @@ class LiveMapParameters:
     """The standard log-odds map (eq 1-4), updated reading by reading."""
 
     live_p_occupied: float = _param(
-        0.7,
-        'Occupancy of the cells on the axis at the measured range, given one reading.',
-        'probability',
-        0.5,
-        0.999,
+        0.8, 'Occupancy of a cell on the axis at the measured range, given one reading.', 'probability', 0.5, 0.999
     )
     live_p_free: float = _param(
-        0.3,
-        'Occupancy of the cells on the axis before the measured range, given one reading.',
-        'probability',
-        0.001,
-        0.5,
+        0.25, 'Occupancy of a cell on the axis before the measured range, given one reading.', 'probability', 0.001, 0.5
     )
-    live_p_free_no_echo: float = _param(0.4, 'The same for a reading without echo.', 'probability', 0.001, 0.5)
-    live_depth: float = _param(0.1, 'Half the depth of the arc that an echo marks as occupied.', 'm', 0.001, 5.0)
-    live_limit: float = _param(
-        5.0, 'Bound on the log-odds of a cell, so that the map can still change.', 'log-odds', 0.1, 100.0
+    live_p_free_no_echo: float = _param(
+        0.3, 'The same for a reading without echo, which may be a lost one.', 'probability', 0.001, 0.5
+    )
+    live_depth: float = _param(
+        0.05, 'Half the depth of the arc that an echo marks as occupied; never below half a cell.', 'm', 0.001, 5.0
     )
 
 

@@ -51,6 +51,9 @@ HISTORY = 10 * NANOSECONDS
 JUMP = NANOSECONDS
 """Odometry older than the newest by more than this means that the clock jumped back, not that messages overtook."""
 
+PATH_STEP = 0.05
+"""Metres between points of the robot's path."""
+
 MOST_WAITING = 100_000
 """Readings that may wait for odometry at once, so that memory stays bounded without any."""
 
@@ -128,6 +131,10 @@ class Placer:
         Sensor frames without a mounting pose.
     map_frame, base_frame : str
         The frames of the first odometry message; empty before it.
+    path : list of (x, y)
+        Where the robot drove, in metres, a point every `PATH_STEP`.
+    time_jumps : int
+        How often odometry's clock jumped back.
     """
 
     def __init__(self, mounts: MountLookup, parameters: Parameters | None = None, patient: bool = False) -> None:
@@ -156,6 +163,7 @@ class Placer:
         self.map_frame = self.base_frame = ''
         self.time_jumps = 0
         self._waiting: list[_Measurement] = []
+        self.path: list[tuple[float, float]] = []
         self._stamps: list[int] = []
         self._poses: list[Pose2] = []
         self._newest_range: int | None = None
@@ -196,6 +204,8 @@ class Placer:
         if (message.frame_id, message.child_frame_id) != (self.map_frame, self.base_frame):
             self.odometry_rejected['other_frame'] += 1
             return
+        if not self.path or math.dist(self.path[-1], message.pose[:2]) > PATH_STEP:
+            self.path.append(message.pose[:2])
         stamps, poses = self._stamps, self._poses
         if stamps and message.stamp < stamps[-1] - JUMP:
             self._jump_back()

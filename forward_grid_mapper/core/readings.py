@@ -79,7 +79,7 @@ class Readings:
             value = columns.get(field.name, 0 if optional else None)
             if value is None:
                 raise ValueError(f'column {field.name} is missing')
-            made[field.name] = np.ascontiguousarray(np.broadcast_to(np.asarray(value, kind), z.shape))
+            made[field.name] = np.array(np.broadcast_to(np.asarray(value, kind), z.shape))
         return cls(**made, sensor_names=tuple(names))
 
 

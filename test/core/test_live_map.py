@@ -1,0 +1,82 @@
+"""The standard map against its plain twin, and the laws that the node relies on."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+import naive
+from conftest import random_readings
+from forward_grid_mapper.core.errors import InputError
+from forward_grid_mapper.core.grid import Grid
+from forward_grid_mapper.core.live_map import LiveMap
+from forward_grid_mapper.core.parameters import Parameters
+
+AREA = Grid(0.1, -10, 5, 20, 16)
+
+
+def logit(p: float) -> float:
+    return math.log(p / (1 - p))
+
+
+def test_log_odds_are_those_of_the_twin() -> None:
+    readings = random_readings(np.random.default_rng(0), AREA, 80)
+    parameters = Parameters.from_flat({'live_depth': 0.12})
+    live = LiveMap(parameters)
+    live.add(readings)
+    p = parameters.live
+    logits = logit(p.live_p_occupied), logit(p.live_p_free), logit(p.live_p_free_no_echo)
+    expected = naive.live_log_odds(readings, live.grid, p.live_depth, logits)
+    assert live.log_odds() == pytest.approx(expected, abs=1e-4)
+
+
+def test_the_order_and_the_batches_of_readings_do_not_matter() -> None:
+    rng = np.random.default_rng(1)
+    readings = random_readings(rng, AREA, 200)
+    whole = LiveMap(Parameters())
+    whole.add(readings)
+    parts = LiveMap(Parameters())
+    for part in np.array_split(rng.permutation(len(readings)), 23):
+        parts.add(readings.select(part))
+    assert parts.grid == whole.grid
+    assert np.array_equal(parts.log_odds(), whole.log_odds())
+
+
+def test_probabilities_are_unknown_exactly_where_no_cone_reaches() -> None:
+    readings = random_readings(np.random.default_rng(2), AREA, 1)
+    live = LiveMap(Parameters())
+    live.add(readings)
+    known = np.isfinite(live.probability()).ravel()
+    depth = Parameters().live.live_depth
+    pose = (readings.x[0], readings.y[0], readings.yaw[0])
+    cells = naive.cone_cells(pose, readings.half_angle[0], readings.z[0] + depth, live.grid)
+    assert set(np.flatnonzero(known).tolist()) == set(cells)
+
+
+def test_the_map_can_be_asked_for_on_a_larger_grid() -> None:
+    readings = random_readings(np.random.default_rng(3), AREA, 30)
+    live = LiveMap(Parameters())
+    live.add(readings)
+    wide = Grid(0.1, -300, -300, 600, 600)
+    assert np.array_equal(live.log_odds(wide)[wide.window(live.grid)], live.log_odds())
+    assert np.count_nonzero(live.log_odds(wide)) == np.count_nonzero(live.log_odds())
+
+
+def test_a_map_that_would_be_too_large_is_refused_and_nothing_changes() -> None:
+    live = LiveMap(Parameters.from_flat({'max_cells': 10_000}))
+    near = random_readings(np.random.default_rng(4), AREA, 5, z_max=1.0)
+    live.add(near)
+    before = live.log_odds()
+    far = near.select(slice(0, 1))
+    far.x[:] = 1e6
+    with pytest.raises(InputError, match='max_cells'):
+        live.add(far)
+    assert np.array_equal(live.log_odds(), before)
+
+
+def test_empty_map() -> None:
+    live = LiveMap(Parameters())
+    live.add(random_readings(np.random.default_rng(0), AREA, 0))
+    assert live.probability().shape == (0, 0)

@@ -1,0 +1,116 @@
+"""The whole run: laws that the three maps obey together."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+
+from conftest import random_readings
+from forward_grid_mapper.core.errors import Cancelled, InputError
+from forward_grid_mapper.core.forward_model import log_likelihood
+from forward_grid_mapper.core.grid import Grid
+from forward_grid_mapper.core.mapping import Mapper
+from forward_grid_mapper.core.maps import MapSet
+from forward_grid_mapper.core.parameters import Parameters
+from forward_grid_mapper.core.readings import Readings
+
+AREA = Grid(0.1, -13, 4, 30, 20)
+
+
+def run(readings: Readings, **values: object) -> MapSet:
+    return Mapper(Parameters.from_flat(values)).run(readings)
+
+
+def some(seed: int = 0, count: int = 400) -> Readings:
+    readings = random_readings(np.random.default_rng(seed), AREA, count)
+    readings.half_angle[:] = 0.15
+    return readings
+
+
+def same(a: MapSet, b: MapSet) -> bool:
+    return a.grid == b.grid and all(
+        np.array_equal(getattr(a, name), getattr(b, name), equal_nan=True) for name in ('live', 'ml', 'uncertainty')
+    )
+
+
+def test_maps_do_not_depend_on_the_order_of_arrival() -> None:
+    readings = some()
+    shuffled = readings.select(np.random.default_rng(1).permutation(len(readings)))
+    assert same(run(readings), run(shuffled))
+
+
+def test_sensor_numbers_do_not_matter() -> None:
+    readings = some()
+    half = (np.arange(len(readings)) % 2).astype(np.int32)
+    stamps = np.arange(len(readings)) // 8
+    a = dataclasses.replace(readings, sensor=half, stamp=stamps, sensor_names=('left', 'right'))
+    b = dataclasses.replace(readings, sensor=(1 - half).astype(np.int32), stamp=stamps, sensor_names=('right', 'left'))
+    assert same(run(a), run(b))
+
+
+def mirrored(readings: Readings) -> Readings:
+    return dataclasses.replace(readings, x=-readings.x, yaw=math.pi - readings.yaw)
+
+
+def turned(readings: Readings) -> Readings:
+    return dataclasses.replace(readings, x=-readings.y, y=readings.x.copy(), yaw=readings.yaw + math.pi / 2)
+
+
+@pytest.mark.parametrize('seed', range(8))
+def test_mirrored_or_turned_readings_give_the_mirrored_or_turned_maps(seed: int) -> None:
+    readings = some(seed)
+    plain, mirror, turn = (run(r, cell_distance='center') for r in (readings, mirrored(readings), turned(readings)))
+    for name, tolerance in (('ml', 0), ('live', 1e-5), ('uncertainty', 1e-4)):
+        expected = getattr(plain, name)
+        np.testing.assert_allclose(getattr(mirror, name)[:, ::-1], expected, atol=tolerance)
+        np.testing.assert_allclose(np.rot90(getattr(turn, name), 1), expected, atol=tolerance)
+
+
+@pytest.mark.parametrize('seed', range(4))
+def test_with_nearest_points_the_same_holds_but_for_ties(seed: int) -> None:
+    # two neighbours can be equally near, and then the first in the order of cells is taken
+    plain, mirror = (run(r, cell_distance='nearest') for r in (some(seed), mirrored(some(seed))))
+    assert (mirror.ml[:, ::-1] != plain.ml).sum() <= 4
+    assert mirror.objective == pytest.approx(plain.objective, abs=2.0)
+
+
+def test_all_maps_know_the_same_grid_and_the_figures_fit_the_map() -> None:
+    maps = run(some())
+    assert maps.live.shape == maps.ml.shape == maps.uncertainty.shape == maps.grid.shape
+    assert np.array_equal(np.isnan(maps.uncertainty), maps.ml == -1)
+    assert set(np.unique(maps.ml)) == {-1, 0, 1}
+    likelihood = log_likelihood(maps.readings, maps.grid, maps.ml, maps.parameters.model)
+    assert maps.log_likelihood == pytest.approx(likelihood, abs=1e-9)
+    prior = maps.parameters.search.prior
+    assert maps.objective == pytest.approx(likelihood + (maps.ml == 1).sum() * math.log(prior / (1 - prior)), abs=1e-9)
+
+
+def test_learning_raises_the_likelihood_and_reports_the_values() -> None:
+    readings = some()
+    plain = run(readings)
+    learned = Mapper(Parameters(), learn_rounds=3).run(readings)
+    assert learned.log_likelihood > plain.log_likelihood
+    assert learned.parameters.model != plain.parameters.model
+
+
+def test_no_readings_is_an_error_that_says_so() -> None:
+    with pytest.raises(InputError, match='no reading'):
+        run(some(count=0))
+
+
+def test_a_run_can_be_cancelled_at_any_stage() -> None:
+    for stage in ('live map', 'index', 'search'):
+        mapper = Mapper(Parameters())
+        with pytest.raises(Cancelled):
+            mapper.run(
+                some(), lambda name, progress, stage=stage, mapper=mapper: mapper.cancel() if name == stage else None
+            )
+
+
+def test_one_reading() -> None:
+    maps = run(some(count=1))
+    assert maps.statistics['converged']
+    assert len(maps.unexplained) == 1
