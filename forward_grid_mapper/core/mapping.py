@@ -125,7 +125,7 @@ class Mapper:
             ml=ml.astype(np.int8),
             uncertainty=uncertainty,
             readings=readings,
-            unexplained=explained.random + explained.lost > 0.5,
+            unexplained=explained.random > 0.5,
             log_likelihood=likelihood,
             objective=likelihood + occupied * float(np.log(prior / (1 - prior))),
             parameters=parameters,

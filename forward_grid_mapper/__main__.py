@@ -1,0 +1,36 @@
+"""`python3 -m forward_grid_mapper COMMAND …`, for machines without ros2cli."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+
+from . import __version__
+
+COMMANDS = {
+    'process_bag': 'map a recorded drive',
+    'simulate': 'record a drive through a small world with a known map',
+    'experiment': "repeat the paper's experiments: a table and a figure",
+    'demo': 'simulate, map, score: the whole way in one command',
+}
+
+
+def main() -> int:
+    """Run the command named by the first argument."""
+    if len(sys.argv) > 1 and sys.argv[1] in COMMANDS:
+        command = importlib.import_module(f'.commands.{sys.argv[1]}', __package__)
+        return int(command.main(sys.argv[2:]))
+    if len(sys.argv) > 1 and sys.argv[1] == '--version':
+        print(__version__)
+        return 0
+    lines = '\n'.join(f'  {name:12s} {text}' for name, text in COMMANDS.items())
+    usage = f'usage: python3 -m forward_grid_mapper COMMAND …\n\n{lines}\n\nCOMMAND --help tells more.'
+    if len(sys.argv) > 1 and sys.argv[1] in ('-h', '--help'):
+        print(usage)
+        return 0
+    print(usage, file=sys.stderr)
+    return 2
+
+
+if __name__ == '__main__':
+    sys.exit(main())

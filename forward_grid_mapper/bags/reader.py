@@ -1,0 +1,197 @@
+"""Reading a recorded bag: what is in it, and its ranges and odometry in the order they were recorded."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Collection, Iterator, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+from ..core.errors import BagError, InputError
+from ..core.messages import OdometryMessage, RangeMessage, odometry_message, range_message
+from .choice import ODOMETRY, RANGE, Topics, choose_topics
+from .decoder import TF_MESSAGE, decoder_of
+from .opening import open_sources, repair_hint
+from .source import Channel, Source, one_line
+from .static_transforms import StaticTransforms
+
+_CONVERSIONS: dict[str, Callable[[Any], RangeMessage | OdometryMessage]] = {
+    RANGE: range_message,
+    ODOMETRY: odometry_message,
+}
+_PROGRESS_STEP = 1000
+
+
+class Bag:
+    """A recorded bag, open for reading in a `with` block.
+
+    Parameters
+    ----------
+    path : str or Path
+        ROS 2 bag folder, single `.mcap` or `.db3` file, or ROS 1 `.bag`.
+
+    Attributes
+    ----------
+    undecodable : dict
+        Number of messages by topic that did not fit their type and were skipped.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = Path(path)
+        self.undecodable: dict[str, int] = {}
+        self._sources: list[Source] = []
+        self._damage: str | None = None
+        self._read = 0
+
+    def __enter__(self) -> Bag:
+        """Open the bag.
+
+        Raises
+        ------
+        BagError
+            If there is no bag or nothing of it can be read.
+        """
+        self._sources, self._damage = open_sources(self.path)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Close the bag."""
+        self._damage = self._reasons()
+        for source in self._sources:
+            source.close()
+        self._sources = []
+
+    @property
+    def truncated(self) -> str | None:
+        """One line about what could not be read; complete only after reading. None for a sound bag."""
+        reasons = self._reasons()
+        if reasons is None:
+            return None
+        return (
+            f'{self.path.name} is damaged or cut off ({reasons}); what was intact was read; {repair_hint(self.path)}.'
+        )
+
+    def topics(self) -> dict[str, tuple[str, int]]:
+        """Return (message type, number of messages) by topic; several types are joined by ' | '."""
+        types: dict[str, set[str]] = {}
+        counts: Counter[str] = Counter()
+        for channel in self._channels():
+            types.setdefault(channel.topic, set()).add(channel.msgtype)
+            counts[channel.topic] += channel.total
+        return {topic: (' | '.join(sorted(types[topic])), counts[topic]) for topic in sorted(types)}
+
+    def choose_topics(self, range_topics: Sequence[str] | None = None, odom_topic: str | None = None) -> Topics:
+        """Return the topics to map from: those named, else all Range topics and the only Odometry topic.
+
+        Raises
+        ------
+        BagError
+            If a named topic is not there, or there is none, or several Odometry topics and none named.
+        """
+        return choose_topics(self.topics(), range_topics, odom_topic, self._frames_of)
+
+    def messages(
+        self, topics: Topics, progress: Callable[[int, int], None] | None = None
+    ) -> Iterator[RangeMessage | OdometryMessage]:
+        """Yield the messages of the chosen topics by log time, file after file of a split bag.
+
+        Parameters
+        ----------
+        topics : Topics
+            From `choose_topics`.
+        progress : callable, optional
+            Called with (done, total) messages every now and then, and at the end.
+
+        Raises
+        ------
+        BagError
+            If the bag is damaged and nothing of these topics can be read.
+        """
+        wanted = {(topic, RANGE) for topic in topics.range_topics} | {(topics.odom_topic, ODOMETRY)}
+        total = sum(c.total for c in self._channels() if (c.topic, c.msgtype) in wanted)
+        done = decoded = 0
+        for topic in {topic for topic, _ in wanted}:
+            self.undecodable.pop(topic, None)
+        for channel, message in self._decoded(wanted):
+            done += 1
+            if progress and done % _PROGRESS_STEP == 0:
+                progress(done, max(done, total))
+            if message is not None:
+                try:
+                    converted = _CONVERSIONS[channel.msgtype](message)
+                except Exception:  # a definition of the same name with other fields
+                    self._count_undecodable(channel)
+                    continue
+                decoded += 1
+                yield converted
+        if not decoded and self.truncated:
+            raise BagError(
+                f'{self.path} is damaged or cut off and nothing of the chosen topics can be read; '
+                f'{repair_hint(self.path)}.'
+            )
+        if progress:
+            progress(done, max(done, total))
+
+    def static_transforms(self) -> StaticTransforms:
+        """Return all transforms on `/tf_static`, and on the `tf_static` of any namespace."""
+        transforms = StaticTransforms()
+        wanted = {(c.topic, c.msgtype) for c in self._channels() if c.topic.split('/')[-1] == 'tf_static'}
+        for channel, message in self._decoded({pair for pair in wanted if pair[1] == TF_MESSAGE}):
+            if message is None:
+                continue
+            try:
+                for item in message.transforms:
+                    _add_transform(transforms, item)
+            except (AttributeError, TypeError, ValueError):
+                self._count_undecodable(channel)
+        return transforms
+
+    def _reasons(self) -> str | None:
+        reasons = [self._damage, *(source.damage for source in self._sources)]
+        return '; '.join(dict.fromkeys(reason for reason in reasons if reason)) or None
+
+    def _channels(self) -> Iterator[Channel]:
+        if not self._sources:
+            raise ValueError('the bag is not open; use it in a with block')
+        return (channel for source in self._sources for channel in source.channels)
+
+    def _decoded(self, wanted: Collection[tuple[str, str]]) -> Iterator[tuple[Channel, Any]]:
+        """Yield the messages of these (topic, type) pairs, None for one that does not fit its definition."""
+        for source in self._sources:
+            channels = {c.key: c for c in source.channels if (c.topic, c.msgtype) in wanted}
+            decoders = {key: decoder_of(channel) for key, channel in channels.items()}
+            if not channels:
+                continue
+            try:
+                for key, _, data in source.messages(channels.keys()):
+                    try:
+                        message = decoders[key](data)
+                    except Exception:  # rosbags lets many kinds through for bytes that do not fit
+                        self._count_undecodable(channels[key])
+                        message = None
+                    yield channels[key], message
+            except Exception as error:  # as above; the next file of a split bag may be sound
+                source.damage = source.damage or one_line(error)
+
+    def _count_undecodable(self, channel: Channel) -> None:
+        self.undecodable[channel.topic] = self.undecodable.get(channel.topic, 0) + 1
+
+    def _frames_of(self, topic: str) -> str:
+        for _, message in self._decoded({(topic, ODOMETRY)}):
+            if message is not None:
+                odometry = odometry_message(message)
+                return f'{odometry.frame_id or "?"} → {odometry.child_frame_id or "?"}'
+        return 'none of them readable'
+
+
+def _add_transform(transforms: StaticTransforms, item: Any) -> None:
+    offset, turn = item.transform.translation, item.transform.rotation
+    parent, child = str(item.header.frame_id), str(item.child_frame_id)
+    try:
+        transforms.add(parent, child, (offset.x, offset.y, offset.z), (turn.x, turn.y, turn.z, turn.w))
+    except InputError as error:
+        # One bad frame elsewhere on the robot must not stop a map that does not need it.
+        transforms.rejected[child.lstrip('/')] = str(error)

@@ -1,0 +1,122 @@
+"""Where raw messages come from: one storage file read by rosbags, with a scanner to fall back on."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterator
+from typing import Any, NamedTuple, Protocol
+
+RawMessage = tuple[int, int, bytes]
+"""Channel key, log time in nanoseconds, serialized message."""
+
+
+class Channel(NamedTuple):
+    """Messages of one topic and type in one file. `encoding` is 'cdr' or 'ros1'."""
+
+    key: int
+    topic: str
+    msgtype: str
+    encoding: str
+    definition_format: str
+    definition: str
+    total: int
+
+
+class Source(Protocol):
+    """One storage file that is open for reading.
+
+    Attributes
+    ----------
+    channels : list of Channel
+    damage : str or None
+        Why not everything could be read, as far as is known by now.
+    """
+
+    channels: list[Channel]
+    damage: str | None
+
+    def messages(self, keys: Collection[int]) -> Iterator[RawMessage]:
+        """Yield the messages of these channels by log time."""
+
+    def close(self) -> None:
+        """Release the file."""
+
+
+def one_line(error: BaseException) -> str:
+    """Return what an exception says, on one line and short enough to quote."""
+    text = ' '.join(str(error).split()).rstrip('.')
+    if isinstance(error, KeyError):
+        text = f'a record lacks {text}'
+    return (text[:160] + ' …' if len(text) > 160 else text) or type(error).__name__
+
+
+def full_type_name(msgtype: str) -> str:
+    """Return 'package/msg/Name' for ROS 1's 'package/Name' too."""
+    parts = msgtype.split('/')
+    return f'{parts[0]}/msg/{parts[1]}' if len(parts) == 2 else msgtype
+
+
+class RosbagsSource:
+    """A file, or a compressed bag folder, that rosbags reads by its index.
+
+    Parameters
+    ----------
+    reader : rosbags.rosbag1.Reader or rosbags.rosbag2.Reader
+        Already open; this object closes it.
+    encoding : str
+        'cdr' or 'ros1'.
+    scan : callable
+        Opens a scanner of the same file, which goes on where rosbags stops at damage.
+    """
+
+    def __init__(self, reader: Any, encoding: str, scan: Callable[[], Source] | None) -> None:
+        self._reader = reader
+        self._scan = scan
+        self._connections = {c.id: c for c in reader.connections}
+        self.damage: str | None = None
+        self.channels = [
+            Channel(
+                c.id,
+                c.topic,
+                full_type_name(c.msgtype),
+                encoding,
+                c.msgdef.format.name.lower(),
+                c.msgdef.data,
+                c.msgcount,
+            )
+            for c in reader.connections
+        ]
+
+    def messages(self, keys: Collection[int]) -> Iterator[RawMessage]:
+        """Yield the messages of these channels by log time."""
+        connections = [c for key, c in self._connections.items() if key in keys]
+        if not connections:
+            return
+        last, seen = -1, 0
+        try:
+            for connection, time, data in self._reader.messages(connections):
+                last, seen = time, seen + 1
+                yield connection.id, time, bytes(data)
+        except Exception as error:  # rosbags lets struct, zstd, sqlite and assertion errors through
+            self.damage = one_line(error)
+        expected = sum(c.msgcount for c in connections)
+        if self.damage is None and seen < expected:
+            self.damage = f'the index promises {expected} messages, only {seen} were found'
+        if self.damage is not None and self._scan is not None:
+            yield from self._rest(keys, last)
+
+    def _rest(self, keys: Collection[int], last: int) -> Iterator[RawMessage]:
+        assert self._scan is not None
+        try:
+            scan = self._scan()
+        except Exception:  # the damage is known already; the scanner could not get round it
+            return
+        try:
+            for raw in scan.messages(keys):
+                if raw[1] > last:
+                    yield raw
+        finally:
+            scan.close()
+
+    def close(self) -> None:
+        """Release the file."""
+        self._reader.close()

@@ -1,0 +1,1 @@
+"""The command lines; each module's `main` is one command."""

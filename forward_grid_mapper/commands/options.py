@@ -1,0 +1,49 @@
+"""Options that choose parameters, the same for every command that maps."""
+
+from __future__ import annotations
+
+import argparse
+
+from ..core.messages import Pose2
+from ..core.parameters import Parameters
+from ..files.parameter_file import load_parameters, parse_setting
+from ..files.parameter_text import dump_parameters
+
+
+def add_mapping_options(parser: argparse.ArgumentParser) -> None:
+    """Add `--params`, `--set` and `--list-parameters`."""
+    group = parser.add_argument_group('parameters')
+    group.add_argument('--params', metavar='FILE', help='parameter YAML, the same file that the node takes')
+    group.add_argument(
+        '--set',
+        action='append',
+        default=[],
+        metavar='NAME=VALUE',
+        help='set one parameter, after --params; may be repeated (--list-parameters shows all)',
+    )
+    group.add_argument('--list-parameters', action=ListParameters, help='show every parameter as YAML and exit')
+
+
+class ListParameters(argparse.Action):
+    """Prints the parameter table with defaults, units and ranges."""
+
+    def __init__(self, option_strings: list[str], dest: str, help: str | None = None) -> None:
+        super().__init__(option_strings, dest, nargs=0, default=argparse.SUPPRESS, help=help)
+
+    def __call__(self, parser: argparse.ArgumentParser, *unused: object) -> None:
+        """Print and exit."""
+        print(dump_parameters(Parameters()), end='')
+        parser.exit()
+
+
+def chosen_parameters(options: argparse.Namespace) -> tuple[Parameters, dict[str, Pose2]]:
+    """Return the parameters and the sensor poses of `--params` and `--set`.
+
+    Raises
+    ------
+    ParameterError
+        If the file or a setting is wrong.
+    """
+    values, mounts, _ = load_parameters(options.params) if options.params else ({}, {}, {})
+    settings = dict(parse_setting(text) for text in options.set)
+    return Parameters.from_flat({**values, **settings}), dict(mounts)

@@ -1,0 +1,124 @@
+"""`process_bag`: from a recorded drive to three maps, a picture and a report."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+from ..core.errors import OutputError, ParameterError
+from ..core.mapping import Mapper
+from ..core.maps import MapSet
+from ..files.map_files import occupancy_values
+from ..files.output_folder import free_name
+from ..files.parameter_file import parse_sensor
+from ..files.report import report_text
+from ..files.results import write_results
+from .console import Ticker, run
+from .offline import Drive, read_drive
+from .options import add_mapping_options, chosen_parameters
+
+COMMAND = 'process_bag'
+
+
+def parser() -> argparse.ArgumentParser:
+    """Return the parser of the command line."""
+    made = argparse.ArgumentParser(
+        COMMAND,
+        description='Map a recorded drive: reads sonar Range and Odometry from a ROS 1 or ROS 2 bag and writes the '
+        'live log-odds map, the maximum likelihood map and the uncertainty map.',
+    )
+    made.add_argument('bag', help='ROS 2 bag folder, single .mcap or .db3 file, or ROS 1 .bag')
+    made.add_argument('-o', '--output', metavar='DIR', help='new folder for the results (default: BAG_maps)')
+    made.add_argument('--range-topics', nargs='+', metavar='TOPIC', help='Range topics (default: all in the bag)')
+    made.add_argument('--odom-topic', metavar='TOPIC', help='Odometry topic (needed if the bag has several)')
+    made.add_argument(
+        '--sensor',
+        action='append',
+        default=[],
+        metavar='FRAME=X,Y,YAW',
+        help='pose of a sensor on the robot in metres and radians (or 90deg); wins over /tf_static; may be repeated',
+    )
+    made.add_argument(
+        '--learn',
+        type=int,
+        default=0,
+        metavar='ROUNDS',
+        help='learn p_hit, p_rand, p_lost and sigma in that many rounds; p_hit comes out too high, check the maps',
+    )
+    made.add_argument('--bag', dest='write_bag', action='store_true', help='also write the maps as a bag (mcap)')
+    made.add_argument('-q', '--quiet', action='store_true', help='print nothing but errors and the folder')
+    add_mapping_options(made)
+    return made
+
+
+def process(options: argparse.Namespace) -> int:
+    """Do what the command line asks for."""
+    parameters, mounts = chosen_parameters(options)
+    mounts |= dict(parse_sensor(text) for text in options.sensor)
+    if options.learn < 0:
+        raise ParameterError('--learn: the number of rounds must not be negative')
+    bag = Path(options.bag)
+    output = Path(options.output) if options.output else free_name(Path.cwd(), f'{bag.resolve().stem}_maps')
+    if options.output and output.exists() and not (output.is_dir() and not any(output.iterdir())):
+        # said again when writing; here it spares the user the wait
+        raise OutputError(f'{output} exists and is not an empty folder; choose another with -o')
+    begin = time.perf_counter()
+    with Ticker(options.quiet) as ticker:
+        drive = read_drive(
+            bag,
+            parameters,
+            mounts,
+            options.range_topics,
+            options.odom_topic,
+            ticker.reading,
+        )
+        read = time.perf_counter() - begin
+        maps = Mapper(parameters, options.learn).run(drive.placer.readings, ticker.mapping)
+        maps.statistics['seconds'] = {'reading the bag': read, **maps.statistics['seconds']}
+        ticker.say('writing')
+        if options.learn:
+            drive.source['warnings'].append(_learned(maps))
+        if not maps.statistics['converged']:
+            drive.source['warnings'].append('the search ended at max_sweeps before it converged; raise max_sweeps')
+        report = write_results(output, maps, drive.source, drive.path_xy, '/'.join(bag.resolve().parts[-2:]))
+        if options.write_bag:
+            _write_bag(output / 'maps.mcap_bag', maps, drive)
+    if not options.quiet:
+        print(report_text(report), end='')
+    else:
+        for warning in report['warnings']:
+            print(f'{COMMAND}: warning: {warning}', file=sys.stderr)
+    print(f'maps are in {output}')
+    return 0
+
+
+def _learned(maps: MapSet) -> str:
+    m = maps.parameters.model
+    return (
+        f'learned p_hit {m.p_hit:.3f}, p_rand {m.p_rand:.3f}, p_lost {m.p_lost:.3f}, sigma {m.sigma:.3f} m together '
+        f'with the map: p_hit is biased upward this way, and smooth walls may be lost; compare with a run '
+        f'without --learn'
+    )
+
+
+def _write_bag(path: Path, maps: MapSet, drive: Drive) -> None:
+    from ..bags.writer import BagWriter
+
+    stamp = drive.source['stamps'][1]
+    with BagWriter(path, 'mcap') as writer:
+        for name, values in (('live_map', maps.live), ('ml_map', maps.ml), ('uncertainty_map', maps.uncertainty)):
+            topic = f'/forward_grid_mapper/{name}'
+            writer.write_grid(topic, maps.grid, occupancy_values(values), drive.placer.map_frame, stamp)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command; return its exit code."""
+    options = parser().parse_args(arguments)
+    return run(COMMAND, lambda: process(options))
+
+
+if __name__ == '__main__':
+    sys.exit(main())

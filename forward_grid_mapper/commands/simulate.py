@@ -1,0 +1,122 @@
+"""`simulate`: record a drive through a small world whose map is known."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from ..core.errors import ParameterError
+from ..core.messages import OdometryMessage, RangeMessage
+from ..files.map_files import write_trinary
+from ..files.output_folder import output_errors, output_folder
+from ..simulation.drive import BASE_FRAME, START, Recording, corridor_drive, door_drive
+from ..simulation.sonar import NOISE_FREE, NOISY, SonarArray, front_array, sonar_ring
+from .console import Ticker, run
+
+COMMAND = 'simulate'
+FORMATS = {'mcap': 'bag', 'sqlite3': 'bag', 'ros1': 'drive.bag'}
+SONARS: dict[str, Callable[[], SonarArray]] = {'ring': sonar_ring, 'front': front_array}
+
+
+def parser() -> argparse.ArgumentParser:
+    """Return the parser of the command line."""
+    made = argparse.ArgumentParser(
+        COMMAND,
+        description='Record a simulated drive: a bag of sonar Range and Odometry, the true map (reference.yaml) and '
+        "the robot's path (trajectory.csv).",
+    )
+    made.add_argument(
+        'world',
+        choices=('door', 'corridor'),
+        help="door: a robot passes an open door (the paper's Fig. 4); corridor: 64 m with six doors, a smooth wall "
+        'and a person walking behind the robot (Fig. 6)',
+    )
+    made.add_argument('-o', '--output', required=True, metavar='DIR', help='new folder for the recording')
+    made.add_argument('--seen', type=int, default=3, metavar='N', help='door: sweeps taken in front of it (default 3)')
+    made.add_argument('--passes', type=int, default=1, metavar='N', help='corridor: times along it (default 1)')
+    made.add_argument('--noise-free', action='store_true', help='no random readings, no noise, nobody walking')
+    made.add_argument('--sonars', choices=sorted(SONARS), default='ring', help='ring of 24 or front array of 8')
+    made.add_argument(
+        '--topics', choices=('one', 'each'), default='one', help='all sonars on /sonar, or one topic each'
+    )
+    made.add_argument('--format', choices=sorted(FORMATS), default='mcap', help='bag format (default mcap)')
+    made.add_argument('--seed', type=int, default=0, help='of the noise (default 0)')
+    made.add_argument('-q', '--quiet', action='store_true', help='print nothing but errors')
+    return made
+
+
+def record(world: str, seen: int, passes: int, noise_free: bool, seed: int, sonars: SonarArray) -> Recording:
+    """Simulate the drive that the options ask for.
+
+    Raises
+    ------
+    ParameterError
+        If a number is not positive, or the seed is negative.
+    """
+    for name, value in (('--seen', seen), ('--passes', passes), ('--seed', seed + 1)):
+        if value < 1:
+            raise ParameterError(f'{name} must be a positive number (for --seed, or 0)')
+    noise = NOISE_FREE if noise_free else NOISY
+    if world == 'door':
+        return door_drive(seen, noise, seed, sonars)
+    return corridor_drive(seed, passes, noise, not noise_free, sonars)
+
+
+def write_recording(folder: Path, recording: Recording, format: str = 'mcap', each: bool = False) -> Path:
+    """Write bag, true map and path into an existing folder; return the bag's path.
+
+    Messages are logged by stamp, as a robot would; a Range follows the odometry of its stamp.
+    """
+    from ..bags.writer import BagWriter
+
+    path = folder / FORMATS[format]
+    with BagWriter(path, format) as writer:
+        writer.write_static_transforms([(BASE_FRAME, frame, pose) for frame, pose in recording.mounts], START)
+        # both lists are in order of time, and the sort is stable
+        messages: list[OdometryMessage | RangeMessage] = [*recording.odometry, *recording.ranges]
+        for message in sorted(messages, key=lambda message: message.stamp):
+            if isinstance(message, OdometryMessage):
+                writer.write_odometry('/odom', message)
+            else:
+                writer.write_range(f'/{message.frame_id}' if each else '/sonar', message)
+    world = recording.world
+    write_trinary(folder / 'reference', world.grid, world.reference)
+    with output_errors(folder):
+        np.savetxt(folder / 'trajectory.csv', recording.robot[:, :2], fmt='%.4f', delimiter=',')
+    return path
+
+
+def simulate(options: argparse.Namespace) -> int:
+    """Do what the command line asks for."""
+    with Ticker(options.quiet) as ticker:
+        ticker.say('simulating')
+        recording = record(
+            options.world,
+            options.seen,
+            options.passes,
+            options.noise_free,
+            options.seed,
+            SONARS[options.sonars](),
+        )
+        ticker.say('writing')
+        with output_folder(options.output) as folder:
+            bag = write_recording(folder, recording, options.format, options.topics == 'each').name
+    if not options.quiet:
+        print(f'{len(recording.ranges):,} readings and {len(recording.odometry):,} odometry messages')
+        print(f'bag, reference.yaml and trajectory.csv are in {options.output}; map it with')
+        print(f'  python3 -m forward_grid_mapper process_bag {Path(options.output) / bag}')
+    return 0
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command; return its exit code."""
+    options = parser().parse_args(arguments)
+    return run(COMMAND, lambda: simulate(options))
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,1 @@
+"""Files that people and other programs read: maps, reports, pictures and parameters."""

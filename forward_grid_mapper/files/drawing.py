@@ -1,0 +1,227 @@
+"""Drawing of a composed picture; the one module that needs matplotlib, imported only when a picture is wanted."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib import patheffects
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import LinearSegmentedColormap, Normalize
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.markers import MarkerStyle
+from matplotlib.patches import Patch
+from matplotlib.path import Path as Outline
+from matplotlib.ticker import MaxNLocator
+from matplotlib.transforms import Affine2D
+
+from .figure import Tile
+from .picture import Picture
+
+# Free is white and unknown a cool tint, so that they differ to every eye; in between runs a warm scale, so that an
+# uncertain cell looks like neither. Path and dots are blue and vermilion of the Okabe-Ito palette.
+_FREE, _OCCUPIED, _UNKNOWN = '#ffffff', '#14171c', '#cfd9e4'
+_PATH, _DOT = '#0072b2', '#d55e00'
+_INK, _FRAME = '#22262b', '#8b96a3'
+_PROBABILITY = LinearSegmentedColormap.from_list(
+    'occupancy', [(0.0, _FREE), (0.2, '#fdf0d2'), (0.5, '#eeb04d'), (0.78, '#8a4a1c'), (1.0, _OCCUPIED)]
+)
+_DART = Outline([(1.0, 0.0), (-0.8, 0.75), (-0.4, 0.0), (-0.8, -0.75), (1.0, 0.0)])
+
+_DPI = 150
+# Lengths of the page in inches.
+_EDGE, _HEAD, _FOOT, _LABELS, _CAPTION, _GAP = 0.3, 0.8, 0.8, 0.55, 0.42, 0.3
+# Below this width the legend would run into the scale of probabilities.
+_MIN_WIDTH = 11.3
+_WIDE = 2.6
+
+
+def draw(path: Path, picture: Picture) -> None:
+    """Write the picture to `path`."""
+    left, right, bottom, top = picture.view
+    aspect = (right - left) / (top - bottom)
+    columns, rows, width, height = _layout(len(picture.panels), aspect)
+    page_width = 2 * _EDGE + _LABELS + columns * width + (columns - 1) * _GAP
+    page_height = _HEAD + _FOOT + _LABELS + rows * (height + _CAPTION)
+    figure = Figure(figsize=(page_width, page_height), dpi=_DPI, facecolor='white')
+    FigureCanvasAgg(figure)
+    for k, panel in enumerate(picture.panels):
+        row, column = divmod(k, columns)
+        x = _EDGE + _LABELS + column * (width + _GAP)
+        y = page_height - _HEAD - (row + 1) * (height + _CAPTION)
+        axes = figure.add_axes((x / page_width, y / page_height, width / page_width, height / page_height))
+        axes.set_facecolor(_UNKNOWN)
+        if panel.values.size:
+            axes.imshow(
+                panel.values,
+                cmap=_PROBABILITY,
+                vmin=0.0,
+                vmax=1.0,
+                extent=panel.extent,
+                origin='lower',
+                interpolation='nearest',
+                aspect='auto',
+            )
+        if k == picture.overlay:
+            _draw_overlay(axes, picture)
+        _frame(axes, panel.title, picture.view, (column == 0, row == rows - 1))
+    _head(figure, picture)
+    _foot(figure, picture)
+    figure.savefig(path)
+
+
+def draw_table(path: Path, title: str, rows: Sequence[Sequence[Tile]], view: tuple[float, float, float, float]) -> None:
+    """Write a table of maps, all in the box `view`, to `path`."""
+    aspect = (view[1] - view[0]) / (view[3] - view[2])
+    width = 3.0 if aspect < _WIDE else 13.0
+    height, columns = width / aspect, max(len(row) for row in rows)
+    page = 2 * _EDGE + columns * width + (columns - 1) * _GAP, _EDGE + _HEAD + len(rows) * (height + _CAPTION)
+    figure = Figure(figsize=page, dpi=_DPI, facecolor='white')
+    FigureCanvasAgg(figure)
+    figure.text(_EDGE / page[0], 1 - 0.45 / page[1], title, fontsize=14, fontweight='bold', color=_INK)
+    for r, row in enumerate(rows):
+        for c, tile in enumerate(row):
+            x, y = _EDGE + c * (width + _GAP), page[1] - _HEAD - (r + 1) * (height + _CAPTION) + 0.1
+            axes = figure.add_axes((x / page[0], y / page[1], width / page[0], height / page[1]))
+            axes.set_facecolor(_UNKNOWN)
+            shown = np.where(np.asarray(tile.values) < 0, np.nan, tile.values)
+            axes.imshow(
+                shown, cmap=_PROBABILITY, vmin=0, vmax=1, extent=tile.grid.extent, origin='lower', interpolation='none'
+            )
+            axes.set(xlim=view[:2], ylim=view[2:], xticks=[], yticks=[])
+            axes.set_title(tile.title, loc='left', fontsize=9.5, color=_INK, pad=4)
+            for spine in axes.spines.values():
+                spine.set(color=_FRAME, linewidth=0.7)
+    figure.savefig(path)
+
+
+def _layout(panels: int, aspect: float) -> tuple[int, int, float, float]:
+    """Return columns, rows, and a panel's width and height in inches; wide maps are stacked."""
+    if aspect > _WIDE:
+        columns, width = 1, min(12.0, 3.4 * aspect)
+    else:
+        columns = panels if panels < 4 or aspect < 0.6 else 2
+        width = min(4.8 if aspect < 1.5 else 5.6, 8.0 * aspect)
+    width_at_least = (_MIN_WIDTH - 2 * _EDGE - _LABELS - (columns - 1) * _GAP) / columns
+    height = min(max(width, width_at_least) / aspect, 8.0)
+    return columns, math.ceil(panels / columns), max(width, width_at_least), max(height, 0.6)
+
+
+def _frame(axes: Axes, title: str, view: tuple[float, float, float, float], outer: tuple[bool, bool]) -> None:
+    """Set limits, caption and scale; `outer` tells whether the panel bears the labels of the y and the x axis."""
+    axes.set_xlim(view[0], view[1])
+    axes.set_ylim(view[2], view[3])
+    axes.set_aspect('equal', adjustable='datalim')
+    axes.set_title(title, loc='left', fontsize=11.5, color=_INK, pad=5)
+    span = max(view[1] - view[0], view[3] - view[2])
+    for axis, length in ((axes.xaxis, view[1] - view[0]), (axes.yaxis, view[3] - view[2])):
+        ticks = 4 + 6 * length / span if span == length else max(2.0, 10 * length / span)
+        axis.set_major_locator(MaxNLocator(nbins=int(ticks), steps=[1, 2, 5, 10]))
+    axes.tick_params(labelsize=8.5, color=_FRAME, labelcolor=_INK, length=3, width=0.7)
+    axes.tick_params(labelleft=outer[0], labelbottom=outer[1])
+    for spine in axes.spines.values():
+        spine.set(color=_FRAME, linewidth=0.7)
+    if outer[0]:
+        axes.set_ylabel('y in m', fontsize=9, color=_INK)
+    if outer[1]:
+        axes.set_xlabel('x in m', fontsize=9, color=_INK)
+
+
+def _draw_overlay(axes: Axes, picture: Picture) -> None:
+    dots, path = picture.unexplained_xy, picture.path_xy
+    if len(dots):
+        # Many dots shrink, so that the map stays visible beneath them.
+        size = float(np.clip(9.0 * math.sqrt(300 / len(dots)), 2.0, 9.0))
+        axes.scatter(dots[:, 0], dots[:, 1], s=size, color=_DOT, linewidths=0, alpha=0.85, zorder=3)
+    if not len(path):
+        return
+    halo = [patheffects.withStroke(linewidth=2.4, foreground='white', alpha=0.9)]
+    axes.plot(path[:, 0], path[:, 1], color=_PATH, linewidth=1.4, path_effects=halo, solid_joinstyle='round', zorder=4)
+    for marker, xy in zip(_path_markers(_heading(path)), (path[0], path[-1]), strict=True):
+        axes.add_line(_marker_line(marker, xy[0], xy[1]))
+
+
+def _heading(path: np.ndarray) -> float:
+    """Return the direction in degrees in which the path ends; the last few centimetres are noise."""
+    away = path[-1] - path
+    far = np.flatnonzero(np.hypot(away[:, 0], away[:, 1]) > 0.1)
+    return math.degrees(math.atan2(away[far[-1], 1], away[far[-1], 0])) if len(far) else 0.0
+
+
+def _path_markers(heading: float) -> tuple[MarkerStyle, MarkerStyle]:
+    dart = MarkerStyle(_DART.transformed(Affine2D().rotate_deg(heading)))
+    return MarkerStyle('o'), dart
+
+
+def _marker_line(marker: MarkerStyle, x: float, y: float, **options: Any) -> Line2D:
+    start = marker.get_marker() == 'o'
+    return Line2D(
+        [x],
+        [y],
+        linestyle='none',
+        marker=marker,
+        markersize=8 if start else 13,
+        markerfacecolor='white' if start else _PATH,
+        markeredgecolor=_PATH if start else 'white',
+        markeredgewidth=2.0 if start else 1.0,
+        zorder=5,
+        **options,
+    )
+
+
+def _head(figure: Figure, picture: Picture) -> None:
+    width, height = figure.get_size_inches()
+    room = int((width - 2 * _EDGE) * 9.5)
+    title = picture.title if len(picture.title) <= room else picture.title[: room - 1] + '…'
+    x = (_EDGE + 0.05) / width
+    # A dollar sign would start a formula.
+    figure.text(
+        x, 1 - 0.42 / height, title.replace('$', r'\$'), fontsize=15, fontweight='bold', color=_INK, va='baseline'
+    )
+    figure.text(x, 1 - 0.67 / height, picture.figures, fontsize=9.5, color='#4a525c', va='baseline')
+
+
+def _foot(figure: Figure, picture: Picture) -> None:
+    """Draw the legend and the scale of probabilities below the maps."""
+    width, height = figure.get_size_inches()
+    start, end = _path_markers(0.0)
+    edge: dict[str, Any] = {'edgecolor': _FRAME, 'linewidth': 0.7}
+    handles: list[Patch | Line2D] = [
+        Patch(facecolor=_FREE, label='free', **edge),
+        Patch(facecolor=_OCCUPIED, label='occupied', **edge),
+        Patch(facecolor=_UNKNOWN, label='not observed', **edge),
+    ]
+    if len(picture.path_xy):
+        handles += [
+            Line2D([], [], color=_PATH, linewidth=1.6, label='path of the robot'),
+            _marker_line(start, 0, 0, label='start'),
+            _marker_line(end, 0, 0, label='end'),
+        ]
+    if count := len(picture.unexplained_xy):
+        label = f'unexplained reading ({count:,})'
+        handles.append(Line2D([], [], linestyle='none', marker='o', markersize=4, color=_DOT, mew=0, label=label))
+    figure.legend(
+        handles=handles,
+        loc='center left',
+        bbox_to_anchor=((_EDGE - 0.05) / width, 0.38 / height),
+        ncol=len(handles),
+        frameon=False,
+        fontsize=9,
+        labelcolor=_INK,
+        handlelength=1.5,
+        handletextpad=0.5,
+        columnspacing=1.4,
+    )
+    bar_width = 2.0
+    axes = figure.add_axes(((width - _EDGE - bar_width) / width, 0.36 / height, bar_width / width, 0.12 / height))
+    bar = figure.colorbar(ScalarMappable(Normalize(0, 1), _PROBABILITY), cax=axes, orientation='horizontal')
+    bar.set_ticks([0, 0.5, 1], labels=['0', '0.5', '1'])
+    axes.tick_params(labelsize=8, color=_FRAME, labelcolor=_INK, length=2, width=0.7)
+    axes.set_title('probability of an obstacle', fontsize=8.5, color=_INK, pad=3)
+    bar.outline.set(color=_FRAME, linewidth=0.7)

@@ -1,0 +1,40 @@
+"""A table of small maps, for comparing many at a glance."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from numpy.typing import NDArray
+
+from ..core.errors import OutputError
+from ..core.grid import Grid
+from .output_folder import output_errors
+
+Box = tuple[float, float, float, float]
+
+
+class Tile(NamedTuple):
+    """One map of the table: `values` are probabilities, or cells 0 and 1, with NaN or -1 where unknown."""
+
+    title: str
+    grid: Grid
+    values: NDArray[Any]
+
+
+def write_figure(path: Path | str, title: str, rows: Sequence[Sequence[Tile]], view: Box) -> None:
+    """Draw rows of maps of the same place, each showing the box `view` (left, right, bottom, top in metres).
+
+    Raises
+    ------
+    OutputError
+        If the file cannot be written, or matplotlib is not installed.
+    """
+    path = Path(path)
+    try:
+        from .drawing import draw_table
+    except ImportError as error:
+        raise OutputError(f'the figure needs matplotlib ({error}); install it with pip install matplotlib') from error
+    with output_errors(path):
+        draw_table(path, title, rows, view)

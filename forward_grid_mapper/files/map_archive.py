@@ -1,0 +1,85 @@
+"""`maps.npz`: the three maps with everything needed to work on them in numpy."""
+
+from __future__ import annotations
+
+import json
+import zipfile
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core.errors import InputError, MapperError
+from ..core.grid import Grid
+from ..core.maps import UNKNOWN, MapSet
+from ..core.parameters import Parameters
+from .output_folder import output_errors
+
+
+class MapArchive(NamedTuple):
+    """What `maps.npz` holds; the names are those of `MapSet`."""
+
+    grid: Grid
+    live: NDArray[np.float32]
+    ml: NDArray[np.int8]
+    uncertainty: NDArray[np.float32]
+    log_likelihood: float
+    objective: float
+    parameters: Parameters
+
+
+def write_npz(path: Path | str, maps: MapSet) -> None:
+    """Write the maps as compressed arrays, none of them pickled.
+
+    `live_map`, `ml_map` and `uncertainty_map` are float32 probabilities, NaN where unknown, row 0 with the smallest y;
+    `origin` (2,) is the corner of cell (0, 0) and `resolution` the edge of a cell, metres; `log_likelihood` and
+    `objective` are in nats; `parameters` is a JSON text.
+
+    Raises
+    ------
+    OutputError
+        If the file cannot be written.
+    """
+    path = Path(path)
+    with output_errors(path), path.open('wb') as file:
+        np.savez_compressed(
+            file,
+            live_map=maps.live.astype(np.float32),
+            ml_map=np.where(maps.ml == UNKNOWN, np.nan, maps.ml).astype(np.float32),
+            uncertainty_map=maps.uncertainty.astype(np.float32),
+            origin=np.array(maps.grid.origin, np.float64),
+            resolution=np.float64(maps.grid.resolution),
+            log_likelihood=np.float64(maps.log_likelihood),
+            objective=np.float64(maps.objective),
+            parameters=np.array(json.dumps(maps.parameters.flat())),
+        )
+
+
+def read_npz(path: Path | str) -> MapArchive:
+    """Read what `write_npz` wrote.
+
+    Raises
+    ------
+    InputError
+        If the file is missing, damaged or something else.
+    """
+    path = Path(path)
+    try:
+        with path.open('rb') as file, np.load(file, allow_pickle=False) as data:
+            ml = data['ml_map']
+            resolution = float(data['resolution'])
+            column, row = (round(float(v) / resolution) for v in data['origin'])
+            return MapArchive(
+                grid=Grid(resolution, column, row, ml.shape[1], ml.shape[0]),
+                live=data['live_map'],
+                ml=np.where(np.isnan(ml), UNKNOWN, ml).astype(np.int8),
+                uncertainty=data['uncertainty_map'],
+                log_likelihood=float(data['log_likelihood']),
+                objective=float(data['objective']),
+                parameters=Parameters.from_flat(json.loads(str(data['parameters']))),
+            )
+    except FileNotFoundError as error:
+        raise InputError(f'{path} does not exist') from error
+    except (OSError, EOFError, KeyError, ValueError, IndexError, TypeError, zipfile.BadZipFile, MapperError) as error:
+        raise InputError(f'{path} is not an archive of maps, or is damaged: {error}') from error

@@ -1,0 +1,142 @@
+"""Folders and files that appear whole or not at all, and errors that say what to do."""
+
+from __future__ import annotations
+
+import errno
+import itertools
+import os
+import shutil
+import uuid
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from ..core.errors import OutputError
+
+_FULL = {errno.ENOSPC, errno.EDQUOT}
+# Errors that only writing can cause, so that they may be blamed on the output whoever meets them.
+_WRITE_ONLY = _FULL | {errno.EFBIG, errno.EROFS}
+
+
+@contextmanager
+def output_errors(path: Path) -> Iterator[None]:
+    """Turn an `OSError` from writing `path` into an `OutputError`.
+
+    Raises
+    ------
+    OutputError
+        In place of every `OSError` of the block.
+    """
+    try:
+        yield
+    except OSError as error:
+        raise _output_error(path, error) from error
+
+
+@contextmanager
+def output_folder(path: Path | str) -> Iterator[Path]:
+    """Give a temporary folder to write into, which takes the name `path` when the block succeeds.
+
+    Nothing appears under the final name before, and the temporary folder is removed if the block fails. Missing
+    parents are made. An empty folder that exists already is filled, not replaced: it may be a mount point or the
+    shell's working directory.
+
+    Parameters
+    ----------
+    path : Path or str
+        The folder to make; it must not exist or be empty.
+
+    Yields
+    ------
+    Path
+        The temporary folder.
+
+    Raises
+    ------
+    OutputError
+        If the folder has something in it, cannot be made, or the disk is full.
+    """
+    final = Path(os.path.abspath(path))  # noqa: PTH100 (a link must stay a link, so no resolve)
+    with output_errors(final):
+        exists = _is_empty_folder(final)
+        made = [] if exists else _make_parents(final.parent)
+        staging = (final if exists else final.parent) / f'.{final.name}.{uuid.uuid4().hex[:8]}.partial'
+        try:
+            staging.mkdir()
+        except OSError:
+            _remove_empty(made)
+            raise
+    done = False
+    try:
+        yield staging
+        with output_errors(final):
+            if exists:
+                for entry in sorted(staging.iterdir()):
+                    entry.rename(final / entry.name)
+                staging.rmdir()
+            else:
+                staging.rename(final)
+        done = True
+    except OSError as error:
+        if error.errno in _WRITE_ONLY:
+            raise _output_error(final, error) from error
+        raise
+    finally:
+        if not done:
+            shutil.rmtree(staging, ignore_errors=True)
+            _remove_empty(made)
+
+
+def free_name(parent: Path | str, stem: str) -> Path:
+    """Return the first of `stem`, `stem_2`, `stem_3`, … that does not exist in `parent`.
+
+    Raises
+    ------
+    OutputError
+        If `parent` cannot be searched.
+    """
+    parent = Path(parent)
+    with output_errors(parent):
+        taken = set(os.listdir(parent)) if parent.exists() else set()  # noqa: PTH208 (one look, not one per name)
+    names = itertools.chain([stem], (f'{stem}_{n}' for n in itertools.count(2)))
+    return parent / next(name for name in names if name not in taken)
+
+
+def _is_empty_folder(path: Path) -> bool:
+    """Tell an empty folder (True) from a free name (False); refuse everything else."""
+    if not os.path.lexists(path):
+        return False
+    if not path.is_dir():
+        raise OutputError(f'{path} is a file; choose another folder with -o')
+    if any(path.iterdir()):
+        raise OutputError(f'{path} exists and is not empty; choose another with -o, or remove it first')
+    return True
+
+
+def _make_parents(folder: Path) -> list[Path]:
+    """Make `folder` with its parents; return those that were missing, innermost first."""
+    missing = list(itertools.takewhile(lambda p: not p.exists(), (folder, *folder.parents)))
+    if not missing and not folder.is_dir():
+        raise NotADirectoryError(errno.ENOTDIR, os.strerror(errno.ENOTDIR), str(folder))
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError:
+        _remove_empty(missing)
+        raise
+    return missing
+
+
+def _remove_empty(folders: list[Path]) -> None:
+    for folder in folders:
+        with suppress(OSError):
+            folder.rmdir()
+
+
+def _output_error(path: Path, error: OSError) -> OutputError:
+    if error.errno in _FULL:
+        return OutputError(f'{path}: the disk is full; free some space or choose another place with -o')
+    if error.errno == errno.ENOTDIR:
+        return OutputError(f'{path}: a part of this path is a file, not a folder; choose another with -o')
+    if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
+        return OutputError(f'{path}: no permission to write there; choose another place with -o')
+    return OutputError(f'{path} cannot be written: {error.strerror or error}')

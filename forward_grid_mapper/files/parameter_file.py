@@ -1,0 +1,219 @@
+"""Reading parameters: a ROS 2 parameter file, a flat YAML, or `name=value` on a command line."""
+
+from __future__ import annotations
+
+import difflib
+import math
+import re
+from collections.abc import Hashable, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import yaml
+
+from ..core.errors import ParameterError
+from ..core.messages import Pose2
+from ..core.parameters import Parameter, find
+
+NODE_NAME = 'forward_grid_mapper'
+
+# Parameters that only the running node has. A file may hold them, so that node and offline tool share it.
+NODE_ONLY = frozenset(
+    {
+        'range_topics',
+        'odom_topic',
+        'range_reliability',
+        'publish_rate',
+        'save_directory',
+        'use_sim_time',
+        'map_frame',
+        'base_frame',
+        'online',
+    }
+)
+# Parameters that ROS itself declares on every node.
+_ROS_OWN = re.compile(r'start_type_description_service|qos_overrides\..+')
+_MOUNT = re.compile(r'sensors\.(?P<frame>.+)\.pose')
+
+
+class ParameterFile(NamedTuple):
+    """What a parameter file holds.
+
+    Attributes
+    ----------
+    values : dict
+        Checked values of the table's parameters, by name.
+    mounts : dict
+        Pose of each sensor in the robot's base frame, by `frame_id`.
+    node : dict
+        Values that only the node understands, unchecked.
+    """
+
+    values: dict[str, Any]
+    mounts: dict[str, Pose2]
+    node: dict[str, Any]
+
+
+def load_parameters(path: Path | str) -> ParameterFile:
+    """Read a ROS 2 parameter YAML, or a flat mapping of names to values.
+
+    Names may be nested or dotted. In a ROS file the sections `/**` and `forward_grid_mapper` (in any namespace) count,
+    the latter first; a section of another name counts if it is the only one, as for a node that was renamed.
+
+    Raises
+    ------
+    ParameterError
+        Naming the file, if it cannot be read, or holds an unknown or repeated name or a bad value.
+    """
+    path = Path(path)
+    try:
+        document = yaml.load(path.read_text(encoding='utf-8'), _Loader)
+        flat: dict[str, Any] = {}
+        for section in _sections({} if document is None else document):
+            flat |= dict(_flatten(section))
+        return _sort_out(flat)
+    except OSError as error:
+        raise ParameterError(f'{path} cannot be read: {error.strerror}') from error
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise ParameterError(f'{path} is not valid YAML: {error}') from error
+    except ParameterError as error:
+        raise ParameterError(f'{path}: {error}') from error
+
+
+def parse_setting(text: str) -> tuple[str, Any]:
+    """Return the name and the checked value of `name=value`.
+
+    Raises
+    ------
+    ParameterError
+        If the text has another form, the name is unknown or the value not admitted.
+    """
+    name, equals, value = (part.strip() for part in text.partition('='))
+    if not equals or not name:
+        raise ParameterError(f'{text!r} is not of the form name=value, such as p_hit=0.6')
+    row = _row(name)
+    return name, row.check(_typed(row, value))
+
+
+def parse_sensor(text: str) -> tuple[str, Pose2]:
+    """Return the frame and pose of `frame=x,y,yaw`: metres, and radians or, with the suffix `deg`, degrees.
+
+    Raises
+    ------
+    ParameterError
+        If the text has another form or a number is not finite.
+    """
+    frame, _, numbers = (part.strip() for part in text.rpartition('='))
+    parts = numbers.split(',')
+    degrees = parts[-1].strip().endswith('deg')
+    parts[-1] = parts[-1].strip().removesuffix('deg')
+    try:
+        pose = _pose(frame, [float(part) for part in parts])
+    except (ValueError, ParameterError):
+        pose = None
+    if pose is None or not frame:
+        raise ParameterError(
+            f'{text!r} is not of the form frame=x,y,yaw, such as sonar_left=0.1,0.15,1.57 or sonar_left=0.1,0.15,90deg'
+        )
+    return frame, pose._replace(yaw=math.radians(pose.yaw)) if degrees else pose
+
+
+class _Loader(yaml.SafeLoader):
+    """A safe loader that refuses repeated keys and reads `1e-4` as a number, as ROS does."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Any]:
+        seen = set()
+        for key, _ in node.value:
+            if not isinstance(key, yaml.ScalarNode):
+                continue
+            if key.value in seen:
+                raise ParameterError(f'{key.value} is given twice (line {key.start_mark.line + 1})')
+            seen.add(key.value)
+        return super().construct_mapping(node, deep)
+
+
+_Loader.add_implicit_resolver(
+    'tag:yaml.org,2002:float', re.compile(r'[-+]?(?:\d+\.?\d*|\.\d+)[eE][-+]?\d+$'), list('-+.0123456789')
+)
+
+
+def _sections(document: Any) -> list[dict[str, Any]]:
+    """Return the parameter mappings of a file, the more specific ones last."""
+    if not isinstance(document, dict):
+        raise ParameterError('it must hold names with values, such as "p_hit: 0.6"')
+    found = {name: section or {} for name, section in _ros_sections(document, '')}
+    if not found:
+        return [document]
+    wildcards = [s for name, s in found.items() if name.strip('/') in ('*', '**')]
+    own = [s for name, s in found.items() if name.rpartition('/')[2] == NODE_NAME]
+    chosen = wildcards + own or (list(found.values()) if len(found) == 1 else [])
+    if not chosen:
+        raise ParameterError(f'it has no section for {NODE_NAME} or /**; there are: {", ".join(found)}')
+    return chosen
+
+
+def _ros_sections(document: dict[Any, Any], prefix: str) -> Iterator[tuple[str, Any]]:
+    for key, value in document.items():
+        if isinstance(value, dict):
+            if 'ros__parameters' in value:
+                yield f'{prefix}{key}', value['ros__parameters']
+            else:
+                yield from _ros_sections(value, f'{prefix}{key}/')
+
+
+def _flatten(section: Any, prefix: str = '') -> Iterator[tuple[str, Any]]:
+    if not isinstance(section, dict):
+        raise ParameterError('ros__parameters must hold names with values, such as "p_hit: 0.6"')
+    seen = set()
+    for key, value in section.items():
+        name = f'{prefix}{key}'
+        pairs = list(_flatten(value, f'{name}.')) if isinstance(value, dict) else [(name, value)]
+        for full, leaf in pairs:
+            if full in seen:
+                raise ParameterError(f'{full} is given twice, nested and with dots')
+            seen.add(full)
+            yield full, leaf
+
+
+def _sort_out(flat: dict[str, Any]) -> ParameterFile:
+    result = ParameterFile({}, {}, {})
+    for name, value in flat.items():
+        if mount := _MOUNT.fullmatch(name):
+            result.mounts[mount['frame']] = _pose(name, value)
+        elif name in NODE_ONLY or _ROS_OWN.fullmatch(name):
+            result.node[name] = value
+        elif name.partition('.')[0] == 'sensors':
+            raise ParameterError(f'{name}: sensors are given as sensors.<frame_id>.pose: [x, y, yaw]')
+        else:
+            result.values[name] = _row(name).check(value)
+    return result
+
+
+def _row(name: str) -> Parameter:
+    """Return the table's row; look for near names among the node's parameters too."""
+    if name in NODE_ONLY:
+        raise ParameterError(f'{name} is a parameter of the node only')
+    try:
+        return find(name)
+    except ParameterError:
+        if near := difflib.get_close_matches(name, NODE_ONLY, n=1, cutoff=0.8):
+            raise ParameterError(f'no parameter is called {name!r}; did you mean {near[0]}?') from None
+        raise
+
+
+def _pose(name: str, value: Any) -> Pose2:
+    numbers = value if isinstance(value, list) else []
+    good = [float(v) for v in numbers if isinstance(v, (int, float)) and not isinstance(v, bool) and math.isfinite(v)]
+    if len(good) != 3 or len(numbers) != 3:
+        raise ParameterError(f'{name}: {value!r} is not [x, y, yaw], three finite numbers (metres, radians)')
+    return Pose2(*good)
+
+
+def _typed(row: Parameter, text: str) -> Any:
+    """Return `text` as the row's type, or as it is where that fails, for the row's own check to refuse."""
+    if row.type is bool:
+        return {'true': True, 'false': False}.get(text.lower(), text)
+    try:
+        return row.type(text)
+    except ValueError:
+        return text

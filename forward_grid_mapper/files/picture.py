@@ -1,0 +1,153 @@
+"""The picture of a run: the three maps side by side, with the robot's path."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core.errors import OutputError
+from ..core.grid import Grid
+from ..core.maps import UNKNOWN, MapSet
+from .output_folder import output_errors
+
+Box = tuple[float, float, float, float]
+# More cells than that along a side cannot be told apart in the picture.
+_MAX_SIDE = 2400
+_MARGIN = 0.03
+
+
+class Panel(NamedTuple):
+    """One map of the picture: `values` are probabilities with NaN where unknown, `extent` its box in metres."""
+
+    title: str
+    values: NDArray[np.float32]
+    extent: Box
+
+
+class Picture(NamedTuple):
+    """What is drawn. `view` is the box shown; points are in metres; `overlay` is the panel that bears them."""
+
+    title: str
+    figures: str
+    panels: list[Panel]
+    view: Box
+    overlay: int
+    path_xy: NDArray[np.float64]
+    unexplained_xy: NDArray[np.float64]
+
+
+def write_picture(
+    path: Path | str,
+    maps: MapSet,
+    path_xy: NDArray[np.float64],
+    title: str,
+    reference: tuple[Grid, NDArray[np.int8]] | None = None,
+) -> None:
+    """Draw the maps into an image file (`.png`, or what else matplotlib knows).
+
+    Parameters
+    ----------
+    path : Path or str
+    maps : MapSet
+    path_xy : float64, shape (P, 2)
+        Where the robot was, in order, metres; may be empty.
+    title : str
+    reference : (Grid, int8 array), optional
+        The true map, −1 unknown, 0 free, 1 occupied, drawn as one more panel.
+
+    Raises
+    ------
+    OutputError
+        If matplotlib is not installed, or the file cannot be written.
+    """
+    try:
+        from . import drawing
+    except (ImportError, AttributeError) as error:  # AttributeError: a matplotlib built for another numpy
+        raise OutputError(
+            f'no picture: matplotlib is missing or broken ({error}); install it with "pip install matplotlib" or '
+            '"apt install python3-matplotlib"'
+        ) from error
+    path = Path(path)
+    picture = compose(maps, np.asarray(path_xy, np.float64).reshape(-1, 2), title, reference)
+    with output_errors(path):
+        drawing.draw(path, picture)
+
+
+def compose(
+    maps: MapSet,
+    path_xy: NDArray[np.float64],
+    title: str,
+    reference: tuple[Grid, NDArray[np.int8]] | None,
+) -> Picture:
+    """Choose what the picture shows; the parameters are those of `write_picture`."""
+    path_xy = path_xy[np.isfinite(path_xy).all(axis=1)]
+    alpha = maps.parameters.search.alpha
+    named: list[tuple[str, Grid, NDArray[Any]]] = [
+        ('Standard log-odds map', maps.grid, maps.live),
+        ('Maximum likelihood map', maps.grid, _probability(maps.ml)),
+        (f'Uncertainty map (α = {alpha:g})', maps.grid, maps.uncertainty),
+    ]
+    if reference is not None:
+        named.append(('Reference', reference[0], _probability(reference[1])))
+    known = (maps.ml != UNKNOWN) | np.isfinite(maps.live)
+    view = _view(maps.grid, known, path_xy)
+    panels = [Panel(name, *_crop(grid, values, view)) for name, grid, values in named]
+    return Picture(title, _figures(maps), panels, view, 1, path_xy, _unexplained_ends(maps))
+
+
+def _probability(cells: NDArray[np.int8]) -> NDArray[np.float32]:
+    return np.where(cells == UNKNOWN, np.nan, cells).astype(np.float32)
+
+
+def _figures(maps: MapSet) -> str:
+    readings = len(maps.readings)
+    parts = [f'{readings:,} readings', f'{100 * maps.grid.resolution:g} cm cells']
+    if np.isfinite(maps.log_likelihood):
+        total, mean = (
+            f'{v:,.2f}'.replace('-', '−') for v in (maps.log_likelihood, maps.log_likelihood / max(1, readings))
+        )
+        parts.append(f'log-likelihood {total} nats ({mean} a reading)')
+    return '   ·   '.join(parts)
+
+
+def _view(grid: Grid, known: NDArray[np.bool_], path_xy: NDArray[np.float64]) -> Box:
+    """Return the box around the known cells and the path, with a margin."""
+    columns, rows = np.flatnonzero(known.any(axis=0)), np.flatnonzero(known.any(axis=1))
+    left, right, bottom, top = grid.extent
+    if len(rows):
+        x, y = grid.origin
+        left, right = x + columns[0] * grid.resolution, x + (columns[-1] + 1) * grid.resolution
+        bottom, top = y + rows[0] * grid.resolution, y + (rows[-1] + 1) * grid.resolution
+    if len(path_xy):
+        left, bottom = np.minimum((left, bottom), path_xy.min(axis=0))
+        right, top = np.maximum((right, top), path_xy.max(axis=0))
+    margin = max(_MARGIN * max(right - left, top - bottom), 2 * grid.resolution)
+    return float(left - margin), float(right + margin), float(bottom - margin), float(top + margin)
+
+
+def _crop(grid: Grid, values: NDArray[Any], view: Box) -> tuple[NDArray[np.float32], Box]:
+    """Return the part of a map that is in view, coarse enough to be drawn, and its extent."""
+    left, right, bottom, top = (np.array(v) for v in view)
+    (row0, row1), (column0, column1) = grid.cells_of(np.stack([left, right]), np.stack([bottom, top]))
+    row0, row1 = np.clip((row0, row1 + 1), 0, grid.height)
+    column0, column1 = np.clip((column0, column1 + 1), 0, grid.width)
+    part = np.asarray(values[row0:row1, column0:column1], np.float32)
+    step = max(1, -(-max(part.shape) // _MAX_SIDE))
+    if step > 1:
+        # The largest value of each block stays: a wall one cell thick must not fall between pixels.
+        pad = [(0, -n % step) for n in part.shape]
+        part = np.pad(part, pad, constant_values=np.nan)
+        part = np.fmax.reduce(part.reshape(part.shape[0] // step, step, -1), axis=1)
+        part = np.fmax.reduce(part.reshape(part.shape[0], -1, step), axis=2)
+    x, y = grid.origin
+    x, y, size = x + column0 * grid.resolution, y + row0 * grid.resolution, step * grid.resolution
+    return part, (float(x), float(x + part.shape[1] * size), float(y), float(y + part.shape[0] * size))
+
+
+def _unexplained_ends(maps: MapSet) -> NDArray[np.float64]:
+    """Return where the axes of the readings that the ML map leaves unexplained end, shape (U, 2)."""
+    odd = maps.readings.select(maps.unexplained)
+    return np.stack([odd.x + odd.z * np.cos(odd.yaw), odd.y + odd.z * np.sin(odd.yaw)], axis=1)

@@ -1,0 +1,126 @@
+"""The report of a mapping run: what was read and rejected, what came out, and how long it took."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .. import __version__
+from ..core.maps import UNKNOWN, MapSet
+from ..core.parameters import TABLE
+from .output_folder import output_errors
+from .report_text import report_text
+
+__all__ = ['report_data', 'report_text', 'write_report']
+
+
+def report_data(maps: MapSet, source: Mapping[str, Any]) -> dict[str, Any]:
+    """Return everything worth knowing about a run, ready for JSON.
+
+    Parameters
+    ----------
+    maps : MapSet
+    source : mapping
+        Where the readings came from. All keys are optional: `bag`, `range_topics`, `odom_topic`, `odom_frame`,
+        `map_frame`, `mounts_from`, `stamps` (first and last, nanoseconds), `duration_s`, `path_m`, `counts`
+        (`received`, `accepted`, `rejected` by reason), `sensors` (by frame: `accepted`, `no_echo`, `unexplained`),
+        `warnings`. Others are kept as they are under `input`.
+
+    Returns
+    -------
+    dict
+        Of plain Python values; a number that is not finite is None.
+    """
+    rest = dict(source)
+    counts = dict(rest.pop('counts', None) or {})
+    counts.setdefault('accepted', len(maps.readings))
+    sensors = _sensors(maps)
+    for name, row in (rest.pop('sensors', None) or {}).items():
+        sensors[name] = {**sensors.get(name, {}), **row}
+    statistics = dict(maps.statistics)
+    data = {
+        'version': __version__,
+        'warnings': list(rest.pop('warnings', None) or []),
+        'input': rest,
+        'counts': counts,
+        'sensors': sensors,
+        'map': _map(maps),
+        'result': {
+            'readings': len(maps.readings),
+            'unexplained': int(np.count_nonzero(maps.unexplained)),
+            'log_likelihood': maps.log_likelihood,
+            'objective': maps.objective,
+        },
+        'seconds': statistics.pop('seconds', {}),
+        'statistics': statistics,
+        'parameters': maps.parameters.flat(),
+        'changed_parameters': {
+            row.name: {'value': value, 'default': row.default}
+            for row in TABLE
+            if (value := maps.parameters.flat()[row.name]) != row.default
+        },
+    }
+    plain: dict[str, Any] = _plain(data)
+    return plain
+
+
+def write_report(folder: Path | str, data: dict[str, Any]) -> None:
+    """Write `report.json` and `report.txt`.
+
+    Raises
+    ------
+    OutputError
+        If they cannot be written.
+    """
+    texts = {
+        'report.json': json.dumps(data, indent=2, ensure_ascii=False, allow_nan=False) + '\n',
+        'report.txt': report_text(data),
+    }
+    for name, text in texts.items():
+        path = Path(folder) / name
+        with output_errors(path):
+            path.write_text(text, encoding='utf-8')
+
+
+def _sensors(maps: MapSet) -> dict[str, dict[str, Any]]:
+    readings = maps.readings
+    table = {}
+    for index, name in enumerate(readings.sensor_names):
+        mine = readings.sensor == index
+        table[name] = {
+            'accepted': int(np.count_nonzero(mine)),
+            'no_echo': int(np.count_nonzero(mine & ~readings.echo)),
+            'unexplained': int(np.count_nonzero(mine & maps.unexplained)),
+        }
+    return table
+
+
+def _map(maps: MapSet) -> dict[str, Any]:
+    grid = maps.grid
+    return {
+        'resolution': grid.resolution,
+        'width': grid.width,
+        'height': grid.height,
+        'origin': list(grid.origin),
+        'free_cells': int(np.count_nonzero(maps.ml == 0)),
+        'occupied_cells': int(np.count_nonzero(maps.ml == 1)),
+        'unknown_cells': int(np.count_nonzero(maps.ml == UNKNOWN)),
+    }
+
+
+def _plain(value: Any) -> Any:
+    """Return `value` of Python's own types, as JSON knows them."""
+    if isinstance(value, Mapping):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, (np.ndarray, np.generic)):
+        return _plain(value.tolist())
+    if isinstance(value, (list, tuple, set, frozenset)):
+        return [_plain(item) for item in value]
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    return value if value is None or isinstance(value, (str, int)) else str(value)

@@ -1,0 +1,159 @@
+"""The report as a page of text that tells at a glance whether the run was good."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Iterator
+from datetime import datetime, timezone
+from typing import Any
+
+_LABEL = 14
+_WIDTH = 100
+
+
+def report_text(data: dict[str, Any]) -> str:
+    """Return the text of a report made by `report_data`; what is absent is left out."""
+    sections = (_warnings, _input, _counts, _sensors, _map, _result, _seconds, _parameters)
+    title = f'Sonar maps by forward_grid_mapper {data.get("version") or ""}'.rstrip()
+    parts = [f'{title}\n{"=" * len(title)}']
+    for section in sections:
+        if lines := list(section(data)):
+            parts.append('\n'.join(lines))
+    return '\n\n'.join(parts) + '\n'
+
+
+def _warnings(data: dict[str, Any]) -> Iterator[str]:
+    warnings = data.get('warnings') or []
+    if warnings:
+        yield f'WARNINGS ({len(warnings)})'
+    for warning in warnings:
+        yield textwrap.fill(str(warning), _WIDTH, initial_indent='  ! ', subsequent_indent='    ')
+
+
+def _input(data: dict[str, Any]) -> Iterator[str]:
+    source = data.get('input') or {}
+    if bag := source.get('bag'):
+        yield from _line('Bag', bag)
+    if topics := source.get('range_topics'):
+        yield from _line('Ranges from', topics if isinstance(topics, str) else ', '.join(map(str, topics)))
+    if topic := source.get('odom_topic'):
+        frame = source.get('odom_frame')
+        yield from _line('Odometry', f'{topic}, frame {frame}' if frame else topic)
+    if frame := source.get('map_frame'):
+        yield from _line('Map frame', frame)
+    if mounts := source.get('mounts_from'):
+        yield from _line('Sensor poses', f'from {mounts}')
+    drive = []
+    if (path := source.get('path_m')) is not None:
+        drive.append(f'{path:.1f} m')
+    if (duration := source.get('duration_s')) is not None:
+        drive.append(f'in {duration:.1f} s')
+    if start := _date(source.get('stamps')):
+        drive.append(f'from {start}')
+    if drive:
+        yield from _line('Drive', ' '.join(drive))
+
+
+def _counts(data: dict[str, Any]) -> Iterator[str]:
+    counts = data.get('counts') or {}
+    accepted, rejected = counts.get('accepted') or 0, counts.get('rejected') or {}
+    received = counts.get('received')
+    if received is None:
+        received = accepted + sum(rejected.values())
+    yield from _line('Readings', f'{received:,} received, {accepted:,} accepted ({_share(accepted, received)})')
+    if rejected:
+        yield '  rejected'
+    for reason, number in sorted(rejected.items(), key=lambda item: -item[1]):
+        yield f'  {number:>12,}  {_share(number, received):>7}  {reason}'
+
+
+def _sensors(data: dict[str, Any]) -> Iterator[str]:
+    sensors = data.get('sensors') or {}
+    if not sensors:
+        return
+    width = max(12, *(len(name) + 2 for name in sensors))
+    yield f'{"Sensors":<{width}}{"accepted":>12}{"no echo":>12}{"unexplained":>14}'
+    for name, row in sorted(sensors.items()):
+        total = row.get('accepted')
+        shares = (_share(row.get(key), total) for key in ('no_echo', 'unexplained'))
+        no_echo, unexplained = shares
+        yield f'  {name:<{width - 2}}{_number(total):>12}{no_echo:>12}{unexplained:>14}'
+
+
+def _map(data: dict[str, Any]) -> Iterator[str]:
+    grid = data.get('map') or {}
+    if not grid.get('resolution'):
+        return
+    cell, (x, y) = grid['resolution'], grid['origin']
+    size = f'{grid["width"] * cell:.1f} x {grid["height"] * cell:.1f} m'
+    yield from _line(
+        'Map', f'{size}: {grid["width"]} x {grid["height"]} cells of {cell:g} m, corner ({x:.2f}, {y:.2f})'
+    )
+    cells = (f'{_number(grid.get(f"{kind}_cells"))} {word}' for kind, word in _KINDS)
+    yield from _line('ML map', ', '.join(cells))
+
+
+_KINDS = (('occupied', 'occupied'), ('free', 'free'), ('unknown', 'not observed'))
+
+
+def _result(data: dict[str, Any]) -> Iterator[str]:
+    result, statistics = data.get('result') or {}, data.get('statistics') or {}
+    readings, likelihood = result.get('readings'), result.get('log_likelihood')
+    if likelihood is not None:
+        mean = f' ({likelihood / readings:.3f} a reading)' if readings else ''
+        yield from _line('Log-likelihood', f'{likelihood:,.1f} nats{mean}')
+    if (objective := result.get('objective')) is not None:
+        yield from _line('Objective', f'{objective:,.1f} nats')
+    if (unexplained := result.get('unexplained')) is not None:
+        share = _share(unexplained, readings)
+        yield from _line('Unexplained', f'{unexplained:,} readings ({share}) have chance as their likeliest cause')
+    work = [f'{statistics[key]:,} {key}' for key in ('pairs', 'sweeps', 'flips', 'shifts') if statistics.get(key)]
+    if (converged := statistics.get('converged')) is not None:
+        work.append('converged' if converged else 'NOT converged: max_sweeps was reached')
+    if work:
+        yield from _line('Search', ', '.join(work))
+
+
+def _seconds(data: dict[str, Any]) -> Iterator[str]:
+    seconds = data.get('seconds')
+    if isinstance(seconds, (int, float)):
+        yield from _line('Seconds', f'{seconds:.2f}')
+    elif seconds:
+        stages = {name: s for name, s in seconds.items() if isinstance(s, (int, float))}
+        text = ', '.join(f'{name} {s:.2f}' for name, s in stages.items())
+        yield from _line('Seconds', text if 'total' in stages else f'{text}; together {sum(stages.values()):.2f}')
+
+
+def _parameters(data: dict[str, Any]) -> Iterator[str]:
+    changed = data.get('changed_parameters')
+    if changed is None:
+        return
+    if not changed:
+        yield from _line('Parameters', 'all at their defaults')
+        return
+    yield 'Parameters that differ from the defaults'
+    width = max(map(len, changed))
+    for name, row in changed.items():
+        yield f'  {name:<{width}}  {row["value"]}  (default {row["default"]})'
+
+
+def _line(label: str, text: object) -> Iterator[str]:
+    lead = f'{label:<{_LABEL}}  '
+    options: dict[str, Any] = {'break_long_words': False, 'break_on_hyphens': False}
+    yield textwrap.fill(str(text), _WIDTH, initial_indent=lead, subsequent_indent=' ' * len(lead), **options)
+
+
+def _number(value: Any) -> str:
+    return '–' if value is None else f'{value:,}'
+
+
+def _share(part: Any, whole: Any) -> str:
+    return '–' if part is None or not whole else f'{100.0 * part / whole:.1f} %'
+
+
+def _date(stamps: Any) -> str:
+    """Return the first stamp as a date; nothing for simulated time, which starts at zero."""
+    first = stamps[0] if isinstance(stamps, list) and stamps else stamps
+    if not isinstance(first, int) or first < 10**17:
+        return ''
+    return datetime.fromtimestamp(first // 10**9, timezone.utc).strftime('%Y-%m-%d %H:%M:%S UTC')

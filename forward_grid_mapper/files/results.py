@@ -1,0 +1,75 @@
+"""Everything that a run leaves behind, written in one place for the node and the offline tool."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core.errors import OutputError
+from ..core.grid import Grid
+from ..core.maps import MapSet
+from .map_archive import write_npz
+from .map_files import write_raw, write_trinary
+from .output_folder import output_errors, output_folder
+from .report import report_data, write_report
+
+
+def write_results(
+    path: Path | str,
+    maps: MapSet,
+    source: Mapping[str, Any],
+    path_xy: NDArray[np.float64],
+    title: str,
+    reference: tuple[Grid, NDArray[np.int8]] | None = None,
+    extras: Mapping[str, str] | None = None,
+) -> dict[str, Any]:
+    """Write maps, archive, picture and report into a new folder; nothing is left if any of them fails.
+
+    Parameters
+    ----------
+    path : Path or str
+        The folder, which must not hold anything yet.
+    maps : MapSet
+    source : mapping
+        What `report_data` asks for.
+    path_xy : float64, shape (P, 2)
+        Where the robot drove, metres.
+    title : str
+        Of the picture.
+    reference : (Grid, int8 array), optional
+        The true map, for the picture.
+    extras : mapping of str to str, optional
+        More text files, by name.
+
+    Returns
+    -------
+    dict
+        The report.
+
+    Raises
+    ------
+    OutputError
+        If the folder exists, or cannot be written.
+    """
+    with output_folder(path) as folder:
+        write_raw(folder / 'live_map', maps.grid, maps.live)
+        write_trinary(folder / 'ml_map', maps.grid, maps.ml)
+        write_raw(folder / 'uncertainty_map', maps.grid, maps.uncertainty)
+        write_npz(folder / 'maps.npz', maps)
+        warnings = list(source.get('warnings') or [])
+        try:
+            from .picture import write_picture
+
+            write_picture(folder / 'maps.png', maps, path_xy, title, reference)
+        except OutputError as error:
+            warnings.append(f'no picture was drawn: {error}')
+        report = report_data(maps, {**source, 'warnings': warnings})
+        write_report(folder, report)
+        for name, text in (extras or {}).items():
+            with output_errors(folder / name):
+                (folder / name).write_text(text, encoding='utf-8')
+    return report

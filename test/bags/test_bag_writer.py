@@ -1,0 +1,118 @@
+"""Bags written for others to play: messages, quality of service, and nothing half made."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from bag_samples import MOUNTS, START, SUFFIXES, write_sample
+from rosbags.highlevel import AnyReader
+from rosbags.interfaces import QosDurability, QosReliability
+
+from forward_grid_mapper.bags import Bag, BagWriter
+from forward_grid_mapper.core.errors import OutputError
+from forward_grid_mapper.core.grid import Grid
+from forward_grid_mapper.core.messages import RangeMessage
+
+RANGE = RangeMessage(START, 'sonar_0', 1.0, 0.125, 5.0, 0.25)
+GRID = Grid(0.25, -3, 5, 4, 2)
+VALUES = np.array([[0, 100, -1, 50], [-1, -1, 7, 8]], np.int8)
+KINDS = sorted(SUFFIXES)
+
+
+def final_path(folder: Path, kind: str) -> Path:
+    return folder / ('out.bag' if kind == 'ros1' else 'out')
+
+
+@pytest.mark.parametrize('kind', KINDS)
+def test_grid_and_latched_topics(tmp_path: Path, kind: str) -> None:
+    path = final_path(tmp_path, kind)
+    with BagWriter(path, kind) as writer:
+        writer.write_static_transforms(MOUNTS, START)
+        writer.write_range('/sonar', RANGE, radiation_type=1, time=START + 5)
+        writer.write_grid('/map', GRID, VALUES, 'odom', START + 7)
+    with AnyReader([path]) as reader:
+        found = {c.topic: (c, t, reader.deserialize(raw, c.msgtype)) for c, t, raw in reader.messages()}
+    _, time, grid = found['/map']
+    assert time == START + 7
+    assert (grid.info.width, grid.info.height, grid.info.resolution) == (4, 2, 0.25)
+    assert (grid.info.origin.position.x, grid.info.origin.position.y) == (-0.75, 1.25)
+    assert (grid.info.origin.orientation.w, grid.header.frame_id) == (1.0, 'odom')
+    assert grid.data.tolist() == VALUES.ravel().tolist()
+    assert found['/sonar'][1] == START + 5
+    assert found['/sonar'][2].radiation_type == 1
+    assert [t.child_frame_id for t in found['/tf_static'][2].transforms] == ['sonar_0', 'sonar_1']
+    for topic, (connection, _, _) in found.items():
+        latched = topic != '/sonar'
+        if kind == 'ros1':
+            assert connection.ext.latching == latched
+        else:
+            (quality,) = connection.ext.offered_qos_profiles
+            assert quality.reliability == QosReliability.RELIABLE
+            assert (quality.durability == QosDurability.TRANSIENT_LOCAL) == latched
+
+
+@pytest.mark.parametrize('kind', KINDS)
+def test_existing_paths_are_refused(tmp_path: Path, kind: str) -> None:
+    path = write_sample(tmp_path, kind, count=2)
+    with pytest.raises(OutputError, match='exists already'), BagWriter(path, kind):
+        pass
+    with Bag(path) as bag:
+        assert bag.topics()['/odom'][1] == 2
+
+
+@pytest.mark.parametrize('kind', KINDS)
+def test_nothing_is_left_after_an_exception(tmp_path: Path, kind: str) -> None:
+    path = final_path(tmp_path, kind)
+    with pytest.raises(KeyboardInterrupt), BagWriter(path, kind) as writer:
+        writer.write_range('/sonar', RANGE)
+        assert not path.exists()
+        raise KeyboardInterrupt
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize('kind', KINDS)
+def test_a_path_taken_meanwhile_is_kept(tmp_path: Path, kind: str) -> None:
+    path = final_path(tmp_path, kind)
+    with pytest.raises(OutputError, match='exists already'), BagWriter(path, kind) as writer:
+        writer.write_range('/sonar', RANGE)
+        path.write_text('mine')
+    assert path.read_text() == 'mine'
+    assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize('kind', KINDS)
+def test_parents_are_made_and_files_in_the_way_reported(tmp_path: Path, kind: str) -> None:
+    with BagWriter(final_path(tmp_path / 'new' / 'folder', kind), kind) as writer:
+        writer.write_range('/sonar', RANGE)
+    assert final_path(tmp_path / 'new' / 'folder', kind).exists()
+    (tmp_path / 'file').touch()
+    with pytest.raises(OutputError, match='cannot be written'), BagWriter(final_path(tmp_path / 'file', kind), kind):
+        pass
+
+
+def test_wrong_use(tmp_path: Path) -> None:
+    with pytest.raises(OutputError, match='mcap, sqlite3, ros1'):
+        BagWriter(tmp_path / 'bag', 'hdf5')
+    with pytest.raises(OutputError, match=r'must end in \.bag'), BagWriter(tmp_path / 'bag', 'ros1'):
+        pass
+    with pytest.raises(OutputError, match='cannot have'), BagWriter(tmp_path / '100%', 'sqlite3'):
+        pass
+    with pytest.raises(OutputError, match='not open'):
+        BagWriter(tmp_path / 'bag').write_range('/sonar', RANGE)
+    with BagWriter(tmp_path / 'bag') as writer:
+        writer.write_range('/sonar', RANGE)
+        with pytest.raises(ValueError, match='shape'):
+            writer.write_grid('/map', GRID, VALUES.T, 'odom', START)
+        with pytest.raises(OutputError, match='a topic of its own'):
+            writer.write_grid('/sonar', GRID, VALUES, 'odom', START)
+        with pytest.raises(OutputError, match='cannot be written'):
+            writer.write_range('/sonar', RANGE._replace(stamp=2**80))
+
+
+@pytest.mark.parametrize('kind', KINDS)
+def test_an_interrupted_name_with_spaces_and_accents(tmp_path: Path, kind: str) -> None:
+    path = write_sample(tmp_path, kind, count=2, name='Büro 1 – Süd')
+    with Bag(path) as bag:
+        assert len(list(bag.messages(bag.choose_topics()))) == 4

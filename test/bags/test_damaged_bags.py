@@ -1,0 +1,140 @@
+"""Bags that are cut off or have flipped bits give what is intact, or a BagError; never anything else."""
+
+from __future__ import annotations
+
+import random
+import time
+from pathlib import Path
+
+import pytest
+from bag_samples import COUNT, SUFFIXES, sample_messages, storage_file, write_many_chunks, write_sample
+
+from forward_grid_mapper.bags import Bag, Topics
+from forward_grid_mapper.core.errors import BagError, MapperError
+from forward_grid_mapper.core.messages import RangeMessage
+
+KINDS = sorted(SUFFIXES)
+TOPICS = Topics(('/sonar',), '/odom')
+
+
+def read(path: Path) -> tuple[list[object], str | None]:
+    with Bag(path) as bag:
+        bag.topics()
+        bag.static_transforms()
+        return list(bag.messages(TOPICS)), bag.truncated
+
+
+@pytest.mark.parametrize('kind', KINDS)
+def test_cut_files(tmp_path: Path, kind: str) -> None:
+    bag = write_sample(tmp_path, kind)
+    file = storage_file(bag)
+    content, whole = file.read_bytes(), sample_messages()
+    most = 0
+    for percent in (0, 1, 5, 10, 25, 50, 75, 90, 95, 99, 99.9):
+        file.write_bytes(content[: int(len(content) * percent / 100)])
+        for path in {bag, file}:
+            try:
+                messages, truncated = read(path)
+            except BagError as error:
+                assert '\n' not in str(error)
+                assert percent < 30, f'nothing was read of {percent} %'
+                continue
+            assert truncated is not None and '\n' not in truncated and 'repair it with' in truncated
+            if kind == 'sqlite3':  # a page that was cut in two keeps its later rows
+                assert messages == [m for m in whole if m in set(messages)]
+            else:
+                assert messages == whole[: len(messages)]
+            most = max(most, len(messages))
+    assert most > COUNT
+
+
+@pytest.mark.parametrize('kind', KINDS)
+def test_every_cut_near_the_ends(tmp_path: Path, kind: str) -> None:
+    file = storage_file(write_sample(tmp_path, kind, count=3))
+    content = file.read_bytes()
+    for size in (*range(1, 200), *range(len(content) - 200, len(content))):
+        file.write_bytes(content[:size])
+        try:
+            _, truncated = read(file)
+        except BagError:
+            continue
+        assert truncated is not None
+
+
+@pytest.mark.parametrize('kind', KINDS)
+def test_flipped_bits(tmp_path: Path, kind: str) -> None:
+    bag = write_sample(tmp_path, kind, count=20)
+    file = storage_file(bag)
+    content = file.read_bytes()
+    for seed in range(60):
+        rng = random.Random(seed)
+        damaged = bytearray(content)
+        for _ in range(rng.choice((1, 1, 20))):
+            damaged[rng.randrange(len(damaged))] ^= 1 << rng.randrange(8)
+        file.write_bytes(damaged)
+        begin = time.monotonic()
+        try:
+            read(rng.choice((bag, file)))
+        except MapperError as error:
+            assert str(error)
+        assert time.monotonic() - begin < 5.0
+
+
+def test_flipped_bits_in_metadata(tmp_path: Path) -> None:
+    bag = write_sample(tmp_path, 'mcap', count=20)
+    metadata = bag / 'metadata.yaml'
+    content = metadata.read_bytes()
+    for seed in range(60):
+        rng = random.Random(seed)
+        damaged = bytearray(content)
+        damaged[rng.randrange(len(damaged))] ^= 1 << rng.randrange(8)
+        metadata.write_bytes(damaged)
+        assert read(bag)[0] == sample_messages(20)
+
+
+@pytest.mark.parametrize(
+    ('kind', 'compression'), [('mcap', None), ('mcap', 'storage'), ('ros1', None), ('ros1', 'bz2'), ('ros1', 'lz4')]
+)
+def test_one_bad_chunk_costs_only_its_own_messages(tmp_path: Path, kind: str, compression: str | None) -> None:
+    bag = write_many_chunks(tmp_path, kind, compression)
+    file = storage_file(bag)
+    content = bytearray(file.read_bytes())
+    mark = {'storage': b'\x28\xb5\x2f\xfd', 'bz2': b'BZh', 'lz4': b'\x04\x22\x4d\x18', None: b'sonar_1'}[compression]
+    at = -1
+    for _ in range(6):
+        at = content.index(mark, at + 1)
+    content[at : at + 60] = bytes(60)  # more than a message: what follows it must be found again
+    file.write_bytes(content)
+    expected = [m for m in sample_messages() if isinstance(m, RangeMessage)]
+    with Bag(file) as opened:
+        messages = list(opened.messages(TOPICS))
+        damaged = opened.truncated is not None or sum(opened.undecodable.values()) > 0
+    intact = set(messages) & set(expected)
+    assert len(intact) < COUNT
+    assert damaged
+    assert len(intact) > COUNT * 0.8
+
+
+@pytest.mark.parametrize(('kind', 'compression'), [('mcap', None), ('mcap', 'storage'), ('ros1', 'bz2')])
+def test_a_recording_that_was_killed_has_no_index(tmp_path: Path, kind: str, compression: str | None) -> None:
+    file = storage_file(write_many_chunks(tmp_path, kind, compression))
+    content = file.read_bytes()
+    file.write_bytes(content[: len(content) * 7 // 10])
+    with Bag(file) as bag:
+        messages = list(bag.messages(TOPICS))
+        assert bag.topics()['/sonar'][1] == len(messages)
+        assert bag.truncated is not None
+    assert bag.truncated is not None, 'it must outlive the with block, for a report'
+    expected = [m for m in sample_messages() if isinstance(m, RangeMessage)]
+    assert len(messages) > COUNT // 3
+    assert messages == expected[: len(messages)]
+
+
+def test_a_damaged_file_of_a_split_bag_costs_only_itself(tmp_path: Path) -> None:
+    bag = write_sample(tmp_path, 'mcap')
+    (bag / 'second.mcap').write_bytes(b'\x89MCAP0\r\n')
+    metadata = bag / 'metadata.yaml'
+    metadata.write_text(metadata.read_text().replace('- bag.mcap', '- bag.mcap\n  - second.mcap', 1))
+    messages, truncated = read(bag)
+    assert messages == sample_messages()
+    assert truncated is not None and 'second.mcap' in truncated

@@ -1,0 +1,125 @@
+"""Sensor mounts from a tree of fixed transforms."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from forward_grid_mapper.bags import StaticTransforms
+from forward_grid_mapper.core.errors import InputError
+from forward_grid_mapper.core.messages import Pose2
+
+NONE = (0.0, 0.0, 0.0)
+IDENTITY = (0.0, 0.0, 0.0, 1.0)
+
+
+def about(axis: str, angle: float) -> tuple[float, float, float, float]:
+    vector = [0.0, 0.0, 0.0]
+    vector['xyz'.index(axis)] = math.sin(angle / 2)
+    return (*vector, math.cos(angle / 2))
+
+
+def test_chain_branches_and_the_way_back() -> None:
+    transforms = StaticTransforms()
+    transforms.add('base', 'deck', (1.0, 0.0, 0.5), about('z', math.pi / 2))
+    transforms.add('/deck', '/sonar', (2.0, 0.0, 0.0), about('z', math.pi / 2))
+    transforms.add('base', 'mast', (0.0, 3.0, 0.0), IDENTITY)
+    x, y, yaw = transforms.lookup('base', 'sonar')
+    assert (x, y, abs(yaw)) == pytest.approx((1.0, 2.0, math.pi))
+    x, y, yaw = transforms.lookup('/sonar', 'base')
+    assert (x, y, abs(yaw)) == pytest.approx((1.0, 2.0, math.pi))
+    assert transforms.lookup('mast', 'deck') == pytest.approx((1.0, -3.0, math.pi / 2))
+    assert transforms.lookup('base', 'base') == Pose2(0.0, 0.0, 0.0)
+    assert transforms.lookup('base', 'nowhere') is None
+    assert transforms.frames == ['base', 'deck', 'mast', 'sonar']
+    assert len(transforms) == 3
+
+
+def test_separate_trees_are_not_joined() -> None:
+    transforms = StaticTransforms()
+    transforms.add('base', 'a', NONE, IDENTITY)
+    transforms.add('other', 'b', NONE, IDENTITY)
+    assert transforms.lookup('a', 'b') is None
+
+
+def test_a_sensor_upside_down_turns_the_other_way() -> None:
+    transforms = StaticTransforms()
+    transforms.add('base', 'flipped', (0.0, 0.0, 1.0), about('x', math.pi))
+    transforms.add('flipped', 'sonar', (1.0, 1.0, 0.0), about('z', 0.5))
+    assert transforms.lookup('base', 'sonar') == pytest.approx((1.0, -1.0, -0.5))
+
+
+@pytest.mark.parametrize('degrees', [-59.0, 0.0, 59.0])
+def test_tilt_is_projected(degrees: float) -> None:
+    transforms = StaticTransforms()
+    transforms.add('base', 'turned', NONE, about('z', 1.0))
+    transforms.add('turned', 'sonar', NONE, about('y', math.radians(degrees)))
+    assert transforms.lookup('base', 'sonar') == pytest.approx((0.0, 0.0, 1.0))
+
+
+@pytest.mark.parametrize(('degrees', 'side'), [(61.0, 'down'), (90.0, 'down'), (-61.0, 'up'), (-90.0, 'up')])
+def test_floor_and_ceiling_are_refused(degrees: float, side: str) -> None:
+    transforms = StaticTransforms()
+    transforms.add('base', 'sonar_9', NONE, about('y', math.radians(degrees)))
+    with pytest.raises(InputError, match=f"'sonar_9' looks {side}"):
+        transforms.lookup('base', 'sonar_9')
+
+
+@pytest.mark.parametrize(
+    ('translation', 'quaternion'),
+    [
+        (NONE, (0.0, 0.0, 0.0, 0.0)),
+        (NONE, (0.0, 0.0, 1.0, 1.0)),
+        (NONE, (math.nan, 0.0, 0.0, 1.0)),
+        ((math.inf, 0.0, 0.0), IDENTITY),
+    ],
+)
+def test_bad_numbers_are_refused(translation: tuple[float, ...], quaternion: tuple[float, ...]) -> None:
+    transforms = StaticTransforms()
+    with pytest.raises(InputError, match="'base' to 'sonar'"):
+        transforms.add('/base', 'sonar', translation, quaternion)
+    assert transforms.lookup('base', 'sonar') is None
+
+
+def test_a_rejected_transform_matters_only_on_the_way() -> None:
+    transforms = StaticTransforms()
+    transforms.rejected['arm'] = 'the arm is broken'
+    transforms.add('arm', 'sonar', NONE, IDENTITY)
+    transforms.add('base', 'wheel', NONE, IDENTITY)
+    assert transforms.lookup('base', 'wheel') is not None
+    with pytest.raises(InputError, match='the arm is broken'):
+        transforms.lookup('base', 'sonar')
+
+
+def test_loops_end_and_later_transforms_win() -> None:
+    transforms = StaticTransforms()
+    transforms.add('a', 'b', NONE, IDENTITY)
+    transforms.add('b', 'a', NONE, IDENTITY)
+    assert transforms.lookup('c', 'a') is None
+    with pytest.raises(InputError):
+        transforms.add('a', '/a', NONE, IDENTITY)
+    transforms.add('base', 'sonar', NONE, IDENTITY)
+    transforms.add('base', 'sonar', (1.0, 0.0, 0.0), IDENTITY)
+    assert transforms.lookup('base', 'sonar') == Pose2(1.0, 0.0, 0.0)
+
+
+def test_composition_agrees_with_rotating_vectors() -> None:
+    """Each step is applied to points by the formula v + 2 q × (q × v + w v)."""
+    rng = np.random.default_rng(3)
+    transforms = StaticTransforms()
+    origin, tip = np.zeros(3), np.array([1.0, 0.0, 0.0])
+    steps = []
+    for i in range(4):
+        # Small turns keep the sensor within 60° of the plane.
+        quaternion = np.append(rng.normal(0.0, 0.08, 3), 1.0)
+        quaternion /= np.linalg.norm(quaternion)
+        steps.append((rng.normal(size=3), quaternion))
+        transforms.add(f'f{i}', f'f{i + 1}', steps[-1][0], quaternion)
+    for offset, quaternion in reversed(steps):
+        q, w = quaternion[:3], quaternion[3]
+        origin, tip = (v + 2 * np.cross(q, np.cross(q, v) + w * v) + offset for v in (origin, tip))
+    forward = tip - origin
+    expected = (origin[0], origin[1], math.atan2(forward[1], forward[0]))
+    assert transforms.lookup('f0', 'f4') == pytest.approx(expected)

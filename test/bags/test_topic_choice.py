@@ -1,0 +1,60 @@
+"""Which topics are mapped from, and what is said when that is not clear."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from bag_samples import START, write_sample
+
+from forward_grid_mapper.bags import Bag, BagWriter, Topics
+from forward_grid_mapper.core.errors import BagError
+from forward_grid_mapper.core.messages import OdometryMessage, Pose2, RangeMessage
+
+ODOMETRY = OdometryMessage(START, 'odom', 'base_link', Pose2(0.0, 0.0, 0.0))
+RANGE = RangeMessage(START, 'sonar_0', 1.0, 0.125, 5.0, 0.25)
+
+
+def test_choice_by_name(tmp_path: Path) -> None:
+    with Bag(write_sample(tmp_path, 'mcap', shared_topic=False)) as bag:
+        assert bag.choose_topics(['sonar_1', '/sonar_1'], 'odom') == Topics(('/sonar_1',), '/odom')
+        with pytest.raises(BagError, match=r"no topic 'sonar_9'; `--range-topics` can be: /sonar_0, /sonar_1"):
+            bag.choose_topics(['sonar_9'])
+        with pytest.raises(BagError, match=r'type nav_msgs/msg/Odometry, not sensor_msgs/msg/Range.*/sonar_0'):
+            bag.choose_topics(['/odom'])
+        with pytest.raises(BagError, match=r"no topic '/o'; `--odom-topic` can be: /odom"):
+            bag.choose_topics(odom_topic='/o')
+
+
+def test_several_odometry_topics_must_be_chosen_from(tmp_path: Path) -> None:
+    with BagWriter(tmp_path / 'bag') as writer:
+        writer.write_range('/sonar', RANGE)
+        writer.write_odometry('/odom', ODOMETRY)
+        writer.write_odometry('/odom', ODOMETRY)
+        writer.write_odometry('/corrected', ODOMETRY._replace(frame_id='map'))
+    with Bag(tmp_path / 'bag') as bag:
+        with pytest.raises(BagError) as caught:
+            bag.choose_topics()
+        assert bag.choose_topics(odom_topic='corrected').odom_topic == '/corrected'
+    text = str(caught.value)
+    assert '--odom-topic' in text
+    assert '/odom: 2 messages, odom → base_link' in text
+    assert '/corrected: 1 messages, map → base_link' in text
+
+
+def test_bags_that_lack_something(tmp_path: Path) -> None:
+    with BagWriter(tmp_path / 'a') as writer:
+        writer.write_odometry('/odom', ODOMETRY)
+    with BagWriter(tmp_path / 'b') as writer:
+        writer.write_range('/sonar', RANGE)
+    with BagWriter(tmp_path / 'c'):
+        pass
+    with Bag(tmp_path / 'a') as bag, pytest.raises(BagError, match=r'no sensor_msgs/Range.*\n  /odom: 1 nav_msgs'):
+        bag.choose_topics()
+    with Bag(tmp_path / 'b') as bag:
+        with pytest.raises(BagError, match=r'no nav_msgs/Odometry.*\n  /sonar: 1 sensor_msgs'):
+            bag.choose_topics()
+        with pytest.raises(BagError, match=r"no topic 'odom', nor any other nav_msgs"):
+            bag.choose_topics(odom_topic='odom')
+    with Bag(tmp_path / 'c') as bag, pytest.raises(BagError, match='no topics at all'):
+        bag.choose_topics()

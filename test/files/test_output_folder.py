@@ -1,0 +1,126 @@
+"""Folders that appear whole or not at all."""
+
+from __future__ import annotations
+
+import errno
+import os
+from pathlib import Path
+
+import pytest
+
+from forward_grid_mapper.core.errors import OutputError
+from forward_grid_mapper.files.output_folder import free_name, output_errors, output_folder
+
+
+def names_in(folder: Path) -> list[str]:
+    return sorted(entry.name for entry in folder.iterdir())
+
+
+def fill(path: Path) -> None:
+    with output_folder(path) as folder:
+        assert folder != path
+        assert not (path / 'a.txt').exists()
+        (folder / 'a.txt').write_text('a')
+        (folder / 'sub').mkdir()
+
+
+@pytest.mark.parametrize('name', ['maps', 'maps.v2', 'runs/today/maps'])
+def test_appears_when_done(tmp_path: Path, name: str) -> None:
+    fill(tmp_path / name)
+    assert names_in(tmp_path / name) == ['a.txt', 'sub']
+    assert len(list(tmp_path.iterdir())) == 1
+
+
+def test_has_ordinary_permissions(tmp_path: Path) -> None:
+    (tmp_path / 'plain').mkdir()
+    fill(tmp_path / 'maps')
+    assert (tmp_path / 'maps').stat().st_mode == (tmp_path / 'plain').stat().st_mode
+
+
+def test_fills_an_empty_folder_in_place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    inode = tmp_path.stat().st_ino
+    monkeypatch.chdir(tmp_path)
+    fill(Path())
+    assert names_in(tmp_path) == ['a.txt', 'sub']
+    assert tmp_path.stat().st_ino == inode
+
+
+def test_refuses_a_folder_with_something_in_it(tmp_path: Path) -> None:
+    (tmp_path / 'mine.txt').write_text('mine')
+    with pytest.raises(OutputError, match='choose another with -o'):
+        fill(tmp_path)
+    assert names_in(tmp_path) == ['mine.txt']
+
+
+def test_refuses_a_file(tmp_path: Path) -> None:
+    (tmp_path / 'maps').write_text('mine')
+    with pytest.raises(OutputError, match='is a file'):
+        fill(tmp_path / 'maps')
+    with pytest.raises(OutputError, match='is a file, not a folder'):
+        fill(tmp_path / 'maps' / 'inner')
+
+
+def test_refuses_a_folder_that_came_up_meanwhile(tmp_path: Path) -> None:
+    with pytest.raises(OutputError, match='cannot be written'), output_folder(tmp_path / 'maps') as folder:
+        (folder / 'a.txt').write_text('a')
+        (tmp_path / 'maps').mkdir()
+        (tmp_path / 'maps' / 'mine.txt').write_text('mine')
+    assert names_in(tmp_path) == ['maps']
+    assert names_in(tmp_path / 'maps') == ['mine.txt']
+
+
+@pytest.mark.parametrize('failure', [RuntimeError, KeyboardInterrupt, FileNotFoundError])
+@pytest.mark.parametrize('exists', [False, True])
+def test_nothing_stays_after_a_failure(tmp_path: Path, failure: type[BaseException], exists: bool) -> None:
+    target = tmp_path / 'maps' if exists else tmp_path / 'new' / 'maps'
+    if exists:
+        target.mkdir()
+    with pytest.raises(failure), output_folder(target) as folder:
+        (folder / 'a.txt').write_text('a')
+        raise failure
+    assert list(tmp_path.iterdir()) == ([target] if exists else [])
+    assert not exists or not names_in(target)
+
+
+def test_a_full_disk_is_told(tmp_path: Path) -> None:
+    with pytest.raises(OutputError, match='disk is full'), output_folder(tmp_path / 'maps'):
+        raise OSError(errno.ENOSPC, 'No space left on device')
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_forbidden_parent_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(self: Path, *args: object, **kwargs: object) -> None:
+        raise PermissionError(errno.EACCES, 'Permission denied')
+
+    monkeypatch.setattr(Path, 'mkdir', refuse)
+    with pytest.raises(OutputError, match='no permission'):
+        fill(tmp_path / 'maps')
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason='permissions do not bind root')
+def test_a_forbidden_parent_is_told_for_real(tmp_path: Path) -> None:
+    tmp_path.chmod(0o500)
+    with pytest.raises(OutputError, match='no permission'):
+        fill(tmp_path / 'maps')
+    tmp_path.chmod(0o700)
+
+
+def test_output_errors_name_the_file() -> None:
+    with pytest.raises(OutputError, match=r'maps\.npz cannot be written: odd'), output_errors(Path('maps.npz')):
+        raise OSError(errno.EINVAL, 'odd')
+
+
+def test_free_name_never_overwrites(tmp_path: Path) -> None:
+    assert free_name(tmp_path / 'absent', 'maps') == tmp_path / 'absent' / 'maps'
+    for expected in ('maps', 'maps_2', 'maps_3'):
+        path = free_name(tmp_path, 'maps')
+        assert path == tmp_path / expected
+        path.mkdir()
+    (tmp_path / 'maps_4').symlink_to('nowhere')
+    assert free_name(tmp_path, 'maps').name == 'maps_5'
+
+
+def test_free_name_below_a_file(tmp_path: Path) -> None:
+    (tmp_path / 'file').write_text('')
+    with pytest.raises(OutputError, match='is a file'):
+        free_name(tmp_path / 'file', 'maps')

@@ -1,0 +1,184 @@
+"""Parameters from files and command lines, and back."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from forward_grid_mapper.core.errors import ParameterError
+from forward_grid_mapper.core.messages import Pose2
+from forward_grid_mapper.core.parameters import TABLE, Parameter, Parameters
+from forward_grid_mapper.files.parameter_file import ParameterFile, load_parameters, parse_sensor, parse_setting
+from forward_grid_mapper.files.parameter_text import dump_parameters, parameters_markdown
+
+
+def admitted(row: Parameter) -> st.SearchStrategy[Any]:
+    if row.choices:
+        return st.sampled_from(row.choices)
+    if row.type is bool:
+        return st.booleans()
+    return st.integers(int(row.low), int(row.high)) if row.type is int else st.floats(row.low, row.high)
+
+
+all_values = st.fixed_dictionaries({row.name: admitted(row) for row in TABLE})
+
+
+def load(tmp_path: Path, text: str) -> ParameterFile:
+    (tmp_path / 'p.yaml').write_text(text)
+    return load_parameters(tmp_path / 'p.yaml')
+
+
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
+@given(values=all_values)
+def test_dump_round_trip(tmp_path: Path, values: dict[str, Any]) -> None:
+    parameters = Parameters.from_flat(values)
+    read = load(tmp_path, dump_parameters(parameters))
+    assert Parameters.from_flat(read.values) == parameters
+    assert not read.mounts and not read.node
+
+
+def test_dump_is_commented_and_plain_yaml() -> None:
+    text = dump_parameters(Parameters())
+    assert all(len(line) <= 100 for line in text.splitlines())
+    for row in TABLE:
+        assert row.help.split()[0] in text
+        assert f'\n    {row.name}: ' in text
+    # A parser of YAML 1.1 must see numbers too.
+    assert yaml.safe_load(text)['/**']['ros__parameters'] == Parameters().flat()
+
+
+def test_markdown_has_a_row_for_each() -> None:
+    text = parameters_markdown()
+    rows = [line for line in text.splitlines() if line.startswith('| `')]
+    assert len(rows) == len(TABLE)
+    assert all(row.replace('\\|', '').count('|') == 6 for row in rows)
+    assert text.count('\n## ') == len({row.group for row in TABLE}) - 1
+
+
+@pytest.mark.parametrize(
+    'text',
+    [
+        'p_hit: 0.3\nrange_topics: [a, b]\nsensors: {base/left.1: {pose: [0, 0.5, 1e-1]}}',
+        '/**:\n  ros__parameters:\n    p_hit: 0.3\n    range_topics: [a, b]\n'
+        '    sensors.base/left.1.pose: [0, 0.5, 0.1]',
+        'forward_grid_mapper:\n  ros__parameters:\n    p_hit: 3e-1\n    range_topics: [a, b]\n'
+        '    sensors:\n      base/left.1.pose: [0, 0.5, 0.1]',
+        '/robot/forward_grid_mapper:\n  ros__parameters:\n    p_hit: 0.3\n    range_topics: [a, b]\n'
+        '    sensors: {base/left.1: {pose: [0, 0.5, 0.1]}}\namcl: {ros__parameters: {alpha1: 0.2}}',
+        'robot:\n  renamed:\n    ros__parameters:\n      p_hit: 0.3\n      range_topics: [a, b]\n'
+        '      sensors: {base/left: {1.pose: [0, 0.5, 0.1]}}',
+    ],
+)
+def test_forms_of_a_file(tmp_path: Path, text: str) -> None:
+    assert load(tmp_path, text) == ParameterFile(
+        {'p_hit': 0.3}, {'base/left.1': Pose2(0.0, 0.5, 0.1)}, {'range_topics': ['a', 'b']}
+    )
+
+
+@pytest.mark.parametrize('text', ['', '# nothing', '/**:\n  ros__parameters:\n', '{}'])
+def test_files_without_values(tmp_path: Path, text: str) -> None:
+    assert load(tmp_path, text) == ParameterFile({}, {}, {})
+
+
+def test_the_specific_section_wins(tmp_path: Path) -> None:
+    own = 'forward_grid_mapper: {ros__parameters: {p_hit: 0.5}}\n'
+    common = '/**: {ros__parameters: {p_hit: 0.3, use_sim_time: true}}\n'
+    for text in (own + common, common + own):
+        assert load(tmp_path, text) == ParameterFile({'p_hit': 0.5}, {}, {'use_sim_time': True})
+
+
+def test_parameters_of_ros_itself_pass(tmp_path: Path) -> None:
+    assert load(tmp_path, 'qos_overrides: {/odom: {subscription: {depth: 5}}}').node == {
+        'qos_overrides./odom.subscription.depth': 5
+    }
+
+
+@pytest.mark.parametrize(
+    ('text', 'message'),
+    [
+        ('p_hitt: 0.3', 'did you mean p_hit'),
+        ('range_topic: [a]', 'did you mean range_topics'),
+        ('p_hit: often', "p_hit: 'often' is not a number"),
+        ('p_hit: 1.5', 'p_hit: 1.5 is out of range'),
+        ('p_hit:', 'p_hit: None is not a number'),
+        ('max_sweeps: 1.5', 'max_sweeps: 1.5 is not a whole number'),
+        ('shift_moves: 1', 'shift_moves: 1 is not true or false'),
+        ('over_range: keep', 'not one of no_echo, discard'),
+        ('p_hit: 0.3\np_hit: 0.4', 'p_hit is given twice'),
+        ('sensors.a.pose: [0, 0, 0]\nsensors: {a: {pose: [0, 0, 1]}}', 'sensors.a.pose is given twice'),
+        ('sensors.a.pose: [0, 0]', 'sensors.a.pose: .* three finite numbers'),
+        ('sensors.a.pose: [0, 0, 0, 0]', 'three finite numbers'),
+        ('sensors.a.pose: [0, 0, .nan]', 'three finite numbers'),
+        ('sensors.a.pose: [0, true, 1]', 'three finite numbers'),
+        ('sensors.a.pose: "0, 0, 0"', 'three finite numbers'),
+        ('sensors.a.position: [0, 0, 0]', r'sensors\.<frame_id>\.pose'),
+        ('sensors: [a]', r'sensors\.<frame_id>\.pose'),
+        ('- p_hit', 'names with values'),
+        ('/**: {ros__parameters: [1]}', 'names with values'),
+        ('amcl: {ros__parameters: {a: 1}}\nother: {ros__parameters: {a: 1}}', 'there are: amcl, other'),
+        ('p_hit: [', 'not valid YAML'),
+        ('? [a, b]\n: 1', 'not valid YAML|no parameter is called'),
+        ('p_hit: !!python/object/apply:os.getcwd []', 'not valid YAML'),
+    ],
+)
+def test_bad_files_are_named(tmp_path: Path, text: str, message: str) -> None:
+    with pytest.raises(ParameterError, match=message) as caught:
+        load(tmp_path, text)
+    assert str(tmp_path / 'p.yaml') in str(caught.value)
+
+
+def test_files_that_cannot_be_read(tmp_path: Path) -> None:
+    with pytest.raises(ParameterError, match='cannot be read'):
+        load_parameters(tmp_path / 'absent.yaml')
+    (tmp_path / 'binary').write_bytes(b'\xff\xfe\x00\x81')
+    with pytest.raises(ParameterError, match='not valid YAML'):
+        load_parameters(tmp_path / 'binary')
+
+
+@settings(deadline=None)
+@given(values=all_values)
+def test_settings_round_trip(values: dict[str, Any]) -> None:
+    for name, value in values.items():
+        assert parse_setting(f' {name} = {value} ') == (name, value)
+
+
+@pytest.mark.parametrize(
+    ('text', 'message'),
+    [
+        ('p_hit', 'form name=value'),
+        ('=1', 'form name=value'),
+        ('p_hitt=1', 'did you mean p_hit'),
+        ('p_hit=', "'' is not a number"),
+        ('p_hit=nan', 'out of range'),
+        ('max_sweeps=1.5', "'1.5' is not a whole number"),
+        ('shift_moves=maybe', 'not true or false'),
+        ('range_topics=a', 'node only'),
+    ],
+)
+def test_bad_settings(text: str, message: str) -> None:
+    with pytest.raises(ParameterError, match=message):
+        parse_setting(text)
+
+
+@pytest.mark.parametrize(
+    ('text', 'expected'),
+    [
+        ('left=0.1,-2,1.5', ('left', Pose2(0.1, -2.0, 1.5))),
+        (' base/left = 0.1, 1e-2, 90 deg', ('base/left', Pose2(0.1, 0.01, math.pi / 2))),
+        ('a=b=0,0,-90deg', ('a=b', Pose2(0.0, 0.0, -math.pi / 2))),
+    ],
+)
+def test_sensors(text: str, expected: tuple[str, Pose2]) -> None:
+    assert parse_sensor(text) == expected
+
+
+@pytest.mark.parametrize('text', ['left', '=1,2,3', 'left=1,2', 'left=1,2,3,4', 'left=1,2,inf', 'left=a,b,c', 'left='])
+def test_bad_sensors(text: str) -> None:
+    with pytest.raises(ParameterError, match='form frame=x,y,yaw'):
+        parse_sensor(text)

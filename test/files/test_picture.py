@@ -1,0 +1,85 @@
+"""The picture: what it shows, and that it never stops a run."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from made_maps import made_maps
+
+from forward_grid_mapper import files
+from forward_grid_mapper.core.errors import OutputError
+from forward_grid_mapper.core.grid import Grid
+from forward_grid_mapper.files.picture import compose, write_picture
+
+PATH = np.stack([np.linspace(-1, 1, 50), np.zeros(50)], axis=1)
+PNG = b'\x89PNG\r\n\x1a\n'
+
+
+@pytest.mark.parametrize(('width', 'height'), [(40, 30), (300, 40), (20, 150), (8, 8)])
+@pytest.mark.parametrize('with_reference', [False, True])
+def test_shapes_of_maps(tmp_path: Path, width: int, height: int, with_reference: bool) -> None:
+    pytest.importorskip('matplotlib')
+    maps = made_maps(width, height)
+    reference = (Grid(0.05, -5, -5, 30, 20), np.ones((20, 30), np.int8)) if with_reference else None
+    write_picture(tmp_path / 'maps.png', maps, PATH, 'costs $5 or $6_a^b ' * 20, reference)
+    assert (tmp_path / 'maps.png').read_bytes().startswith(PNG)
+
+
+@pytest.mark.parametrize('path', [np.empty((0, 2)), np.zeros((1, 2)), np.full((3, 2), np.nan), np.ones((5, 2))])
+def test_odd_paths(tmp_path: Path, path: np.ndarray) -> None:
+    pytest.importorskip('matplotlib')
+    write_picture(tmp_path / 'maps.png', made_maps(readings=0), path, 'no readings')
+    assert (tmp_path / 'maps.png').read_bytes().startswith(PNG)
+
+
+def test_pyplot_stays_out(tmp_path: Path) -> None:
+    pytest.importorskip('matplotlib')
+    sys.modules.pop('matplotlib.pyplot', None)
+    write_picture(tmp_path / 'maps.png', made_maps(), PATH, 'run')
+    assert 'matplotlib.pyplot' not in sys.modules
+
+
+def test_view_is_cropped_to_what_is_known() -> None:
+    maps = made_maps()
+    maps.ml[:], maps.live[:] = -1, np.nan
+    maps.ml[10, 5], maps.live[12, 9] = 1, 0.4
+    picture = compose(maps, np.empty((0, 2)), '', None)
+    np.testing.assert_allclose(picture.view, (-1.5 - 0.2, -1.0 + 0.2, -0.5 - 0.2, -0.2 + 0.2), atol=1e-9)
+    ml = picture.panels[1]
+    row, column = np.argwhere(ml.values == 1)[0]
+    np.testing.assert_allclose(
+        (ml.extent[0] + column * 0.1, ml.extent[2] + row * 0.1), (-1.5, -0.5), atol=1e-9, err_msg='cell is not in place'
+    )
+
+
+def test_walls_survive_in_coarse_pictures() -> None:
+    maps = made_maps(6001, 11)
+    picture = compose(maps, np.empty((0, 2)), '', None)
+    values = picture.panels[1].values
+    assert max(values.shape) <= 2400
+    assert (np.fmax.reduce(values, axis=0)[3:-3] == 1).all()
+
+
+def test_unexplained_readings_end_on_their_axis() -> None:
+    maps = made_maps()
+    ends = compose(maps, PATH, '', None).unexplained_xy
+    odd = maps.readings.select(maps.unexplained)
+    np.testing.assert_allclose(np.hypot(ends[:, 0] - odd.x, ends[:, 1] - odd.y), odd.z)
+    assert len(ends) == 6
+
+
+def test_matplotlib_is_optional(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, 'matplotlib', None)
+    monkeypatch.delitem(sys.modules, 'forward_grid_mapper.files.drawing', raising=False)
+    monkeypatch.delattr(files, 'drawing', raising=False)
+    with pytest.raises(OutputError, match='pip install matplotlib'):
+        write_picture(tmp_path / 'maps.png', made_maps(), PATH, 'run')
+
+
+def test_a_folder_that_is_absent(tmp_path: Path) -> None:
+    pytest.importorskip('matplotlib')
+    with pytest.raises(OutputError, match='cannot be written'):
+        write_picture(tmp_path / 'absent' / 'maps.png', made_maps(), PATH, 'run')

@@ -1,0 +1,109 @@
+"""The report, as data and as text."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from made_maps import made_maps
+
+from forward_grid_mapper.core.errors import OutputError
+from forward_grid_mapper.files.report import report_data, report_text, write_report
+
+SOURCE: dict[str, Any] = {
+    'bag': Path('/data/run_1.mcap'),
+    'range_topics': ('/left', '/right'),
+    'odom_topic': '/odom',
+    'odom_frame': 'odom',
+    'map_frame': 'odom',
+    'mounts_from': "the bag's /tf_static",
+    'counts': {'received': np.int64(100), 'accepted': 60, 'rejected': {'no pose': 30, 'range is NaN': np.int32(10)}},
+    'stamps': (1_700_000_000_000_000_000, 1_700_000_060_000_000_000),
+    'duration_s': np.float32(60.0),
+    'path_m': 31.25,
+    'warnings': ['sonar_back has no pose: 30 readings rejected'],
+    'sensors': {'sonar_left': {'no_echo': 7}, 'sonar_back': {'accepted': 0, 'no_echo': 0, 'unexplained': 0}},
+    'note': np.nan,
+}
+STATISTICS: dict[str, Any] = {
+    'pairs': np.int64(12345),
+    'flips': 321,
+    'shifts': 12,
+    'sweeps': 5,
+    'converged': np.bool_(False),
+    'seconds': {'index': np.float64(0.25), 'search': 0.5},
+}
+
+
+def test_data_survives_strict_json() -> None:
+    data = report_data(made_maps(statistics=STATISTICS), SOURCE)
+    assert json.loads(json.dumps(data, allow_nan=False)) == data
+    assert data['input']['note'] is None
+    assert data['input']['bag'] == '/data/run_1.mcap'
+    assert data['statistics']['converged'] is False
+
+
+def test_numbers_come_from_the_maps() -> None:
+    data = report_data(made_maps(width=40, height=30, readings=60), SOURCE)
+    assert data['map']['free_cells'] == 34 * 24
+    assert data['map']['occupied_cells'] == 36 * 26 - 34 * 24
+    assert data['map']['unknown_cells'] == 40 * 30 - 36 * 26
+    assert data['result'] == {'readings': 60, 'unexplained': 6, 'log_likelihood': -123.5, 'objective': -150.25}
+    assert data['sensors']['sonar_right'] == {'accepted': 30, 'no_echo': 0, 'unexplained': 0}
+    assert data['sensors']['sonar_left'] == {'accepted': 30, 'no_echo': 7, 'unexplained': 6}
+
+
+def test_the_source_is_not_changed() -> None:
+    source = {'counts': {'received': 1}, 'warnings': ['a']}
+    report_data(made_maps(), source)
+    assert source == {'counts': {'received': 1}, 'warnings': ['a']}
+
+
+def test_text_tells_what_matters() -> None:
+    text = report_text(report_data(made_maps(settings={'p_hit': 0.3}, statistics=STATISTICS), SOURCE))
+    for part in (
+        'WARNINGS (1)',
+        'sonar_back has no pose',
+        '/data/run_1.mcap',
+        '/left, /right',
+        '/odom, frame odom',
+        '31.2 m in 60.0 s from 2023-11-14 22:13:20 UTC',
+        '100 received, 60 accepted (60.0 %)',
+        '30   30.0 %  no pose',
+        '4.0 x 3.0 m: 40 x 30 cells of 0.1 m, corner (-2.00, -1.50)',
+        '120 occupied, 816 free, 264 not observed',
+        '-123.5 nats (-2.058 a reading)',
+        'NOT converged',
+        'index 0.25, search 0.50; together 0.75',
+        'p_hit  0.3  (default 0.9)',
+    ):
+        assert part in text
+    assert all(len(line) <= 100 for line in text.splitlines())
+
+
+def test_an_empty_source_is_enough() -> None:
+    text = report_text(report_data(made_maps(), {}))
+    assert '60 received, 60 accepted (100.0 %)' in text
+    assert 'all at their defaults' in text
+    assert 'None' not in text and 'WARNINGS' not in text
+
+
+def test_no_readings_and_no_likelihood() -> None:
+    maps = dataclasses.replace(made_maps(readings=0), log_likelihood=float('nan'), objective=float('-inf'))
+    data = report_data(maps, {'counts': {'received': 0, 'rejected': {}}, 'sensors': None, 'stamps': 12})
+    assert data['result']['objective'] is None
+    assert '0 received, 0 accepted (–)' in report_text(data)
+    assert report_text({}).startswith('Sonar maps')
+
+
+def test_files(tmp_path: Path) -> None:
+    data = report_data(made_maps(), SOURCE)
+    write_report(tmp_path, data)
+    assert json.loads((tmp_path / 'report.json').read_text(encoding='utf-8')) == data
+    assert (tmp_path / 'report.txt').read_text(encoding='utf-8') == report_text(data)
+    with pytest.raises(OutputError, match=r'report\.json'):
+        write_report(tmp_path / 'absent', data)
