@@ -67,16 +67,8 @@ class Expectations:
 
 
 def causes_of(readings: Readings, sigma: Floats, model: ModelParameters) -> Causes:
-    """Return the map-independent terms of each reading; `sigma` is that of `effective_sigma`.
-
-    Raises
-    ------
-    ValueError
-        If p_rand + p_lost leave nothing for the map to explain.
-    """
+    """Return the map-independent terms of each reading; `sigma` is that of `effective_sigma`."""
     share = 1.0 - model.p_rand - model.p_lost
-    if share <= 0:
-        raise ValueError('p_rand + p_lost must be below 1')
     error = (readings.z_max - readings.z) / sigma
     density = np.where(error <= model.cut, np.exp(-0.5 * error**2) / (math.sqrt(2 * math.pi) * sigma), 0.0)
     return Causes(model.p_hit, share, model.p_rand / readings.z_max, model.p_lost * density, density)

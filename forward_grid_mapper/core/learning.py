@@ -24,6 +24,9 @@ from .grid import Grid
 from .parameters import ModelParameters, find
 from .readings import Readings
 
+MOST_UNEXPLAINED = 0.9
+"""Largest sum of p_rand and p_lost that is learned."""
+
 
 def learn(readings: Readings, grid: Grid, occupied: NDArray[Any], model: ModelParameters) -> ModelParameters:
     """Return `model` after one update of its probabilities and σ, given a map; values stay in the table's ranges.
@@ -44,4 +47,10 @@ def learn(readings: Readings, grid: Grid, occupied: NDArray[Any], model: ModelPa
     bounded: dict[str, Any] = {
         name: float(np.clip(value, find(name).low, find(name).high)) for name, value in values.items()
     }
+    # a map that explains nothing must not take the whole model with it
+    excess = bounded['p_rand'] + bounded.get('p_lost', 0.0)
+    if excess > MOST_UNEXPLAINED:
+        for name in ('p_rand', 'p_lost'):
+            if name in bounded:
+                bounded[name] *= MOST_UNEXPLAINED / excess
     return dataclasses.replace(model, **bounded)

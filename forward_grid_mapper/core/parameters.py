@@ -74,21 +74,25 @@ class GridParameters:
 
 @dataclass(frozen=True)
 class ModelParameters:
-    """The forward sensor model (ALGORITHM: eq 20-24 of the paper, and lost echoes)."""
+    """The forward sensor model: why a reading is what it is.
+
+    The defaults are those of no single world: chance and lost echoes are likely, so that no reading, and no person who
+    walks by, weighs more than a few nats against many others.
+    """
 
     p_hit: float = _param(
-        0.9, 'Probability that an occupied cell in the cone returns the echo.', 'probability', 0.01, 0.98
+        0.6, 'Probability that an occupied cell in the cone returns the echo.', 'probability', 0.01, 0.98
     )
-    p_rand: float = _param(0.05, 'Probability that a reading is random, whatever the map.', 'probability', 1e-4, 0.9)
+    p_rand: float = _param(0.4, 'Probability that a reading is random, whatever the map.', 'probability', 1e-4, 0.95)
     p_lost: float = _param(
-        0.0,
-        "Probability that an echo is lost and the sensor reports no echo, whatever the map; 0 is the paper's model.",
+        0.25,
+        "Probability that no echo is heard, whatever the map, as off smooth walls; 0 is the paper's model.",
         'probability',
         0.0,
-        0.9,
+        0.95,
     )
     sigma: float = _param(
-        0.05,
+        0.1,
         'Standard deviation of a range where the message states none; never below half a cell.',
         'm',
         0.001,
@@ -101,13 +105,20 @@ class ModelParameters:
         choices=('center', 'nearest'),
     )
 
+    def __post_init__(self) -> None:
+        if self.p_rand + self.p_lost > 0.99:
+            raise ParameterError(
+                f'p_rand = {self.p_rand:g} and p_lost = {self.p_lost:g} leave nothing for the map to explain; '
+                f'their sum must not exceed 0.99'
+            )
+
 
 @dataclass(frozen=True)
 class SearchParameters:
     """The search for the maximum likelihood map, and its uncertainty."""
 
     prior: float = _param(
-        0.5,
+        0.4,
         "Prior probability of an occupied cell; 0.5 is the paper's plain ML, less removes dots and thins walls.",
         'probability',
         1e-6,
@@ -115,17 +126,17 @@ class SearchParameters:
     )
     shift_moves: bool = _param(True, 'Also try to move an occupied cell to a neighbouring one in a single step.')
     max_sweeps: int = _param(
-        200, 'Bound on the sweeps over the map; the search says when it was reached.', 'sweeps', 1, 100_000
+        200, 'Bound on the sweeps over the map; the report says when it was reached.', 'sweeps', 1, 100_000
     )
     alpha: float = _param(
-        0.5,
+        0.8,
         'Weight of the evidence in the uncertainty map (eq 45); 0 leaves only the prior, 1 trusts the one map found.',
         '',
         0.0,
         1.0,
     )
     uncertainty_prior: float = _param(
-        0.5, 'Prior occupancy used in the uncertainty map.', 'probability', 1e-6, 0.999999
+        0.3, 'Prior occupancy used in the uncertainty map.', 'probability', 1e-6, 0.999999
     )
 
 

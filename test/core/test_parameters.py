@@ -38,3 +38,8 @@ def test_unknown_names_get_a_hint() -> None:
         find('phit')
     with pytest.raises(ParameterError, match='resolution'):
         Parameters.from_flat({'zzz': 1})
+
+
+def test_causes_must_leave_something_for_the_map() -> None:
+    with pytest.raises(ParameterError, match='p_rand'):
+        Parameters.from_flat({'p_rand': 0.7, 'p_lost': 0.5})
