@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import argparse
+import io
+import os
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from pathlib import Path
 from types import TracebackType
 from typing import TextIO
 
@@ -16,20 +21,51 @@ PATIENCE = 1.0
 """Seconds of work before progress is shown."""
 
 
-def run(command: str, body: Callable[[], int | None]) -> int:
-    """Run a command's body; return its exit code, with errors told in one line."""
+def run(
+    parser: argparse.ArgumentParser, body: Callable[[argparse.Namespace], int], arguments: Sequence[str] | None
+) -> int:
+    """Run a command's body with its options; return its exit code, with errors told in one line."""
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        # a path may hold what the terminal cannot show
+        sys.stdout.reconfigure(errors='backslashreplace')
     try:
-        return body() or 0
+        try:
+            return body(parser.parse_args(arguments))
+        finally:
+            # here an error can still be told
+            sys.stdout.flush()
     except MapperError as error:
-        print(f'{command}: error: {error}', file=sys.stderr)
-        return 1
+        problem = str(error)
+    except MemoryError:
+        problem = 'the memory is not enough for so large a map; raise resolution, or lower max_cells or max_range'
     except BrokenPipeError:
         # the reader of our output went away, as `head` does
-        sys.stderr.close()
+        _still_printing()
         return 1
+    except OSError as error:
+        # of the work's files the work takes care; what remains is the output itself, or the working directory
+        problem = str(error) if _still_printing() else f'standard output: {error}'
     except KeyboardInterrupt:
-        print(f'{command}: cancelled; nothing was written', file=sys.stderr)
+        print(f'{parser.prog}: cancelled; nothing was written', file=sys.stderr)
         return 130
+    print(f'{parser.prog}: error: {problem}', file=sys.stderr)
+    return 1
+
+
+def _still_printing() -> bool:
+    """Return whether stdout takes text; if not, let go of it, lest Python tries again on its way out."""
+    try:
+        sys.stdout.flush()
+    except OSError:
+        with suppress(OSError):
+            sys.stdout.close()
+        return False
+    return True
+
+
+def readable(path: Path | str) -> str:
+    """Return a path as text that can be drawn and written as UTF-8, whatever its bytes are."""
+    return os.fsencode(path).decode('utf-8', 'backslashreplace')
 
 
 class Ticker:

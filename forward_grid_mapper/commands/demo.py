@@ -14,7 +14,7 @@ from ..files.output_folder import free_name, output_folder
 from ..files.results import write_results
 from ..simulation.drive import Recording
 from ..simulation.score import Scores, score_map, threshold, visible_surface
-from .console import Ticker, run
+from .console import Ticker, readable, run
 from .offline import read_drive
 from .options import add_mapping_options, chosen_parameters
 from .simulate import SONARS, record, write_recording
@@ -64,7 +64,7 @@ def demo(options: argparse.Namespace) -> int:
         with output_folder(output) as folder:
             bag = write_recording(folder, recording)
             drive = read_drive(bag, parameters, {}, progress=ticker.reading)
-            drive.source['bag'] = str(output / bag.name)
+            drive.source['bag'] = readable(output / bag.name)
             maps = Mapper(parameters).run(drive.placer.readings, ticker.mapping)
             ticker.say('writing')
             world = recording.world
@@ -88,8 +88,7 @@ def demo(options: argparse.Namespace) -> int:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; return its exit code."""
-    options = parser().parse_args(arguments)
-    return run(COMMAND, lambda: demo(options))
+    return run(parser(), demo, arguments)
 
 
 if __name__ == '__main__':

@@ -205,8 +205,7 @@ def experiment(options: argparse.Namespace) -> int:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; return its exit code."""
-    options = parser().parse_args(arguments)
-    return run(COMMAND, lambda: experiment(options))
+    return run(parser(), experiment, arguments)
 
 
 if __name__ == '__main__':

@@ -16,7 +16,8 @@ from ..bags.static_transforms import StaticTransforms
 from ..core.errors import BagError, InputError
 from ..core.messages import NANOSECONDS, Pose2, RangeMessage
 from ..core.parameters import Parameters
-from ..core.placing import REASONS, Placer
+from ..core.placing import ODOMETRY_REASONS, REASONS, Placer
+from .console import readable
 
 
 @dataclass(frozen=True)
@@ -132,7 +133,7 @@ def read_drive(
         raise _nothing_placed(placer, lookup, spans, undecodable)
     stamps = placer.readings.stamp
     source = {
-        'bag': str(path),
+        'bag': readable(path),
         'range_topics': list(topics.range_topics),
         'odom_topic': topics.odom_topic,
         'odom_frame': placer.map_frame,
@@ -167,7 +168,9 @@ def _warnings(bag: Bag, placer: Placer, lookup: Mounts) -> list[str]:
     if placer.time_jumps:
         warnings.append(f"odometry's clock jumped back {placer.time_jumps} times; what waited for a pose was dropped")
     for reason, count in placer.odometry_rejected.items():
-        warnings.append(f'{count} odometry messages were rejected: {reason}')
+        warnings.append(
+            f'{count} of {placer.odometry_received} odometry messages were rejected: {ODOMETRY_REASONS[reason]}'
+        )
     for reason, count in placer.rejected.items():
         if count > 0.2 * placer.received and reason != 'unknown_mount':
             warnings.append(f'{count} of {placer.received} readings were rejected as {reason}: {REASONS[reason]}')
@@ -192,6 +195,6 @@ def _nothing_placed(
             f'are the drivers set to the same clock (use_sim_time)?'
         )
     reasons = '; '.join(f'{count} {reason} ({REASONS[reason]})' for reason, count in placer.rejected.most_common())
-    if placer.odometry_rejected:
-        reasons += f'; odometry rejected: {dict(placer.odometry_rejected)}'
+    for reason, count in placer.odometry_rejected.most_common():
+        reasons += f'; {count} odometry messages were rejected too: {ODOMETRY_REASONS[reason]}'
     return InputError(f'all {placer.received} readings were rejected: {reasons}')

@@ -8,15 +8,15 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from ..core.errors import OutputError, ParameterError
+from ..core.errors import ParameterError
 from ..core.mapping import Mapper
 from ..core.maps import MapSet
 from ..files.map_files import occupancy_values
-from ..files.output_folder import free_name
+from ..files.output_folder import free_name, output_folder
 from ..files.parameter_file import parse_sensor
 from ..files.report import report_text
 from ..files.results import write_results
-from .console import Ticker, run
+from .console import Ticker, readable, run
 from .offline import Drive, read_drive
 from .options import add_mapping_options, chosen_parameters
 
@@ -62,11 +62,9 @@ def process(options: argparse.Namespace) -> int:
         raise ParameterError('--learn: the number of rounds must not be negative')
     bag = Path(options.bag)
     output = Path(options.output) if options.output else free_name(Path.cwd(), f'{bag.resolve().stem}_maps')
-    if options.output and output.exists() and not (output.is_dir() and not any(output.iterdir())):
-        # said again when writing; here it spares the user the wait
-        raise OutputError(f'{output} exists and is not an empty folder; choose another with -o')
     begin = time.perf_counter()
-    with Ticker(options.quiet) as ticker:
+    # the folder first: if it cannot be written, that should be known before the work
+    with Ticker(options.quiet) as ticker, output_folder(output) as folder:
         drive = read_drive(
             bag,
             parameters,
@@ -83,9 +81,10 @@ def process(options: argparse.Namespace) -> int:
             drive.source['warnings'].append(_learned(maps))
         if not maps.statistics['converged']:
             drive.source['warnings'].append('the search ended at max_sweeps before it converged; raise max_sweeps')
-        report = write_results(output, maps, drive.source, drive.path_xy, '/'.join(bag.resolve().parts[-2:]))
+        title = readable(Path(*bag.resolve().parts[-2:]))
+        report = write_results(folder, maps, drive.source, drive.path_xy, title)
         if options.write_bag:
-            _write_bag(output / 'maps.mcap_bag', maps, drive)
+            _write_bag(folder / 'maps.mcap_bag', maps, drive)
     if not options.quiet:
         print(report_text(report), end='')
     else:
@@ -108,16 +107,17 @@ def _write_bag(path: Path, maps: MapSet, drive: Drive) -> None:
     from ..bags.writer import BagWriter
 
     stamp = drive.source['stamps'][1]
+    # ROS 1 frames may begin with a slash, which tf2 refuses
+    frame = drive.placer.map_frame.lstrip('/')
     with BagWriter(path, 'mcap') as writer:
         for name, values in (('live_map', maps.live), ('ml_map', maps.ml), ('uncertainty_map', maps.uncertainty)):
             topic = f'/forward_grid_mapper/{name}'
-            writer.write_grid(topic, maps.grid, occupancy_values(values), drive.placer.map_frame, stamp)
+            writer.write_grid(topic, maps.grid, occupancy_values(values), frame, stamp)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; return its exit code."""
-    options = parser().parse_args(arguments)
-    return run(COMMAND, lambda: process(options))
+    return run(parser(), process, arguments)
 
 
 if __name__ == '__main__':

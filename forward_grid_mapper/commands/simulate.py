@@ -114,8 +114,7 @@ def simulate(options: argparse.Namespace) -> int:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; return its exit code."""
-    options = parser().parse_args(arguments)
-    return run(COMMAND, lambda: simulate(options))
+    return run(parser(), simulate, arguments)
 
 
 if __name__ == '__main__':

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .cone import axis_run, distance, make_cone, wedge_run
-from .errors import InputError
+from .errors import Cancelled, InputError
 from .grid import Grid, cone_boxes
 from .jit import kernel
 from .parameters import GridParameters, ModelParameters
@@ -170,13 +170,17 @@ def walk(table: Any, t: int, shape: Any, nearest: bool, cells: Any, distances: A
 
 
 @kernel
-def _count(
-    table: Any, shape: Any, nearest: bool, free_start: Any, band_start: Any, seen_start: Any, slot_start: Any
-) -> int:
-    """Count the pairs by reading and by cell, each into the place after its own; return the largest cone."""
+def _count(table: Any, shape: Any, nearest: bool, starts: Any, stop: Any) -> int:
+    """Count the pairs by reading and by cell, each into the place after its own; return the largest cone.
+
+    `starts` are the offsets of a `ConeIndex` in its order: free_start, band_start, seen_start, slot_start.
+    """
+    free_start, band_start, seen_start, slot_start = starts
     cells, distances = np.empty(1024, np.int32), np.empty(1024, np.float64)
     largest = 0
     for t in range(len(table.x)):
+        if stop[0]:
+            break
         n = walk(table, t, shape, nearest, cells, distances)
         if n > len(cells):
             cells, distances = np.empty(2 * n, np.int32), np.empty(2 * n, np.float64)
@@ -193,12 +197,16 @@ def _count(
 
 
 @kernel
-def _fill(table: Any, shape: Any, nearest: bool, cut: float, resolution: float, index: Any, largest: int) -> None:
+def _fill(
+    table: Any, shape: Any, nearest: bool, cut: float, resolution: float, index: Any, largest: int, stop: Any
+) -> None:
     """Write every pair at the place that the counts gave it; the offsets by cell move on and are put back."""
     cells, distances = np.empty(largest, np.int32), np.empty(largest, np.float64)
     band = np.empty(largest, np.int32)
     keys = np.empty(largest, np.float64)
     for t in range(len(table.x)):
+        if stop[0]:
+            break
         n = walk(table, t, shape, nearest, cells, distances)
         at = index.free_start[t]
         m = 0
@@ -233,16 +241,39 @@ def _fill(table: Any, shape: Any, nearest: bool, cut: float, resolution: float, 
         starts[0] = 0
 
 
-def build_cone_index(readings: Readings, grid: Grid, model: ModelParameters) -> ConeIndex:
+def check(stop: NDArray[np.uint8]) -> None:
+    """Raise `Cancelled` if `stop` is set."""
+    if stop[0]:
+        raise Cancelled('the work was cancelled; nothing was changed')
+
+
+def build_cone_index(
+    readings: Readings, grid: Grid, model: ModelParameters, stop: NDArray[np.uint8] | None = None
+) -> ConeIndex:
     """Index the cones of `readings` on `grid`; cells outside the grid are left out.
 
     Cost and memory are linear in the number of pairs of a cell and a reading.
+
+    Parameters
+    ----------
+    readings : Readings
+    grid : Grid
+    model : ModelParameters
+    stop : uint8, shape (1,), optional
+        Set to 1 from any thread to cancel.
+
+    Raises
+    ------
+    Cancelled
+        If `stop` was set.
     """
+    stop = np.zeros(1, np.uint8) if stop is None else stop
     table = cone_table(readings, grid, model)
     nearest = model.cell_distance == 'nearest'
     n = len(readings)
-    starts = [np.zeros(size + 1, np.int64) for size in (n, n, grid.size, grid.size)]
-    largest = _count(table, grid.shape, nearest, *starts)
+    starts = tuple(np.zeros(size + 1, np.int64) for size in (n, n, grid.size, grid.size))
+    largest = _count(table, grid.shape, nearest, starts, stop)
+    check(stop)
     free_start, band_start, seen_start, slot_start = (np.cumsum(start) for start in starts)
     free, band = int(free_start[-1]), int(band_start[-1])
     index = ConeIndex(
@@ -257,5 +288,6 @@ def build_cone_index(readings: Readings, grid: Grid, model: ModelParameters) -> 
         slot_start=slot_start,
         slot_reading=np.empty(band, np.int32),
     )
-    _fill(table, grid.shape, nearest, model.cut, grid.resolution, index, largest)
+    _fill(table, grid.shape, nearest, model.cut, grid.resolution, index, largest, stop)
+    check(stop)
     return index

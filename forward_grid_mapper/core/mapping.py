@@ -8,6 +8,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .cone_index import ConeIndex, build_cone_index, effective_sigma, grid_of
 from .forward_model import causes_of, expectations
@@ -42,14 +43,25 @@ class Mapper:
         """Prepare a run; `learn_rounds` > 0 alternates the search with updates of the model (`learning`)."""
         self._parameters, self._learn_rounds = parameters, learn_rounds
         self._search: Search | None = None
-        self._cancelled = False
+        self._grid: Grid | None = None
+        self._stop = np.zeros(1, np.uint8)
         self._seconds: dict[str, float] = {}
 
     def cancel(self) -> None:
         """Make `run` raise `Cancelled` soon; may be called from any thread."""
-        self._cancelled = True
-        if self._search:
-            self._search.cancel()
+        self._stop[0] = 1
+
+    def so_far(self) -> tuple[Grid, NDArray[np.int8]] | None:
+        """Return the grid and a copy of the ML map that the search has reached, or None before it; any thread."""
+        search, grid = self._search, self._grid
+        if search is None or grid is None:
+            return None
+        return grid, self._observed(search.index, search.state.occupied, grid)
+
+    @staticmethod
+    def _observed(index: ConeIndex, occupied: NDArray[np.uint8], grid: Grid) -> NDArray[np.int8]:
+        seen = np.diff(index.seen_start) + np.diff(index.slot_start) > 0
+        return np.where(seen, occupied, UNKNOWN).reshape(grid.shape).astype(np.int8)
 
     def run(
         self, readings: Readings, watch: Watch = lambda stage, progress: None, live: LiveMap | None = None
@@ -93,12 +105,10 @@ class Mapper:
         self, readings: Readings, grid: Grid, model: ModelParameters, watch: Watch
     ) -> tuple[ConeIndex, SearchResult]:
         with self._stage('index', watch):
-            index = build_cone_index(readings, grid, model)
+            index = build_cone_index(readings, grid, model, self._stop)
         with self._stage('search', watch):
             causes = causes_of(readings, effective_sigma(readings, model, grid.resolution), model)
-            self._search = Search(index, causes, grid.width, self._parameters.search)
-            if self._cancelled:
-                self._search.cancel()
+            self._search, self._grid = Search(index, causes, grid.width, self._parameters.search, self._stop), grid
             return index, self._search.run(lambda progress: watch('search', progress))
 
     def _collect(
@@ -110,10 +120,9 @@ class Mapper:
         result: SearchResult,
         live_map: Any,
     ) -> MapSet:
-        seen = (np.diff(index.seen_start) + np.diff(index.slot_start) > 0).reshape(grid.shape)
-        ml = np.where(seen, result.occupied.reshape(grid.shape).astype(np.int8), np.int8(UNKNOWN))
+        ml = self._observed(index, result.occupied, grid)
         uncertainty = np.where(
-            seen, marginals(result.evidence, parameters.search).reshape(grid.shape), np.float32(np.nan)
+            ml != UNKNOWN, marginals(result.evidence, parameters.search).reshape(grid.shape), np.float32(np.nan)
         )
         explained = expectations(readings, grid, ml, parameters.model)
         likelihood = float(explained.log_likelihood.sum())
@@ -122,7 +131,7 @@ class Mapper:
         return MapSet(
             grid=grid,
             live=live_map,
-            ml=ml.astype(np.int8),
+            ml=ml,
             uncertainty=uncertainty,
             readings=readings,
             unexplained=explained.random > 0.5,

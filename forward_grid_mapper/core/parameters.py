@@ -11,7 +11,7 @@ import difflib
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, get_type_hints
+from typing import Any, get_origin, get_type_hints
 
 from .errors import ParameterError
 
@@ -23,9 +23,18 @@ def _param(
     low: float = -math.inf,
     high: float = math.inf,
     choices: tuple[str, ...] = (),
+    read_only: bool = False,
 ) -> Any:
     return dataclasses.field(
-        default=default, metadata={'help': help, 'unit': unit, 'low': low, 'high': high, 'choices': choices}
+        default=default,
+        metadata={
+            'help': help,
+            'unit': unit,
+            'low': low,
+            'high': high,
+            'choices': choices,
+            'read_only': read_only,
+        },
     )
 
 
@@ -62,13 +71,14 @@ class PlacingParameters:
 class GridParameters:
     """The lattice of cells; its extent follows the readings."""
 
-    resolution: float = _param(0.1, 'Edge length of a cell.', 'm', 0.005, 2.0)
+    resolution: float = _param(0.1, 'Edge length of a cell.', 'm', 0.005, 2.0, read_only=True)
     max_cells: int = _param(
         50_000_000,
         'Bound on the cells of a map; a reading that would make the grid larger is rejected.',
         'cells',
         10_000,
         1_000_000_000,
+        read_only=True,
     )
 
 
@@ -103,6 +113,7 @@ class ModelParameters:
         'center',
         'Distance from the sensor to a cell: to its center or to its nearest point.',
         choices=('center', 'nearest'),
+        read_only=True,
     )
 
     def __post_init__(self) -> None:
@@ -145,22 +156,64 @@ class LiveMapParameters:
     """The standard log-odds map (eq 1-4), updated reading by reading."""
 
     live_p_occupied: float = _param(
-        0.8, 'Occupancy of a cell on the axis at the measured range, given one reading.', 'probability', 0.5, 0.999
+        0.8,
+        'Occupancy of a cell on the axis at the measured range, given one reading.',
+        'probability',
+        0.5,
+        0.999,
+        read_only=True,
     )
     live_p_free: float = _param(
-        0.25, 'Occupancy of a cell on the axis before the measured range, given one reading.', 'probability', 0.001, 0.5
+        0.25,
+        'Occupancy of a cell on the axis before the measured range, given one reading.',
+        'probability',
+        0.001,
+        0.5,
+        read_only=True,
     )
     live_p_free_no_echo: float = _param(
-        0.3, 'The same for a reading without echo, which may be a lost one.', 'probability', 0.001, 0.5
+        0.3, 'The same for a reading without echo, which may be a lost one.', 'probability', 0.001, 0.5, read_only=True
     )
     live_depth: float = _param(
-        0.05, 'Half the depth of the arc that an echo marks as occupied; never below half a cell.', 'm', 0.001, 5.0
+        0.05,
+        'Half the depth of the arc that an echo marks as occupied; never below half a cell.',
+        'm',
+        0.001,
+        5.0,
+        read_only=True,
     )
 
 
 @dataclass(frozen=True)
+class NodeParameters:
+    """Topics, frames and output of the node; the offline tool has options for them."""
+
+    range_topics: tuple[str, ...] = _param(('sonar',), 'Topics of sensor_msgs/Range, one or many.', read_only=True)
+    odom_topic: str = _param('odom', 'Topic of nav_msgs/Odometry.', read_only=True)
+    range_reliability: str = _param(
+        'best_effort',
+        'Quality of service of the Range subscriptions; reliable loses nothing and needs reliable publishers.',
+        choices=('best_effort', 'reliable'),
+        read_only=True,
+    )
+    odom_reliability: str = _param(
+        'best_effort', 'The same for odometry.', choices=('best_effort', 'reliable'), read_only=True
+    )
+    map_frame: str = _param(
+        '',
+        "Frame of the maps, if another than odometry's, whose transform to odometry's frame TF gives.",
+        read_only=True,
+    )
+    publish_rate: float = _param(1.0, 'Largest rate of live maps, and of maps seen while EM runs.', 'Hz', 0.01, 50.0)
+    save_directory: str = _param('~/forward_grid_mapper', 'Folder in which save_maps makes a new folder at each call.')
+
+
+@dataclass(frozen=True)
 class Parameter:
-    """One row of the table; `low` and `high` are infinite where there is no bound."""
+    """One row of the table; `low` and `high` are infinite where there is no bound.
+
+    `type` is float, int, bool, str or tuple (of str); `read_only` rows cannot change while the node runs.
+    """
 
     name: str
     group: str
@@ -171,6 +224,7 @@ class Parameter:
     high: float
     choices: tuple[str, ...]
     help: str
+    read_only: bool
 
     @property
     def range(self) -> str:
@@ -179,6 +233,10 @@ class Parameter:
             return ' | '.join(self.choices)
         if self.type is bool:
             return 'true | false'
+        if self.type is str:
+            return 'text'
+        if self.type is tuple:
+            return 'list of text'
         return f'{self.low:g} … {self.high:g}'
 
     def check(self, value: Any) -> Any:
@@ -189,7 +247,15 @@ class Parameter:
         ParameterError
             If it has the wrong type or is out of range.
         """
-        wanted = {float: 'a number', int: 'a whole number', bool: 'true or false', str: 'a word'}[self.type]
+        wanted = {
+            float: 'a number',
+            int: 'a whole number',
+            bool: 'true or false',
+            str: 'text',
+            tuple: 'a list of text',
+        }[self.type]
+        if self.type is tuple and isinstance(value, list) and all(isinstance(v, str) and v for v in value):
+            value = tuple(value)
         if self.type is float and isinstance(value, int) and not isinstance(value, bool):
             value = float(value)
         if type(value) is not self.type:
@@ -210,6 +276,7 @@ class Parameters:
     model: ModelParameters = ModelParameters()
     search: SearchParameters = SearchParameters()
     live: LiveMapParameters = LiveMapParameters()
+    node: NodeParameters = NodeParameters()
 
     @classmethod
     def from_flat(cls, values: Mapping[str, Any], base: Parameters | None = None) -> Parameters:
@@ -245,7 +312,7 @@ def _read_table() -> tuple[Parameter, ...]:
                 Parameter(
                     name=field.name,
                     group=group.name,
-                    type=hints[field.name],
+                    type=get_origin(hints[field.name]) or hints[field.name],
                     default=field.default,
                     **field.metadata,
                 )

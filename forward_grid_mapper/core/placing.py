@@ -16,8 +16,15 @@ from .messages import NANOSECONDS, OdometryMessage, Pose2, RangeMessage
 from .parameters import Parameters, PlacingParameters
 from .readings import ReadingBuffer, Readings
 
-MountLookup = Callable[[str, str, int], Pose2 | None]
-"""(base frame, sensor frame, stamp in nanoseconds) → pose of the sensor in the base frame, or None if unknown."""
+
+class Later:
+    """What a lookup answers when the pose may still become known."""
+
+
+LATER = Later()
+
+MountLookup = Callable[[str, str, int], 'Pose2 | Later | None']
+"""(base frame, sensor frame, stamp in ns) → pose of the sensor in the base frame, `LATER`, or None if unknown."""
 
 REASONS = {
     'nan_range': 'the range is not a number',
@@ -50,6 +57,9 @@ HISTORY = 10 * NANOSECONDS
 
 JUMP = NANOSECONDS
 """Odometry older than the newest by more than this means that the clock jumped back, not that messages overtook."""
+
+RETRY = NANOSECONDS // 20
+"""How often, in message time, a pose that may still become known is asked for again."""
 
 PATH_STEP = 0.05
 """Metres between points of the robot's path."""
@@ -167,11 +177,13 @@ class Placer:
         self._stamps: list[int] = []
         self._poses: list[Pose2] = []
         self._newest_range: int | None = None
+        self._held: list[tuple[_Measurement, Pose2]] = []
+        self._next_try = 0
 
     @property
     def waiting(self) -> int:
-        """Number of readings that wait for odometry."""
-        return len(self._waiting)
+        """Number of readings that wait for odometry or for the pose of their sensor."""
+        return len(self._waiting) + len(self._held)
 
     @property
     def readings(self) -> Readings:
@@ -185,7 +197,7 @@ class Placer:
         if isinstance(measured, str):
             self._reject(message.frame_id, measured)
             return
-        if len(self._waiting) >= MOST_WAITING and not self._patient:
+        if self.waiting >= MOST_WAITING and not self._patient:
             self._reject(message.frame_id, 'too_many_waiting')
             return
         measured.number = self.received
@@ -232,16 +244,25 @@ class Placer:
         for measured in sorted(self._waiting):
             self._reject(measured.frame_id, 'after_odometry' if self._stamps else 'no_odometry')
         self._waiting.clear()
+        for measured, _ in self._held:
+            self._reject_unknown(measured)
+        self._held.clear()
 
     def _reject(self, frame_id: str, reason: str) -> None:
         self.rejected[reason] += 1
         self.rejected_by_frame.setdefault(frame_id, Counter())[reason] += 1
 
+    def _reject_unknown(self, measured: _Measurement) -> None:
+        self.unknown_frames.add(measured.frame_id)
+        self._reject(measured.frame_id, 'unknown_mount')
+
     def _jump_back(self) -> None:
         self.time_jumps += 1
-        for measured in self._waiting:
+        for measured in (*self._waiting, *(held for held, _ in self._held)):
             self._reject(measured.frame_id, 'time_jump')
         self._waiting.clear()
+        self._held.clear()
+        self._next_try = 0
         self._stamps.clear()
         self._poses.clear()
         self._newest_range = None
@@ -259,6 +280,14 @@ class Placer:
         limit = now - round(patience * NANOSECONDS)
         while self._waiting and self._waiting[0].stamp < limit:
             self._reject(heapq.heappop(self._waiting).frame_id, 'no_odometry')
+        if self._held and now >= self._next_try:
+            self._next_try = now + RETRY
+            held, self._held = self._held, []
+            for measured, pose in held:
+                if measured.stamp < limit:
+                    self._reject_unknown(measured)
+                else:
+                    self._mount(measured, pose)
 
     def _place(self, measured: _Measurement) -> None:
         stamps = self._stamps
@@ -275,10 +304,16 @@ class Placer:
                 return
             fraction = (measured.stamp - stamps[after - 1]) / gap
             pose = interpolate(self._poses[after - 1], self._poses[after], fraction)
+        self._mount(measured, pose)
+
+    def _mount(self, measured: _Measurement, pose: Pose2) -> None:
+        """Add the sensor's pose on the robot to the robot's, and keep the reading."""
         mount = self._mounts(self.base_frame, measured.frame_id, measured.stamp)
+        if isinstance(mount, Later):
+            self._held.append((measured, pose))
+            return
         if mount is None:
-            self.unknown_frames.add(measured.frame_id)
-            self._reject(measured.frame_id, 'unknown_mount')
+            self._reject_unknown(measured)
             return
         sensor = pose.compose(mount)
         if not self._fits(sensor, measured.z_max):

@@ -17,8 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from .cone_index import ConeIndex, Floats
-from .errors import Cancelled
+from .cone_index import ConeIndex, Floats, check
 from .flips import FlipState, compute_gains, flip_in_order, mark_cells, refresh_all, shift_in_order
 from .forward_model import Causes
 from .parameters import SearchParameters
@@ -59,7 +58,7 @@ class SearchResult:
 
 
 class Search:
-    """One search; can be watched and cancelled from another thread."""
+    """One search; its map so far is `state.occupied`, which another thread may read at any time."""
 
     def __init__(
         self,
@@ -67,14 +66,14 @@ class Search:
         causes: Causes,
         width: int,
         parameters: SearchParameters,
-        start: NDArray[np.uint8] | None = None,
+        stop: NDArray[np.uint8] | None = None,
     ) -> None:
-        """Start from `start` (uint8, shape (cells,), flat), or from the empty map."""
+        """Start from the empty map; `stop` (uint8, shape (1,)) is set to 1 from any thread to cancel."""
         cells, readings = len(index.seen_start) - 1, len(index.free_start) - 1
-        self._index, self._causes, self._width, self._parameters = index, causes, width, parameters
+        self.index, self._causes, self._width, self._parameters = index, causes, width, parameters
         self._prior = math.log(parameters.prior / (1 - parameters.prior))
         self.state = FlipState(
-            occupied=np.zeros(cells, np.uint8) if start is None else start.astype(np.uint8),
+            occupied=np.zeros(cells, np.uint8),
             blocking=np.zeros(readings, np.int32),
             band_ratio=np.empty(len(index.band_cell), np.float32),
             occupy_ratio=np.empty(readings, np.float32),
@@ -82,22 +81,17 @@ class Search:
             changed=np.zeros(readings, np.uint8),
             dirty=np.ones(cells, np.uint8),
             gain=np.zeros(cells),
-            stop=np.zeros(1, np.uint8),
+            stop=np.zeros(1, np.uint8) if stop is None else stop,
         )
         self.progress = Progress(0, 0, 0, 0.0)
 
-    def cancel(self) -> None:
-        """Make `run` raise `Cancelled` soon; may be called from any thread."""
-        self.state.stop[0] = 1
-
     def _gains(self) -> Floats:
-        mark_cells(self._index, self.state)
-        compute_gains(self._index, self.state, self._prior)
+        mark_cells(self.index, self.state)
+        compute_gains(self.index, self.state, self._prior)
         return self.state.gain
 
     def _advance(self, sweeps: int, flips: int, shifts: int, gain: float, watch: Callable[[Progress], None]) -> None:
-        if self.state.stop[0]:
-            raise Cancelled('the search was cancelled')
+        check(self.state.stop)
         p = self.progress
         self.progress = Progress(p.sweeps + sweeps, p.flips + flips, p.shifts + shifts, p.gain + gain)
         watch(self.progress)
@@ -108,16 +102,16 @@ class Search:
         Raises
         ------
         Cancelled
-            If `cancel` was called.
+            If `stop` was set.
         """
-        refresh_all(self._index, self._causes, self.state)
+        refresh_all(self.index, self._causes, self.state)
         converged = False
         while self.progress.sweeps < self._parameters.max_sweeps:
             gains = self._gains()
             cells = np.flatnonzero(gains > LEAST_GAIN)
             if len(cells):
                 order = cells[np.argsort(-gains[cells], kind='stable')]
-                flips, gain = flip_in_order(self._index, self._causes, self.state, self._prior, LEAST_GAIN, order)
+                flips, gain = flip_in_order(self.index, self._causes, self.state, self._prior, LEAST_GAIN, order)
                 self._advance(1, flips, 0, gain, watch)
                 continue
             if not self._parameters.shift_moves or not self._shift(watch):
@@ -130,9 +124,9 @@ class Search:
         return SearchResult(self.state.occupied, evidence, self.progress, converged)
 
     def _shift(self, watch: Callable[[Progress], None]) -> int:
-        cells = np.flatnonzero(self.state.occupied)
-        shifts, gain = shift_in_order(
-            self._index, self._causes, self.state, self._prior, LEAST_GAIN, cells, self._width
-        )
+        occupied = np.flatnonzero(self.state.occupied)
+        # an order that a mirrored or turned map has too
+        cells = occupied[np.argsort(-self.state.gain[occupied], kind='stable')]
+        shifts, gain = shift_in_order(self.index, self._causes, self.state, self._prior, LEAST_GAIN, cells, self._width)
         self._advance(1, 0, shifts, gain, watch)
         return shifts

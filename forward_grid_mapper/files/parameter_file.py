@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import math
 import re
 from collections.abc import Hashable, Iterator
@@ -17,22 +16,8 @@ from ..core.parameters import Parameter, find
 
 NODE_NAME = 'forward_grid_mapper'
 
-# Parameters that only the running node has. A file may hold them, so that node and offline tool share it.
-NODE_ONLY = frozenset(
-    {
-        'range_topics',
-        'odom_topic',
-        'range_reliability',
-        'publish_rate',
-        'save_directory',
-        'use_sim_time',
-        'map_frame',
-        'base_frame',
-        'online',
-    }
-)
 # Parameters that ROS itself declares on every node.
-_ROS_OWN = re.compile(r'start_type_description_service|qos_overrides\..+')
+_ROS_OWN = re.compile(r'use_sim_time|start_type_description_service|qos_overrides\..+')
 _MOUNT = re.compile(r'sensors\.(?P<frame>.+)\.pose')
 
 
@@ -46,7 +31,7 @@ class ParameterFile(NamedTuple):
     mounts : dict
         Pose of each sensor in the robot's base frame, by `frame_id`.
     node : dict
-        Values that only the node understands, unchecked.
+        Values of the parameters that ROS itself gives every node, unchecked.
     """
 
     values: dict[str, Any]
@@ -91,7 +76,7 @@ def parse_setting(text: str) -> tuple[str, Any]:
     name, equals, value = (part.strip() for part in text.partition('='))
     if not equals or not name:
         raise ParameterError(f'{text!r} is not of the form name=value, such as p_hit=0.6')
-    row = _row(name)
+    row = find(name)
     return name, row.check(_typed(row, value))
 
 
@@ -180,25 +165,13 @@ def _sort_out(flat: dict[str, Any]) -> ParameterFile:
     for name, value in flat.items():
         if mount := _MOUNT.fullmatch(name):
             result.mounts[mount['frame']] = _pose(name, value)
-        elif name in NODE_ONLY or _ROS_OWN.fullmatch(name):
+        elif _ROS_OWN.fullmatch(name):
             result.node[name] = value
         elif name.partition('.')[0] == 'sensors':
             raise ParameterError(f'{name}: sensors are given as sensors.<frame_id>.pose: [x, y, yaw]')
         else:
-            result.values[name] = _row(name).check(value)
+            result.values[name] = find(name).check(value)
     return result
-
-
-def _row(name: str) -> Parameter:
-    """Return the table's row; look for near names among the node's parameters too."""
-    if name in NODE_ONLY:
-        raise ParameterError(f'{name} is a parameter of the node only')
-    try:
-        return find(name)
-    except ParameterError:
-        if near := difflib.get_close_matches(name, NODE_ONLY, n=1, cutoff=0.8):
-            raise ParameterError(f'no parameter is called {name!r}; did you mean {near[0]}?') from None
-        raise
 
 
 def _pose(name: str, value: Any) -> Pose2:
@@ -213,6 +186,8 @@ def _typed(row: Parameter, text: str) -> Any:
     """Return `text` as the row's type, or as it is where that fails, for the row's own check to refuse."""
     if row.type is bool:
         return {'true': True, 'false': False}.get(text.lower(), text)
+    if row.type is tuple:
+        return [part.strip() for part in text.split(',') if part.strip()]
     try:
         return row.type(text)
     except ValueError:

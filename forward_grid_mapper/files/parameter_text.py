@@ -58,6 +58,8 @@ def _comment(text: str) -> list[str]:
 
 
 def _yaml(name: str, value: Any) -> str:
+    if isinstance(value, tuple):
+        return f'{name}: {yaml.safe_dump(list(value), default_flow_style=True, width=1000).strip()}'
     return yaml.safe_dump({name: value}, width=1000).strip()
 
 

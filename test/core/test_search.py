@@ -46,7 +46,7 @@ def test_every_gain_is_the_difference_of_two_evaluations(p_hit: float, cell_dist
     model = ModelParameters(p_hit=p_hit, p_rand=0.02, p_lost=0.1, sigma=0.06, cell_distance=cell_distance)
     readings = random_readings(rng, GRID, 300)
     search = make(readings, model=model)
-    index, state = search._index, search.state
+    index, state = search.index, search.state
     state.occupied[:] = rng.random(GRID.size) < 0.15
     refresh_all(index, search._causes, state)
     for c in rng.permutation(GRID.size)[:40]:
@@ -60,7 +60,7 @@ def test_every_gain_is_the_difference_of_two_evaluations(p_hit: float, cell_dist
 def test_flipping_there_and_back_changes_nothing() -> None:
     readings = random_readings(np.random.default_rng(3), GRID, 100)
     search = make(readings)
-    index, state = search._index, search.state
+    index, state = search.index, search.state
     refresh_all(index, search._causes, state)
     ratios = state.band_ratio.copy(), state.occupy_ratio.copy(), state.free_ratio.copy()
     for c in range(0, GRID.size, 7):
@@ -153,7 +153,7 @@ def test_evidence_is_zero_where_nothing_was_seen() -> None:
 
 def test_a_search_can_be_cancelled() -> None:
     search = make(random_readings(np.random.default_rng(0), GRID, 50))
-    search.cancel()
+    search.state.stop[0] = 1
     with pytest.raises(Cancelled):
         search.run()
 

@@ -19,6 +19,7 @@ from made_maps import made_maps
 
 from forward_grid_mapper.core.errors import InputError, OutputError
 from forward_grid_mapper.core.grid import Grid
+from forward_grid_mapper.core.parameters import Parameters
 from forward_grid_mapper.files.map_archive import read_npz, write_npz
 from forward_grid_mapper.files.map_files import occupancy_values, read_map, write_raw, write_trinary
 
@@ -224,7 +225,7 @@ def test_npz_is_plain_numpy(tmp_path: Path) -> None:
             'parameters': ('U', ()),
         }
         assert data['live_map'].dtype == data['ml_map'].dtype == np.float32
-        assert json.loads(str(data['parameters']))['p_hit'] == 0.9
+        assert json.loads(str(data['parameters']))['p_hit'] == Parameters().model.p_hit
 
 
 def test_npz_of_something_else(tmp_path: Path) -> None:

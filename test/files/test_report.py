@@ -12,6 +12,7 @@ import pytest
 from made_maps import made_maps
 
 from forward_grid_mapper.core.errors import OutputError
+from forward_grid_mapper.core.parameters import Parameters
 from forward_grid_mapper.files.report import report_data, report_text, write_report
 
 SOURCE: dict[str, Any] = {
@@ -79,7 +80,7 @@ def test_text_tells_what_matters() -> None:
         '-123.5 nats (-2.058 a reading)',
         'NOT converged',
         'index 0.25, search 0.50; together 0.75',
-        'p_hit  0.3  (default 0.9)',
+        f'p_hit  0.3  (default {Parameters().model.p_hit})',
     ):
         assert part in text
     assert all(len(line) <= 100 for line in text.splitlines())

@@ -1,0 +1,142 @@
+"""A short simulated drive, bags of it with any fault a test wants, and the commands run on them."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterable, Sequence
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+
+from forward_grid_mapper.bags import BagWriter
+from forward_grid_mapper.commands import process_bag
+from forward_grid_mapper.core.messages import OdometryMessage, Pose2, RangeMessage
+from forward_grid_mapper.simulation.drive import BASE_FRAME, START, door_drive
+from forward_grid_mapper.simulation.sonar import NOISY, front_array
+
+SECOND = 1_000_000_000
+FILES = {'maps.npz', 'maps.png', 'report.json', 'report.txt'} | {
+    f'{name}.{suffix}' for name in ('live_map', 'ml_map', 'uncertainty_map') for suffix in ('pgm', 'yaml')
+}
+Message = OdometryMessage | RangeMessage
+
+
+class Tape(NamedTuple):
+    """What a bag is written from."""
+
+    mounts: tuple[tuple[str, Pose2], ...]
+    odometry: list[OdometryMessage]
+    ranges: list[RangeMessage]
+
+    def of(self, *frames: str) -> Tape:
+        """Only the ranges of these sensors."""
+        return self._replace(ranges=[m for m in self.ranges if m.frame_id in frames])
+
+    def with_ranges(self, **changes: Any) -> Tape:
+        """Every Range changed alike."""
+        return self._replace(ranges=[m._replace(**changes) for m in self.ranges])
+
+    def with_odometry(self, **changes: Any) -> Tape:
+        """Every Odometry changed alike."""
+        return self._replace(odometry=[m._replace(**changes) for m in self.odometry])
+
+
+@lru_cache(maxsize=1)
+def tape() -> Tape:
+    """Past a door with eight sonars; the numbers of a Range are exact in single precision, as in its message."""
+    recording = door_drive(1, NOISY, 0, front_array())
+    exact = [
+        m._replace(**{k: float(np.float32(getattr(m, k))) for k in ('range', 'min_range', 'max_range', 'field_of_view')})
+        for m in recording.ranges
+    ]
+    return Tape(recording.mounts, recording.odometry, exact)
+
+
+def in_turn(drive: Tape) -> list[tuple[int, Message]]:
+    """Every message with its stamp as the time of logging, a Range after the Odometry of its stamp."""
+    return sorted(((m.stamp, m) for m in (*drive.odometry, *drive.ranges)), key=lambda item: item[0])
+
+
+def write_tape(
+    path: Path,
+    drive: Tape,
+    kind: str = 'mcap',
+    *,
+    logged: Iterable[tuple[int, Message]] | None = None,
+    sonar_topic: Callable[[RangeMessage], str] = lambda message: '/sonar',
+    odometry_topic: Callable[[OdometryMessage], str] = lambda message: '/odom',
+    writer: type[BagWriter] = BagWriter,
+) -> Path:
+    """Write a bag of `logged` messages, by default all of the drive in turn; return its path."""
+    with writer(path, kind) as bag:
+        if drive.mounts:
+            bag.write_static_transforms([(BASE_FRAME, frame, pose) for frame, pose in drive.mounts], START)
+        for time, message in in_turn(drive) if logged is None else logged:
+            if isinstance(message, OdometryMessage):
+                bag.write_odometry(odometry_topic(message), message, time)
+            else:
+                bag.write_range(sonar_topic(message), message, time=time)
+    return path
+
+
+def code_of(main: Callable[[Sequence[str]], int], *arguments: object) -> int:
+    """Run a command in this process; return its exit code, also where argparse leaves."""
+    try:
+        return main([str(argument) for argument in arguments])
+    except SystemExit as leaving:
+        return int(leaving.code or 0)
+
+
+def mapped(bag: Path, output: Path, *options: object) -> dict[str, Any]:
+    """Map a bag, which must succeed; return what report.json says."""
+    assert code_of(process_bag.main, bag, '-o', output, *options) == 0
+    return report_in(output)
+
+
+def report_in(folder: Path) -> dict[str, Any]:
+    """The report of a run, whose counts must add up."""
+
+    def refuse(constant: str) -> None:
+        raise AssertionError(f'{constant} is no JSON')
+
+    report = json.loads((folder / 'report.json').read_text('utf-8'), parse_constant=refuse)
+    counts = report['counts']
+    assert counts['accepted'] + sum(counts['rejected'].values()) == counts['received']
+    assert counts['accepted'] == report['result']['readings'] == sum(s['accepted'] for s in report['sensors'].values())
+    return report
+
+
+def arrays_in(folder: Path) -> dict[str, np.ndarray]:
+    """All arrays of maps.npz."""
+    with np.load(folder / 'maps.npz', allow_pickle=False) as archive:
+        return dict(archive)
+
+
+def assert_same_maps(one: Path, other: Path) -> None:
+    """Compare two folders of results, number by number."""
+    a, b = arrays_in(one), arrays_in(other)
+    assert a.keys() == b.keys()
+    for name in a:
+        np.testing.assert_array_equal(a[name], b[name], name)
+
+
+def refusal(capsys: pytest.CaptureFixture[str], folder: Path, *arguments: object, code: int = 1) -> str:
+    """What process_bag says to wrong arguments; it must say it well and leave `folder` as it was."""
+    before = everything_in(folder)
+    capsys.readouterr()
+    assert code_of(process_bag.main, *arguments) == code
+    out, err = capsys.readouterr()
+    assert out == ''
+    assert 'Traceback' not in err
+    message = err.partition('process_bag: error: ')[2]
+    assert message, f'no error was told: {err!r}'
+    assert everything_in(folder) == before
+    return message.rstrip('\n')
+
+
+def everything_in(folder: Path) -> list[str]:
+    """Names of all files and folders at any depth."""
+    return sorted(str(path) for path in folder.rglob('*'))

@@ -1,0 +1,479 @@
+"""What the printed text of the paper would do where the code departs from it (docs/paper.md lists the departures)."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import pytest
+
+import naive
+from conftest import random_readings
+from forward_grid_mapper.core.cone_index import ConeIndex, build_cone_index, effective_sigma
+from forward_grid_mapper.core.errors import ParameterError
+from forward_grid_mapper.core.flips import compute_gains, evidence, flip_in_order, mark_cells, refresh_all
+from forward_grid_mapper.core.forward_model import Causes, causes_of, expectations, log_likelihood
+from forward_grid_mapper.core.grid import Grid
+from forward_grid_mapper.core.learning import learn
+from forward_grid_mapper.core.live_map import LiveMap
+from forward_grid_mapper.core.mapping import Mapper
+from forward_grid_mapper.core.parameters import ModelParameters, Parameters, SearchParameters, find
+from forward_grid_mapper.core.readings import Readings
+from forward_grid_mapper.core.search import LEAST_GAIN, Search
+from forward_grid_mapper.core.uncertainty import marginals
+from forward_grid_mapper.simulation.drive import NOISY, corridor_drive, door_drive
+
+LINE = Grid(0.1, 0, 0, 12, 1)
+"""One row of cells; cell c lies 0.05 + 0.1 c metres before a sensor at the origin."""
+
+AREA = Grid(0.1, 0, 0, 12, 9)
+
+PAPER = ModelParameters(p_hit=0.6, p_rand=0.1, p_lost=0.0, sigma=0.05, cut=5.0, cell_distance='center')
+
+
+def along(*z: float, **columns: object) -> Readings:
+    """Readings of a sensor that looks along `LINE`; 1.1 m is no echo."""
+    given: dict[str, object] = {'x': 0.0, 'y': 0.05, 'yaw': 0.0, 'z_max': 1.1, 'half_angle': 0.1}
+    return Readings.from_columns(z=z, **given | columns)
+
+
+def line(*occupied: int) -> np.ndarray:
+    """The map of `LINE` with these cells occupied."""
+    made = np.zeros(LINE.shape, np.uint8)
+    made[0, list(occupied)] = 1
+    return made
+
+
+def every_map(grid: Grid) -> np.ndarray:
+    return np.array(list(itertools.product((0, 1), repeat=grid.size)), np.uint8).reshape(-1, *grid.shape)
+
+
+def prepare(readings: Readings, grid: Grid, model: ModelParameters) -> tuple[ConeIndex, Causes]:
+    sigma = effective_sigma(readings, model, grid.resolution)
+    return build_cone_index(readings, grid, model), causes_of(readings, sigma, model)
+
+
+def search(
+    readings: Readings,
+    grid: Grid = LINE,
+    model: ModelParameters = PAPER,
+    start: np.ndarray | None = None,
+    prior: float = 0.5,
+    shift_moves: bool = True,
+) -> Search:
+    made = Search(*prepare(readings, grid, model), grid.width, SearchParameters(prior=prior, shift_moves=shift_moves))
+    if start is not None:
+        made.state.occupied[:] = start.ravel()
+    return made
+
+
+def found(*arguments: object, **options: object) -> list[int]:
+    """The occupied cells of the map that the search finds."""
+    return np.flatnonzero(search(*arguments, **options).run().occupied).tolist()
+
+
+def gain_of(cell: int, readings: Readings, occupied: np.ndarray, model: ModelParameters = PAPER) -> float:
+    """What the search believes a flip of `cell` of `LINE` to gain."""
+    index, causes = prepare(readings, LINE, model)
+    state = search(readings, LINE, model, occupied).state
+    refresh_all(index, causes, state)
+    return evidence(index, state, cell)
+
+
+def flipped(occupied: np.ndarray, cell: int) -> np.ndarray:
+    changed = occupied.copy()
+    changed.ravel()[cell] ^= 1
+    return changed
+
+
+def terms(readings: Readings, t: int, grid: Grid, occupied: np.ndarray, model: ModelParameters) -> list[float]:
+    """Density of reading t with each cause: chance, lost echo, no obstacle, first obstacle, second, …"""
+    sigma = naive.sigma_of(readings, t, grid, model)
+    met = naive.obstacles(readings, t, grid, occupied, model)
+    return naive.causes(readings.z[t], readings.z_max[t], sigma, met, model)
+
+
+# The standard map: eq 1-15, Table 1
+
+
+def test_one_reading_gives_back_its_inverse_model_and_not_eq_4_as_printed() -> None:
+    live = LiveMap(Parameters.from_flat({'resolution': 0.1, 'live_p_occupied': 0.8, 'live_p_free': 0.25}))
+    live.add(along(0.55))
+    p, log_odds = live.probability(LINE)[0], live.log_odds(LINE)[0]
+    assert p[2] == pytest.approx(0.25, abs=1e-5)
+    assert p[5] == pytest.approx(0.8, abs=1e-5)
+    printed = 1 - 1 / np.exp(log_odds)
+    assert printed[2] < 0, 'not a probability'
+
+
+def test_readings_that_say_nothing_leave_the_standard_map_at_its_prior() -> None:
+    silent = {'live_p_occupied': 0.5, 'live_p_free': 0.5, 'live_p_free_no_echo': 0.5}
+    live = LiveMap(Parameters.from_flat({'resolution': 0.1, **silent}))
+    live.add(random_readings(np.random.default_rng(0), AREA, 50))
+    p = live.probability()
+    assert np.isfinite(p).sum() > 50
+    assert p[np.isfinite(p)] == pytest.approx(0.5, abs=1e-3)
+
+
+# The forward model: eq 16-32
+
+
+def test_a_sum_of_densities_in_eq_16_would_let_three_readings_be_forgotten() -> None:
+    grid = Grid(0.1, 0, 0, 6, 1)
+    readings = along(0.25, 0.25, 0.25, 0.6, 0.6, 0.6, 0.6, z_max=0.6)
+    maps = every_map(grid)
+    densities = np.array([[sum(terms(readings, t, grid, m, PAPER)) for t in range(7)] for m in maps])
+    assert not maps[densities.sum(axis=1).argmax()].any()
+    best = maps[np.log(densities).sum(axis=1).argmax()]
+    assert np.flatnonzero(best).tolist() == [2]
+    assert found(readings, grid, shift_moves=False) == [2]
+
+
+def test_sigma_of_eq_22_is_a_standard_deviation() -> None:
+    sigma = 0.2
+    e = expectations(along(0.55, 0.55 + sigma, sigma=sigma), LINE, line(5), PAPER)
+    density = e.hit / e.random * (PAPER.p_rand / 1.1) / ((1 - PAPER.p_rand) * PAPER.p_hit)
+    assert density[0] == pytest.approx(1 / (math.sqrt(2 * math.pi) * sigma))
+    assert density[1] / density[0] == pytest.approx(math.exp(-0.5))
+
+
+def test_chance_knows_no_distance_whatever_eq_32_prints() -> None:
+    readings = along(*np.arange(0.05, 0.8, 0.05))
+    told = expectations(readings, LINE, line(), PAPER)
+    assert told.log_likelihood == pytest.approx(math.log(PAPER.p_rand / 1.1))
+    # so readings by chance do not widen the sigma that is learned
+    readings = along(*[0.5, 0.6] * 20, *[0.15] * 10)
+    assert learn(readings, LINE, line(5), PAPER).sigma == pytest.approx(0.05, abs=1e-3)
+
+
+@pytest.mark.parametrize('occupied', [line(), line(5), line(2, 5, 6)])
+def test_the_density_of_a_reading_integrates_to_one(occupied: np.ndarray) -> None:
+    # it would not if eq 36 multiplied by the root, or if e_{t,0} lacked (1 - p_rand) as in Table 2
+    step = 1e-3
+    readings = along(*np.arange(step / 2, 1.1, step))
+    below = np.exp(expectations(readings, LINE, occupied, PAPER).log_likelihood).sum() * step
+    # half of the normal around z_max lies beyond z_max, where no reading can be
+    beyond = (1 - PAPER.p_rand) * (1 - PAPER.p_hit) ** occupied.sum() / 2
+    assert below + beyond == pytest.approx(1.0, abs=1e-3)
+
+
+def test_without_its_factor_the_no_echo_expectation_of_table_2_makes_the_sum_exceed_one() -> None:
+    readings, model = along(1.1, 1.08, 1.04), ModelParameters(p_hit=0.6, p_rand=0.3, p_lost=0.0, sigma=0.05)
+    occupied = line(3)
+    e = expectations(readings, LINE, occupied, model)
+    assert e.random + e.no_echo + e.hit == pytest.approx(1.0)
+    for t in range(len(readings)):
+        chance, _, nothing, *hits = terms(readings, t, LINE, occupied, model)
+        likelihood = chance + nothing + sum(hits)
+        printed = (chance + nothing / (1 - model.p_rand) + sum(hits)) / likelihood
+        assert printed > 1.05
+        assert e.no_echo[t] == pytest.approx(nothing / likelihood)
+
+
+def test_every_obstacle_of_the_cone_counts_not_only_one() -> None:
+    # an echo from behind a missed obstacle is explained by the second
+    readings, occupied = along(0.75), line(3, 7)
+    e = expectations(readings, LINE, occupied, PAPER)
+    assert e.hit[0] > 0.9
+    assert e.rank[0] / e.hit[0] == pytest.approx(2.0, abs=1e-6)
+    chance, _, nothing, first, _ = terms(readings, 0, LINE, occupied, PAPER)
+    assert first + nothing < 1e-6 * chance
+
+
+# EM: eq 33-40, Table 2
+
+
+def squares(readings: Readings, grid: Grid, occupied: np.ndarray, model: ModelParameters) -> float:
+    """The criterion of eq 40: the expected squared errors of the obstacles in units of sigma."""
+    e = expectations(readings, grid, occupied, model)
+    return float((e.squared_error / effective_sigma(readings, model, grid.resolution) ** 2).sum())
+
+
+def descend(cost: Callable[[np.ndarray], float], occupied: np.ndarray) -> np.ndarray:
+    """Flip the cell that lowers `cost` most until none does."""
+    while True:
+        trials = [flipped(occupied, c) for c in range(occupied.size)]
+        costs = [cost(trial) for trial in trials]
+        if min(costs) >= cost(occupied):
+            return occupied
+        occupied = trials[int(np.argmin(costs))]
+
+
+@pytest.mark.parametrize('seed', range(5))
+def test_minimising_eq_40_alone_empties_the_map(seed: int) -> None:
+    grid = Grid(0.1, 0, 0, 4, 3)
+    readings = random_readings(np.random.default_rng(seed), grid, 25)
+    ours = search(readings, grid).run().occupied.reshape(grid.shape)
+    assert ours.any()
+    assert squares(readings, grid, ours, PAPER) > 0
+    assert min(squares(readings, grid, m, PAPER) for m in every_map(grid)) == 0
+    assert not descend(lambda m: squares(readings, grid, m, PAPER), ours).any()
+
+
+def stale_gain(readings: Readings, occupied: np.ndarray, cell: int) -> float:
+    """The gain of a flip with the expectations of before, tied to ranks: e_{t,k} weighs whatever is k-th afterwards."""
+    gain = 0.0
+    for t in range(len(readings)):
+        before = terms(readings, t, LINE, occupied, PAPER)
+        after = terms(readings, t, LINE, flipped(occupied, cell), PAPER)
+        e = np.array(before) / sum(before)
+        tiny = 1e-300
+        for k in (0, *range(2, min(len(before), len(after)))):
+            gain += e[k] * (math.log(max(after[k], tiny)) - math.log(max(before[k], tiny)))
+    return gain
+
+
+@pytest.mark.parametrize(
+    ('cell', 'before', 'ranges'),
+    [(2, line(5), [0.55] * 3 + [0.25] * 3), (2, line(2, 5, 7), [0.55] * 5)],
+    ids=['occupying', 'freeing'],
+)
+def test_stale_expectations_refuse_a_flip_that_the_exact_e_step_takes(
+    cell: int, before: np.ndarray, ranges: Sequence[float]
+) -> None:
+    readings = along(*ranges)
+    truth = naive.log_likelihood(readings, LINE, flipped(before, cell), PAPER)
+    truth -= naive.log_likelihood(readings, LINE, before, PAPER)
+    assert truth > 1
+    assert gain_of(cell, readings, before) == pytest.approx(truth, abs=1e-5)
+    assert stale_gain(readings, before, cell) < -20
+
+
+def test_evidence_is_positive_for_what_returned_the_echo_and_negative_before_it() -> None:
+    for start in (line(), line(2), line(5)):
+        told = search(along(0.55, 0.55, 0.55), start=start, prior=0.2).run().evidence
+        assert told[5] > 5
+        assert told[:4].max() < -2
+
+
+def test_cells_that_nobody_saw_stay_as_they_are_though_table_2_would_fill_them() -> None:
+    readings = along(0.35, 0.35)
+    result = search(readings, start=line(9), prior=0.2).run()
+    assert (result.evidence >= 0)[7:].all(), 'which Table 2 takes for occupied'
+    assert np.flatnonzero(result.occupied).tolist() == [3, 9]
+    assert found(readings, prior=0.2) == [3]
+
+
+def test_a_tie_keeps_the_state() -> None:
+    # the echo comes from between two cells: either explains it, and moving from one to the other gains nothing
+    readings = along(0.5, 0.5, 0.5)
+    truth = [naive.log_likelihood(readings, LINE, line(c), PAPER) for c in (4, 5)]
+    assert truth[0] == pytest.approx(truth[1], abs=1e-9)
+    assert [found(readings, prior=0.05, start=line(c)) for c in (4, 5)] == [[4], [5]]
+
+
+Order = Callable[[np.ndarray, np.ndarray], np.ndarray]
+"""(cells that gain, gain of every cell) → the same cells in the order in which a sweep visits them."""
+
+
+def climb(readings: Readings, grid: Grid, order: Order, model: ModelParameters = PAPER) -> np.ndarray:
+    """Single flips, sweep by sweep, until none gains."""
+    index, causes = prepare(readings, grid, model)
+    state = search(readings, grid, model).state
+    refresh_all(index, causes, state)
+    while True:
+        mark_cells(index, state)
+        compute_gains(index, state, 0.0)
+        cells = np.flatnonzero(state.gain > LEAST_GAIN)
+        if not len(cells):
+            return state.occupied.reshape(grid.shape)
+        flip_in_order(index, causes, state, 0.0, LEAST_GAIN, order(cells, state.gain))
+
+
+def raster(cells: np.ndarray, gain: np.ndarray) -> np.ndarray:
+    return cells
+
+
+def most_promising_first(cells: np.ndarray, gain: np.ndarray) -> np.ndarray:
+    return cells[np.argsort(-gain[cells])]
+
+
+def shuffled(seed: int) -> Order:
+    rng = np.random.default_rng(seed)
+    return lambda cells, gain: rng.permutation(cells)
+
+
+def test_the_search_can_be_trapped_since_orders_end_in_different_optima() -> None:
+    recording = door_drive(1, NOISY, seed=0)
+    readings, grid = recording.readings, recording.world.grid
+    model = ModelParameters(p_hit=0.9, p_rand=0.05, p_lost=0.0, sigma=0.05)
+    ends = [climb(readings, grid, shuffled(seed), model) for seed in range(5)]
+    heights = [log_likelihood(readings, grid, end, model) for end in ends]
+    assert max(heights) - min(heights) > 5
+    for end, other in itertools.combinations(ends, 2):
+        assert (end != other).sum() > 0.1 * end.sum()
+
+
+def test_most_promising_cells_first_ends_higher_than_other_orders() -> None:
+    recording = corridor_drive(seed=0)
+    readings, grid = recording.readings, recording.world.grid
+    orders = (most_promising_first, raster, shuffled(0))
+    heights = [log_likelihood(readings, grid, climb(readings, grid, order), PAPER) for order in orders]
+    assert heights[0] > max(heights[1:]) + 20
+
+
+def test_a_move_leaves_a_place_that_no_single_flip_can() -> None:
+    model = ModelParameters(p_hit=0.98, p_rand=0.1, p_lost=0.0, sigma=0.05)
+    readings, start = along(0.55, 0.55, 0.55, 0.55), line(4)
+    assert found(readings, model=model, start=start, prior=0.2, shift_moves=False) == [4]
+    assert found(readings, model=model, start=start, prior=0.2, shift_moves=True) == [5]
+
+
+def test_the_search_starts_from_the_empty_map_since_a_full_one_ends_lower() -> None:
+    recording = door_drive(1, NOISY, seed=0)
+    readings, grid = recording.readings, recording.world.grid
+    assert not search(readings, grid).state.occupied.any()
+    empty, full = (search(readings, grid, start=start).run() for start in (None, np.ones(grid.shape, np.uint8)))
+    heights = [log_likelihood(readings, grid, end.occupied.reshape(grid.shape), PAPER) for end in (empty, full)]
+    assert heights[0] > heights[1] + 10
+    unseen = empty.evidence == 0
+    assert full.occupied[unseen].all(), 'nothing ever frees them'
+    assert not empty.occupied[unseen].any()
+
+
+# Uncertainty: eq 41-45
+
+
+def test_the_mixed_marginal_is_that_of_eq_42_to_45_with_the_prior_counted_once() -> None:
+    readings = along(0.55, 0.62, 0.35, 1.1)
+    result = search(readings).run()
+    occupied = result.occupied.reshape(LINE.shape)
+    alpha, prior = 0.6, 0.2
+    q = marginals(result.evidence, SearchParameters(alpha=alpha, uncertainty_prior=prior))
+    for c in range(LINE.size):
+        both = [occupied.copy(), occupied.copy()]
+        both[0][0, c], both[1][0, c] = 0, 1
+        free, full = (math.exp(naive.log_likelihood(readings, LINE, m, PAPER)) for m in both)
+        p = full * prior / (full * prior + free * (1 - prior))
+        mixed = [p**alpha * prior ** (1 - alpha), (1 - p) ** alpha * (1 - prior) ** (1 - alpha)]
+        assert q[c] == pytest.approx(mixed[0] / sum(mixed), abs=1e-5)
+
+
+def test_without_evidence_the_marginal_is_the_prior_at_any_alpha() -> None:
+    prior = 0.2
+    h = math.log(prior / (1 - prior))
+    for alpha in (0.0, 0.3, 1.0):
+        q = float(marginals(np.zeros(1), SearchParameters(alpha=alpha, uncertainty_prior=prior))[0])
+        assert q == pytest.approx(prior)
+        # Table 2's last line mixes in the prior as if the likelihood ratio contained it already
+        printed = 1 / (1 + math.exp(-(1 - alpha) * h))
+        assert alpha == 0.0 or printed > prior + 0.05
+
+
+def given_likeliest_cause(readings: Readings, occupied: np.ndarray, distances: np.ndarray) -> float:
+    """log p(Z | m, C) of eq 26, without the prior of the correspondences C: each reading's likeliest cause."""
+    total = 0.0
+    for t in range(len(readings)):
+        sigma = naive.sigma_of(readings, t, LINE, PAPER)
+        cause = int(np.argmax(terms(readings, t, LINE, occupied, PAPER)))
+        means = [None, readings.z_max[t], readings.z_max[t], *distances[occupied[0] == 1]]
+        mean = means[cause]
+        total += math.log(1 / readings.z_max[t] if mean is None else naive.normal(readings.z[t], mean, sigma, 40.0))
+    return total
+
+
+def test_eq_26_alone_says_nothing_of_the_free_space_before_an_obstacle() -> None:
+    readings, occupied = along(*[0.55] * 5), line(5)
+    distances = LINE.centers()[0]
+    alone = given_likeliest_cause(readings, flipped(occupied, 2), distances)
+    alone -= given_likeliest_cause(readings, occupied, distances)
+    assert alone == pytest.approx(0.0)
+    summed = search(readings, start=occupied).run().evidence[2]
+    assert summed == pytest.approx(5 * math.log(1 - PAPER.p_hit), abs=0.2)
+    q = marginals(np.array([alone, summed]), SearchParameters(alpha=1.0, uncertainty_prior=0.5))
+    assert q[0] == pytest.approx(0.5)
+    assert q[1] < 0.02
+
+
+# Choices of our own
+
+
+def test_readings_without_echo_hold_the_free_space() -> None:
+    # two ranges by chance in the open, where ten others heard nothing
+    readings = along(0.55, 0.55, *[1.1] * 10)
+    values = {'p_hit': 0.6, 'p_rand': 0.1, 'p_lost': 0.0, 'sigma': 0.05, 'prior': 0.3, 'resolution': 0.1}
+    whole, echoes = (Mapper(Parameters.from_flat(values)).run(r) for r in (readings, readings.select(readings.echo)))
+    assert (whole.ml[-whole.grid.row, :11] == 0).all()
+    assert echoes.ml[-echoes.grid.row, 5] == 1, 'a dot'
+    assert echoes.grid.width <= 9, 'and nothing known beyond'
+
+
+def test_without_a_floor_of_chance_the_empty_map_is_impossible() -> None:
+    readings = along(0.55, 0.55, 1.1)
+    none, least = (
+        ModelParameters(p_hit=0.9, p_rand=p, p_lost=0.0, sigma=0.05) for p in (0.0, float(find('p_rand').low))
+    )
+    assert log_likelihood(readings, LINE, line(), none) == -math.inf
+    assert math.isfinite(log_likelihood(readings, LINE, line(), least))
+    assert found(readings, model=least, prior=0.3) == [5]
+    with pytest.raises(ParameterError, match='p_rand'):
+        Parameters.from_flat({'p_rand': 0.0})
+
+
+def test_the_floor_bounds_what_one_silent_reading_can_say_against_obstacles() -> None:
+    readings = along(1.1)
+    bound = math.log(PAPER.p_rand / 1.1)
+    told = [log_likelihood(readings, LINE, line(*range(n)), PAPER) for n in range(12)]
+    assert min(told) > bound
+    assert told[11] - bound < 0.01
+    unbounded = 11 * math.log(1 - PAPER.p_hit)
+    assert told[11] - told[0] > unbounded + 3
+
+
+def test_p_hit_stays_below_one_since_freeing_divides_by_the_rest() -> None:
+    with pytest.raises(ParameterError, match='p_hit'):
+        Parameters.from_flat({'p_hit': 1.0})
+    top = ModelParameters(p_hit=find('p_hit').high, p_rand=find('p_rand').low, p_lost=0.0, sigma=0.05)
+    readings, occupied = along(0.55, 0.55, 0.75, 1.1), line(2, 5, 7)
+    for c in range(11):
+        truth = naive.log_likelihood(readings, LINE, flipped(occupied, c), top)
+        truth -= naive.log_likelihood(readings, LINE, occupied, top)
+        assert gain_of(c, readings, occupied, top) == pytest.approx(truth, abs=1e-5)
+
+
+def test_echoes_that_may_be_lost_do_not_wipe_out_a_smooth_wall() -> None:
+    readings = along(*[0.55] * 3, *[1.1] * 12)
+    paper, ours = (ModelParameters(p_hit=0.9, p_rand=0.05, p_lost=p, sigma=0.05) for p in (0.0, 0.3))
+    assert found(readings, model=paper) == []
+    assert found(readings, model=ours) == [5]
+
+
+@pytest.mark.parametrize('seed', range(3))
+def test_the_tails_of_the_noise_cost_work_and_change_no_map(seed: int) -> None:
+    readings = random_readings(np.random.default_rng(seed), AREA, 100)
+    cut, far = (ModelParameters(p_hit=0.6, p_rand=0.1, p_lost=0.0, sigma=0.05, cut=c) for c in (5.0, 40.0))
+    assert len(prepare(readings, AREA, cut)[0].band_cell) < 0.8 * len(prepare(readings, AREA, far)[0].band_cell)
+    assert found(readings, AREA, cut) == found(readings, AREA, far)
+
+
+def test_a_thin_cone_without_a_cell_centre_still_sees_the_cells_on_its_axis() -> None:
+    readings = along(*[0.55] * 3, y=0.02, half_angle=0.01)
+    bearings = np.arctan2(0.05 - 0.02, LINE.centers()[0])
+    assert (np.abs(bearings) > 0.01).all(), 'no centre lies in the cone'
+    assert found(readings, prior=0.3) == [5]
+
+
+def test_a_sigma_below_half_a_cell_would_leave_ranges_that_no_cell_explains() -> None:
+    fine = 0.004
+    model = ModelParameters(p_hit=0.6, p_rand=0.1, p_lost=0.0, sigma=fine)
+    for z in np.arange(0.505, 0.6, 0.01):
+        assert expectations(along(z), LINE, line(5), model).hit[0] > 0.9
+    assert naive.normal(0.595, 0.55, fine, model.cut) == 0.0
+
+
+def test_distance_to_the_face_or_to_the_centre_is_a_choice() -> None:
+    # the echo comes from the near face of cell 5
+    readings = along(0.5)
+    for choice, error in (('center', 0.05), ('nearest', 0.0)):
+        model = ModelParameters(p_hit=0.6, p_rand=0.1, p_lost=0.0, sigma=0.05, cell_distance=choice)
+        e = expectations(readings, LINE, line(5), model)
+        assert math.sqrt(e.squared_error[0] / e.hit[0]) == pytest.approx(error, abs=1e-7)
+
+
+def test_a_prior_spares_the_dot_of_a_single_stray_reading_and_keeps_the_wall() -> None:
+    stray, wall = along(0.25), along(*[0.75] * 3)
+    assert 2 in found(stray, prior=0.5)
+    assert found(stray, prior=0.001) == []
+    assert found(wall, prior=0.001) == [7]
