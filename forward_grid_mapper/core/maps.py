@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -51,3 +51,20 @@ class MapSet:
     objective: float
     parameters: Parameters
     statistics: dict[str, Any] = field(default_factory=dict)
+
+    def with_live(self, grid: Grid, live: NDArray[np.float32]) -> MapSet:
+        """Return the same maps beside another live map, all on the smallest grid that holds both.
+
+        Parameters
+        ----------
+        grid : Grid
+            Of `live`; of the same resolution.
+        live : float32, shape `grid.shape`
+        """
+        whole = self.grid.union(grid)
+        ml = np.full(whole.shape, UNKNOWN, np.int8)
+        ml[whole.window(self.grid)] = self.ml
+        uncertainty, shown = (np.full(whole.shape, np.nan, np.float32) for _ in range(2))
+        uncertainty[whole.window(self.grid)] = self.uncertainty
+        shown[whole.window(grid)] = live
+        return replace(self, grid=whole, live=shown, ml=ml, uncertainty=uncertainty)

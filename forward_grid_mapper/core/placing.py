@@ -1,13 +1,14 @@
 """Placing of readings: messages in any interleaving → readings in the map frame, every rejection counted by reason.
 
-One `Placer` serves the offline tool and the node. It decides by message stamps alone, never by a clock, so the same
-messages give the same readings however fast they arrive.
+One `Placer` serves the offline tool and the node. Where a reading goes is decided by message stamps alone, so the
+same messages give the same readings however fast they arrive; a clock is asked only how long one has waited already.
 """
 
 from __future__ import annotations
 
 import heapq
 import math
+import time
 from bisect import bisect_left
 from collections import Counter
 from collections.abc import Callable
@@ -35,7 +36,7 @@ REASONS = {
     'bad_field_of_view': 'the field of view is not between 0 and 180 degrees; parameter field_of_view overrides it',
     'empty_frame_id': 'the header has no frame_id, so the sensor is unknown',
     'unknown_mount': 'nothing tells where this frame is on the robot: give --sensor, a YAML or a transform',
-    'before_odometry': 'the stamp is before the first odometry, or the message came more than 10 s late',
+    'before_odometry': 'the stamp is before the first odometry, or the message came minutes late',
     'after_odometry': 'the recording ended before odometry reached the stamp',
     'no_odometry': 'odometry did not reach the stamp within pose_timeout',
     'pose_gap': 'odometry has a gap longer than max_pose_gap here',
@@ -52,8 +53,12 @@ ODOMETRY_REASONS = {
 }
 """Why an odometry message is rejected, in words."""
 
-HISTORY = 10 * NANOSECONDS
-"""Odometry older than this, relative to the newest, is forgotten: Range messages are late by less."""
+HISTORY = 600 * NANOSECONDS
+"""Odometry older than this, relative to the newest, is forgotten: Range messages are late by less, even where a bag is
+replayed faster than they can be taken."""
+
+MOST_POSES = 100_000
+"""Odometry messages that are kept at the most; 15 MB."""
 
 JUMP = NANOSECONDS
 """Odometry older than the newest by more than this means that the clock jumped back, not that messages overtook."""
@@ -81,12 +86,12 @@ def interpolate(before: Pose2, after: Pose2, fraction: float) -> Pose2:
 class _Measurement:
     """A Range that passed REP 117: what it says, before it is placed. Order is that of stamps, then of arrival."""
 
-    __slots__ = ('frame_id', 'half_angle', 'number', 'sigma', 'stamp', 'z', 'z_max')
+    __slots__ = ('arrival', 'frame_id', 'half_angle', 'number', 'sigma', 'stamp', 'z', 'z_max')
 
     def __init__(self, message: RangeMessage, z: float, z_max: float, half_angle: float, sigma: float) -> None:
         self.stamp, self.frame_id = message.stamp, message.frame_id
         self.z, self.z_max, self.half_angle, self.sigma = z, z_max, half_angle, sigma
-        self.number = 0
+        self.number, self.arrival = 0, 0.0
 
     def __lt__(self, other: _Measurement) -> bool:
         return (self.stamp, self.number) < (other.stamp, other.number)
@@ -147,7 +152,13 @@ class Placer:
         How often odometry's clock jumped back.
     """
 
-    def __init__(self, mounts: MountLookup, parameters: Parameters | None = None, patient: bool = False) -> None:
+    def __init__(
+        self,
+        mounts: MountLookup,
+        parameters: Parameters | None = None,
+        patient: bool = False,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
         """Prepare for messages.
 
         Parameters
@@ -158,7 +169,11 @@ class Placer:
         patient : bool
             Keep all odometry and let readings wait for it without a bound, as befits a file: then the readings placed
             do not depend on how the two streams interleave.
+        clock : callable
+            Returns seconds. A reading times out when `pose_timeout` has passed both by the stamps that came after it
+            and by this clock: so neither a bag that is replayed fast nor a simulation that stands still loses any.
         """
+        self._clock = clock
         self._mounts = mounts
         self.parameters = (parameters or Parameters()).placing
         self._grid = (parameters or Parameters()).grid
@@ -200,10 +215,28 @@ class Placer:
         if self.waiting >= MOST_WAITING and not self._patient:
             self._reject(message.frame_id, 'too_many_waiting')
             return
-        measured.number = self.received
+        measured.number, measured.arrival = self.received, self._clock()
         heapq.heappush(self._waiting, measured)
         self._newest_range = max(message.stamp, self._newest_range or message.stamp)
         self._settle()
+
+    def reject(self, message: RangeMessage, reason: str) -> None:
+        """Take one Range message and reject it for a reason that is not its own."""
+        self.received += 1
+        self._reject(message.frame_id, reason)
+
+    def clear(self) -> None:
+        """Forget readings, counts and path; odometry is kept, so that the next reading can be placed."""
+        self.buffer.clear()
+        self.rejected.clear()
+        self.odometry_rejected.clear()
+        self.rejected_by_frame.clear()
+        self.unknown_frames.clear()
+        self._waiting.clear()
+        self._held.clear()
+        self.path.clear()
+        self.received = self.odometry_received = self.time_jumps = 0
+        self._box = (math.inf, -math.inf, math.inf, -math.inf)
 
     def add_odometry(self, message: OdometryMessage) -> None:
         """Take one Odometry message."""
@@ -235,8 +268,8 @@ class Placer:
         if self._patient:
             return
         # trimmed by halves, so that the cost a message is constant
-        old = bisect_left(stamps, stamps[-1] - HISTORY)
-        if old > 64 and old > len(stamps) // 2:
+        old = bisect_left(stamps, stamps[-1] - HISTORY) if len(stamps) < MOST_POSES else MOST_POSES // 2
+        if old > 64 and old >= len(stamps) // 2:
             del stamps[: old - 1], poses[: old - 1]
 
     def finish(self) -> None:
@@ -278,13 +311,16 @@ class Placer:
         # a gap that would be bridged must not time out first
         patience = max(self.parameters.pose_timeout, self.parameters.max_pose_gap)
         limit = now - round(patience * NANOSECONDS)
-        while self._waiting and self._waiting[0].stamp < limit:
+        if not ((self._waiting and self._waiting[0].stamp < limit) or self._held):
+            return
+        oldest = self._clock() - patience
+        while self._waiting and self._waiting[0].stamp < limit and self._waiting[0].arrival < oldest:
             self._reject(heapq.heappop(self._waiting).frame_id, 'no_odometry')
         if self._held and now >= self._next_try:
             self._next_try = now + RETRY
             held, self._held = self._held, []
             for measured, pose in held:
-                if measured.stamp < limit:
+                if measured.stamp < limit and measured.arrival < oldest:
                     self._reject_unknown(measured)
                 else:
                     self._mount(measured, pose)

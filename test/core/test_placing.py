@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from forward_grid_mapper.core.messages import NANOSECONDS, OdometryMessage, Pose2, RangeMessage
 from forward_grid_mapper.core.parameters import Parameters
-from forward_grid_mapper.core.placing import HISTORY, REASONS, Placer, measure
+from forward_grid_mapper.core.placing import HISTORY, LATER, REASONS, Placer, measure
 
 INF, NAN = math.inf, math.nan
 MOUNT = Pose2(0.2, 0.1, math.pi / 2)
@@ -27,9 +27,21 @@ def odometry(seconds: float, x: float = 0.0, y: float = 0.0, yaw: float = 0.0) -
     return OdometryMessage(round(seconds * NANOSECONDS), 'odom', 'base_link', Pose2(x, y, yaw))
 
 
-def placer(patient: bool = False, **values: object) -> Placer:
+class Clock:
+    """A clock that the test moves."""
+
+    now = 0.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+def placer(patient: bool = False, clock: Clock | None = None, **values: object) -> Placer:
     return Placer(
-        lambda base, frame, stamp: MOUNT if frame.startswith('sonar') else None, Parameters.from_flat(values), patient
+        lambda base, frame, stamp: MOUNT if frame.startswith('sonar') else None,
+        Parameters.from_flat(values),
+        patient,
+        clock or Clock(),
     )
 
 
@@ -107,7 +119,8 @@ def test_poses_are_interpolated_and_the_mount_is_added() -> None:
 
 
 def test_reasons_of_time() -> None:
-    p = placer(max_pose_gap=0.5, pose_timeout=1.0)
+    clock = Clock()
+    p = placer(clock=clock, max_pose_gap=0.5, pose_timeout=1.0)
     p.add_range(sonar(0.5))
     p.add_odometry(odometry(1.0))
     assert p.rejected['before_odometry'] == 1
@@ -115,6 +128,7 @@ def test_reasons_of_time() -> None:
     p.add_odometry(odometry(1.7))
     assert p.rejected['pose_gap'] == 1
     p.add_range(sonar(1.8))
+    clock.now = 1.5
     p.add_range(sonar(3.0))
     assert p.rejected['no_odometry'] == 1
     p.finish()
@@ -122,6 +136,42 @@ def test_reasons_of_time() -> None:
     assert len(p.buffer) == 0
     assert accounted(p)
     assert set(p.rejected) <= set(REASONS)
+
+
+def test_a_reading_times_out_by_stamps_and_by_the_clock() -> None:
+    clock = Clock()
+    fast, still = placer(clock=clock), placer(clock=clock)
+    for p in (fast, still):
+        p.add_odometry(odometry(0.0))
+        p.add_range(sonar(0.1))
+    # a bag replayed fast: the stamps run on, the clock hardly
+    fast.add_range(sonar(60.0))
+    assert fast.waiting == 2
+    # a simulation that stands still: the clock runs on
+    clock.now = 100.0
+    still.add_range(sonar(0.1))
+    assert still.waiting == 2
+    for p in (fast, still):
+        p.add_odometry(odometry(0.2))
+        assert len(p.buffer) >= 1
+        assert not p.rejected
+
+
+def test_a_pose_that_becomes_known_later_is_waited_for() -> None:
+    clock, known = Clock(), {'sonar'}
+    p = Placer(lambda base, frame, stamp: MOUNT if frame in known else LATER, clock=clock)
+    p.add_odometry(odometry(0.0))
+    p.add_range(sonar(0.0, frame_id='late'))
+    p.add_range(sonar(0.0, frame_id='never'))
+    assert (p.waiting, len(p.buffer)) == (2, 0)
+    known.add('late')
+    p.add_odometry(odometry(0.5))
+    assert (p.waiting, len(p.buffer)) == (1, 1)
+    clock.now = 10.0
+    p.add_odometry(odometry(10.0))
+    assert p.rejected == {'unknown_mount': 1}
+    assert p.unknown_frames == {'never'}
+    assert accounted(p)
 
 
 def test_an_exact_stamp_needs_no_bracket() -> None:
@@ -183,11 +233,11 @@ def test_an_absurd_pose_is_refused() -> None:
 
 def test_odometry_kept_is_bounded_unless_patient() -> None:
     p, q = placer(), placer(patient=True)
-    for k in range(20_000):
-        p.add_odometry(odometry(0.02 * k))
-        q.add_odometry(odometry(0.02 * k))
-    assert len(p._stamps) < 2.2 * HISTORY / (0.02 * NANOSECONDS)
-    assert len(q._stamps) == 20_000
+    for k in range(50_000):
+        p.add_odometry(odometry(0.05 * k))
+        q.add_odometry(odometry(0.05 * k))
+    assert len(p._stamps) < 2.2 * HISTORY / (0.05 * NANOSECONDS)
+    assert len(q._stamps) == 50_000
 
 
 @settings(max_examples=60, deadline=None)

@@ -1,0 +1,20 @@
+"""Compilation of every kernel before the first reading comes, so that no callback has to wait for it."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from .mapping import Mapper
+from .maps import MapSet
+from .parameters import Parameters
+from .readings import Readings
+
+
+def warm_up() -> MapSet:
+    """Map a square room, which calls every kernel with the types that real work has."""
+    yaw = np.linspace(-math.pi, math.pi, 24, endpoint=False)
+    z = 1.0 / np.maximum(np.abs(np.cos(yaw)), np.abs(np.sin(yaw)))
+    readings = Readings.from_columns(('',), x=0.0, y=0.0, yaw=yaw, z=np.minimum(z, 1.4), z_max=1.4, half_angle=0.1)
+    return Mapper(Parameters(), learn_rounds=1).run(readings)

@@ -1,0 +1,62 @@
+"""Services that answer later, from any thread, while the executor goes on with other work."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from typing import Any
+
+from rclpy.node import Node
+from rclpy.service import Service
+
+
+class Reply:
+    """The answer that a client waits for."""
+
+    def __init__(self, service: DeferredService) -> None:
+        self._service = service
+        self._lock = threading.Lock()
+        self._header: Any = None
+        self._response: Any = None
+
+    def send(self, success: bool, message: str) -> None:
+        """Answer, once; a client that has gone is no error."""
+        response = self._service.kind.Response(success=success, message=message)
+        with self._lock:
+            self._response, header = response, self._header
+        if header is not None:
+            self._service.transmit(response, header)
+
+    def arrived(self, header: Any) -> None:
+        """Learn whom to answer, which the executor tells only after the handler returned."""
+        with self._lock:
+            self._header, response = header, self._response
+        if response is not None:
+            self._service.transmit(response, header)
+
+
+class DeferredService:
+    """A service whose handler is given a `Reply` to answer with, now or later.
+
+    An `async` handler would do the same with rclpy's own means, but its executor then spins at full load until the
+    answer is there.
+    """
+
+    def __init__(self, node: Node, kind: Any, name: str, handler: Callable[[Reply], None]) -> None:
+        self.kind = kind
+        self._handler = handler
+        self._service: Service = node.create_service(kind, name, self._accept)
+        self._transmit = self._service.send_response
+        self._service.send_response = self._send
+
+    def _accept(self, request: Any, response: Any) -> Reply:
+        reply = Reply(self)
+        self._handler(reply)
+        return reply
+
+    def _send(self, reply: Reply, header: Any) -> None:
+        reply.arrived(header)
+
+    def transmit(self, response: Any, header: Any) -> None:
+        """Send a response to the client; any thread."""
+        self._transmit(response, header)

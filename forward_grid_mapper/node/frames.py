@@ -1,0 +1,127 @@
+"""Where sensors sit and what the map frame is: parameters first, then TF where tf2_ros is installed."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections import deque
+from collections.abc import Mapping
+from typing import Any
+
+from ..core.messages import NANOSECONDS, OdometryMessage, Pose2, yaw_of
+from ..core.placing import LATER, Later
+
+STEEPEST = math.sin(math.radians(60.0))
+"""A sensor whose axis leaves the plane by more cannot be mapped in it."""
+
+PATIENCE = 0.2
+"""Seconds before a frame that TF did not know is asked for again, so that a missing one costs next to nothing."""
+
+
+class Transforms:
+    """Transforms at a stamp, from a tf2 buffer and without waiting for it; knows none without tf2_ros."""
+
+    def __init__(self, buffer: Any = None, error: type[Exception] = Exception) -> None:
+        """`buffer` is a `tf2_ros.Buffer`, `error` the base of its exceptions."""
+        self._buffer, self._error = buffer, error
+        self._missing: dict[tuple[str, str], float] = {}
+
+    @classmethod
+    def of(cls, node: Any) -> Transforms:
+        """Listen to TF on behalf of a node, if tf2_ros is installed."""
+        try:
+            import tf2_ros
+        except ImportError:
+            return cls()
+        buffer = tf2_ros.Buffer()
+        # the listener lives as long as the buffer that it fills
+        buffer.listener = tf2_ros.TransformListener(buffer, node, spin_thread=False)
+        return cls(buffer, tf2_ros.TransformException)
+
+    @property
+    def available(self) -> bool:
+        """Whether there is any TF to ask."""
+        return self._buffer is not None
+
+    def lookup(self, target: str, source: str, stamp: int) -> Any | None:
+        """Return the `geometry_msgs/Transform` of `source` in `target` at `stamp` in nanoseconds, or None."""
+        key = (target, source)
+        if self._buffer is None or time.monotonic() < self._missing.get(key, 0.0):
+            return None
+        from rclpy.time import Time
+
+        try:
+            found = self._buffer.lookup_transform(target.lstrip('/'), source.lstrip('/'), Time(nanoseconds=stamp))
+        except self._error as error:
+            if 'xtrapolation' not in type(error).__name__:
+                self._missing[key] = time.monotonic() + PATIENCE
+            return None
+        self._missing.pop(key, None)
+        return found.transform
+
+
+def planar(transform: Any) -> Pose2 | None:
+    """Return a transform projected on the plane, or None if its x axis leaves it too steeply or it is not valid."""
+    q, offset = transform.rotation, transform.translation
+    yaw = yaw_of(q)
+    if yaw is None or abs(2.0 * (q.x * q.z - q.w * q.y)) > STEEPEST:
+        return None
+    return Pose2(float(offset.x), float(offset.y), yaw)
+
+
+class Mounts:
+    """Poses of the sensors on the robot: those given as parameters win over TF."""
+
+    def __init__(self, given: Mapping[str, Pose2], transforms: Transforms) -> None:
+        self._given = {frame.lstrip('/'): pose for frame, pose in given.items()}
+        self._transforms = transforms
+        self.steep: set[str] = set()
+
+    def __call__(self, base_frame: str, frame: str, stamp: int) -> Pose2 | Later | None:
+        """Return the pose of a sensor at a stamp, `LATER` if TF may still tell it, None if nothing will."""
+        given = self._given.get(frame.lstrip('/'))
+        if given is not None:
+            return given
+        if not self._transforms.available:
+            return None
+        transform = self._transforms.lookup(base_frame, frame, stamp)
+        if transform is None:
+            return LATER
+        pose = planar(transform)
+        if pose is None:
+            self.steep.add(frame)
+        return pose
+
+
+class MapFrame:
+    """Gives odometry in another map frame, by the transform that TF has at its stamp; holds it back until TF does."""
+
+    def __init__(self, map_frame: str, transforms: Transforms, timeout: float) -> None:
+        self._map_frame, self._transforms = map_frame, transforms
+        self._timeout = round(timeout * NANOSECONDS)
+        self._held: deque[OdometryMessage] = deque()
+        self.dropped = 0
+
+    def convert(self, message: OdometryMessage) -> list[OdometryMessage]:
+        """Take an odometry message; return those whose pose in the map frame is known now, in order."""
+        if not self._map_frame or message.frame_id.lstrip('/') == self._map_frame.lstrip('/'):
+            return [message]
+        if self._held and message.stamp < self._held[-1].stamp:
+            self.dropped += len(self._held)
+            self._held.clear()
+        self._held.append(message)
+        ready = []
+        while self._held:
+            first = self._held[0]
+            transform = self._transforms.lookup(self._map_frame, first.frame_id, first.stamp)
+            pose = planar(transform) if transform is not None else None
+            if pose is not None and first.pose is not None:
+                ready.append(first._replace(frame_id=self._map_frame, pose=pose.compose(first.pose)))
+            elif first.pose is None:
+                ready.append(first)
+            elif message.stamp - first.stamp <= self._timeout:
+                break
+            else:
+                self.dropped += 1
+            self._held.popleft()
+        return ready

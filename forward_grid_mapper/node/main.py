@@ -1,0 +1,74 @@
+"""`mapper`: starts the node and ends it in order."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Sequence
+
+from ..core.errors import MapperError
+from .stopping import Stopper
+
+USAGE = """usage: mapper [--ros-args ...]
+
+Maps sonar Range and Odometry: publishes a live map, and on ~/run_em the maximum likelihood and uncertainty maps.
+Parameters: --ros-args -p NAME:=VALUE, or --params-file FILE (config/mapper.yaml lists all). Remap the topics sonar
+and odom with -r sonar:=/my/sonar -r odom:=/my/odom."""
+
+
+class _Stop(Exception):
+    """Raised inside the executor to end its spinning."""
+
+
+def _raise_stop() -> None:
+    raise _Stop
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the node until it is told to stop; return the exit code."""
+    arguments = sys.argv[1:] if arguments is None else list(arguments)
+    if '-h' in arguments or '--help' in arguments:
+        print(USAGE)
+        return 0
+    stopper = Stopper()
+    try:
+        import rclpy
+        from rclpy.executors import SingleThreadedExecutor
+        from rclpy.signals import SignalHandlerOptions
+    except ImportError as error:
+        print(
+            f"mapper: error: ROS 2 is not there ({error}): source its setup.bash, or pip install '.[ros]'",
+            file=sys.stderr,
+        )
+        return 1
+    from ..core.warm_up import warm_up
+    from .mapper_node import MapperNode
+
+    rclpy.init(args=['mapper', *arguments], signal_handler_options=SignalHandlerOptions.NO)
+    node = None
+    try:
+        node = MapperNode()
+        begin = time.monotonic()
+        node.get_logger().info('preparing kernels; the first start compiles them, which takes some ten seconds')
+        warm_up()
+        node.get_logger().info(f'kernels are ready after {time.monotonic() - begin:.1f} s')
+        executor = SingleThreadedExecutor()
+        executor.add_node(node)
+        node.start()
+        stopper.call(lambda: executor.create_task(_raise_stop))
+        executor.spin()
+    except _Stop:
+        pass
+    except MapperError as error:
+        print(f'mapper: error: {error}', file=sys.stderr)
+        return 1
+    finally:
+        if node is not None:
+            node.close()
+            node.destroy_node()
+        rclpy.try_shutdown()
+    return 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,109 @@
+"""The parameter table as ROS parameters: descriptors, ranges, validation, and the sensors' poses."""
+
+from __future__ import annotations
+
+import difflib
+import math
+from collections.abc import Callable
+from typing import Any
+
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
+from rclpy.node import Node
+from rclpy.parameter import Parameter as RosParameter
+
+from ..core.errors import ParameterError
+from ..core.messages import Pose2
+from ..core.parameters import TABLE, Parameter, Parameters
+
+ROS_OWN = ('use_sim_time', 'start_type_description_service', 'qos_overrides')
+NAMES = {row.name for row in TABLE}
+
+
+def descriptor(row: Parameter) -> ParameterDescriptor:
+    """Return the ROS descriptor of a row of the table."""
+    made = ParameterDescriptor(
+        name=row.name,
+        description=f'{row.help} [{row.unit}]' if row.unit else row.help,
+        additional_constraints='' if row.type in (int, float) else row.range,
+        read_only=row.read_only,
+        # so that `p_hit: 1` is not refused for being written without a point
+        dynamic_typing=row.type is float,
+    )
+    if row.type is float and math.isfinite(row.low) and math.isfinite(row.high):
+        made.floating_point_range = [FloatingPointRange(from_value=row.low, to_value=row.high)]
+    elif row.type is int:
+        made.integer_range = [IntegerRange(from_value=int(row.low), to_value=int(row.high), step=1)]
+    return made
+
+
+def declare(node: Node) -> tuple[Parameters, dict[str, Pose2], list[str]]:
+    """Declare every parameter; return their values, the sensors' poses, and warnings about names that mean nothing.
+
+    The node must have been made with `automatically_declare_parameters_from_overrides`, so that the poses, whose
+    names nobody knows beforehand, are there.
+
+    Raises
+    ------
+    ParameterError
+        If a value has the wrong type or is out of range.
+    """
+    given = node.get_parameters_by_prefix('')
+    values = {}
+    for row in TABLE:
+        value = row.default
+        if row.name in given:
+            value = row.check(given[row.name].value)
+            node.undeclare_parameter(row.name)
+        values[row.name] = value
+        stored = list(value) if isinstance(value, tuple) else value
+        node.declare_parameter(row.name, stored, descriptor(row), ignore_override=True)
+    return Parameters.from_flat(values), _mounts(given), _strangers(given)
+
+
+def validator(current: Callable[[], Parameters], accept: Callable[[Parameters], None]) -> Callable[[Any], Any]:
+    """Return a callback that checks parameters before they are set.
+
+    Parameters
+    ----------
+    current : callable
+        Returns the parameters in force.
+    accept : callable
+        Takes the new ones when all are admitted.
+    """
+
+    def check(changes: list[RosParameter]) -> SetParametersResult:
+        try:
+            for change in changes:
+                if change.name.startswith('sensors.'):
+                    raise ParameterError(f'{change.name} is read at start only; restart the node with it')
+            known = {change.name: change.value for change in changes if change.name in NAMES}
+            accept(Parameters.from_flat(known, base=current()))
+        except ParameterError as error:
+            return SetParametersResult(successful=False, reason=str(error))
+        return SetParametersResult(successful=True)
+
+    return check
+
+
+def _mounts(given: dict[str, RosParameter]) -> dict[str, Pose2]:
+    mounts = {}
+    for name, parameter in given.items():
+        if name.startswith('sensors.') and name.endswith('.pose'):
+            value = parameter.value
+            numbers = list(value) if isinstance(value, (list, tuple)) or hasattr(value, 'typecode') else []
+            if len(numbers) != 3 or not all(isinstance(v, (int, float)) and math.isfinite(v) for v in numbers):
+                raise ParameterError(f'{name}: {value!r} is not [x, y, yaw], three finite numbers (metres, radians)')
+            mounts[name[len('sensors.') : -len('.pose')]] = Pose2(*(float(v) for v in numbers))
+    return mounts
+
+
+def _strangers(given: dict[str, RosParameter]) -> list[str]:
+    warnings = []
+    for name in given:
+        pose = name.startswith('sensors.') and name.endswith('.pose')
+        if name in NAMES or pose or name.partition('.')[0] in ROS_OWN:
+            continue
+        near = difflib.get_close_matches(name, NAMES, n=1)
+        hint = f'; did you mean {near[0]}?' if near else ''
+        warnings.append(f'parameter {name} means nothing to this node and is ignored{hint}')
+    return warnings

@@ -1,0 +1,50 @@
+"""Fixtures of the tests of the node; every test has a DDS domain of its own."""
+
+from __future__ import annotations
+
+import itertools
+import os
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parent))
+
+_domains = itertools.count(os.getpid() % 60)
+
+
+@pytest.fixture
+def domain() -> int:
+    return 1 + next(_domains) % 100
+
+
+@pytest.fixture
+def start(domain: int, tmp_path: Path) -> Iterator[Callable[..., Any]]:
+    """Start nodes, which are ended after the test; `ready` waits until they listen."""
+    from robot import NodeProcess
+
+    nodes = []
+
+    def begin(*arguments: str, ready: bool = True, **changes: str) -> NodeProcess:
+        node = NodeProcess(domain, tmp_path / f'node_{len(nodes)}.log', arguments, **changes)
+        nodes.append(node)
+        if ready:
+            node.wait_for('ready:')
+        return node
+
+    yield begin
+    for node in nodes:
+        if node.process.poll() is None:
+            node.stop()
+
+
+@pytest.fixture
+def robot(domain: int) -> Iterator[Any]:
+    from robot import Robot
+
+    made = Robot(domain)
+    yield made
+    made.close()
