@@ -105,17 +105,18 @@ def log_likelihood(readings: Readings, grid: Grid, occupied: np.ndarray, model: 
 
 def live_log_odds(readings: Readings, grid: Grid, depth: float, logits: tuple[float, float, float]) -> np.ndarray:
     """The standard map; `logits` of occupied, free, and free without echo."""
-    out = np.zeros(grid.size)
+    out = np.full(grid.size, np.nan)
     xs, ys = grid.centers()
     for t in range(len(readings)):
         x, y, yaw, z = readings.x[t], readings.y[t], readings.yaw[t], readings.z[t]
         echo = z < readings.z_max[t]
         for c, d in cone_cells((x, y, yaw), readings.half_angle[t], z + depth, grid).items():
             bearing = math.atan2(ys[c // grid.width] - y, xs[c % grid.width] - x)
-            off_axis = math.remainder(bearing - yaw, 2 * math.pi) / readings.half_angle[t]
-            weight = max(0.0, 1 - off_axis**2)
+            wide = 0.75 * grid.resolution
+            half_angle = max(readings.half_angle[t], wide / max(d, wide))
+            weight = max(0.0, 1 - (math.remainder(bearing - yaw, 2 * math.pi) / half_angle) ** 2)
             if d < (z - depth if echo else z):
-                out[c] += weight * logits[1 if echo else 2]
+                out[c] = np.nansum([out[c], weight * logits[1 if echo else 2]])
             elif echo:
-                out[c] += weight * logits[0]
+                out[c] = np.nansum([out[c], weight * logits[0]])
     return out.reshape(grid.shape)

@@ -110,11 +110,9 @@ class Bag:
         BagError
             If the bag is damaged and nothing of these topics can be read.
         """
-        wanted = {(topic, RANGE) for topic in topics.range_topics} | {(topics.odom_topic, ODOMETRY)}
+        wanted = self._begin(topics)
         total = sum(c.total for c in self._channels() if (c.topic, c.msgtype) in wanted)
         done = decoded = 0
-        for topic in {topic for topic, _ in wanted}:
-            self.undecodable.pop(topic, None)
         for channel, message in self._decoded(wanted):
             done += 1
             if progress and done % _PROGRESS_STEP == 0:
@@ -138,16 +136,35 @@ class Bag:
     def static_transforms(self) -> StaticTransforms:
         """Return all transforms on `/tf_static`, and on the `tf_static` of any namespace."""
         transforms = StaticTransforms()
-        wanted = {(c.topic, c.msgtype) for c in self._channels() if c.topic.split('/')[-1] == 'tf_static'}
-        for channel, message in self._decoded({pair for pair in wanted if pair[1] == TF_MESSAGE}):
-            if message is None:
-                continue
+        for channel, message in self._static():
             try:
                 for item in message.transforms:
                     _add_transform(transforms, item)
             except (AttributeError, TypeError, ValueError):
                 self._count_undecodable(channel)
         return transforms
+
+    def originals(self, topics: Topics) -> Iterator[tuple[str, Any]]:
+        """Yield topic and message of the chosen topics by log time, whole and as rosbags decodes them."""
+        for channel, message in self._decoded(self._begin(topics)):
+            if message is not None:
+                yield channel.topic, message
+
+    def static_originals(self) -> Iterator[tuple[str, Any]]:
+        """Yield topic and message of `/tf_static`, and of the `tf_static` of any namespace, in the same way."""
+        return ((channel.topic, message) for channel, message in self._static())
+
+    def _static(self) -> Iterator[tuple[Channel, Any]]:
+        wanted = {(c.topic, c.msgtype) for c in self._channels() if c.topic.split('/')[-1] == 'tf_static'}
+        found = self._decoded({pair for pair in wanted if pair[1] == TF_MESSAGE})
+        return ((channel, message) for channel, message in found if message is not None)
+
+    def _begin(self, topics: Topics) -> set[tuple[str, str]]:
+        """Return the (topic, type) pairs of the topics, whose undecodable messages are counted anew."""
+        wanted = {(topic, RANGE) for topic in topics.range_topics} | {(topics.odom_topic, ODOMETRY)}
+        for topic, _ in wanted:
+            self.undecodable.pop(topic, None)
+        return wanted
 
     def _reasons(self) -> str | None:
         reasons = [self._damage, *(source.damage for source in self._sources)]

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import argparse
 
+from ..core.errors import ParameterError
 from ..core.messages import Pose2
-from ..core.parameters import Parameters
+from ..core.parameters import Parameters, find
 from ..files.parameter_file import load_parameters, parse_setting
 from ..files.parameter_text import dump_parameters
 
@@ -46,4 +47,7 @@ def chosen_parameters(options: argparse.Namespace) -> tuple[Parameters, dict[str
     """
     values, mounts, _ = load_parameters(options.params) if options.params else ({}, {}, {})
     settings = dict(parse_setting(text) for text in options.set)
+    for name in settings:
+        if find(name).group == 'node':
+            raise ParameterError(f'--set {name}: only the node has this parameter; topics have options of their own')
     return Parameters.from_flat({**values, **settings}), dict(mounts)

@@ -8,7 +8,7 @@ unless z is near z_max: then all cells up to z_max stand in the way of the max-r
 The table is kept twice. By reading: free cells, and band cells with their density. By cell: the readings that have
 it in their free zone, and its band slots, so that the flip evaluation reads each cell's share front to back.
 
-Memory: 8 bytes a free pair, 20 a band pair (of which 4 are the search's), 40 a reading, 16 a cell.
+Memory: 8 bytes a free pair, 20 a band pair, about 80 a reading and 30 a cell, what the search keeps included.
 """
 
 from __future__ import annotations
@@ -100,8 +100,12 @@ def reach_of(readings: Readings, sigma: Floats, cut: float) -> Floats:
     return np.where(ends < readings.z_max, ends, readings.z_max)
 
 
-def grid_of(readings: Readings, model: ModelParameters, grid: GridParameters, within: Grid | None = None) -> Grid:
-    """Return the smallest grid that holds every cell that a reading touches, and all of `within`.
+def grid_of(
+    readings: Readings, model: ModelParameters, grid: GridParameters, within: Grid | None = None, beyond: float = 0.0
+) -> Grid:
+    """Return a grid that holds every cell that a reading touches, and all of `within`.
+
+    It follows the bounding boxes of the cones, out to where no cell matters and to `beyond` metres past the range.
 
     Raises
     ------
@@ -111,6 +115,10 @@ def grid_of(readings: Readings, model: ModelParameters, grid: GridParameters, wi
     if not len(readings):
         raise InputError('no reading was accepted, so there is nothing to map; the report says why each was rejected')
     reach = reach_of(readings, effective_sigma(readings, model, grid.resolution), model.cut)
+    reach = np.maximum(reach, readings.z + beyond if beyond else 0.0)
+    if model.cell_distance == 'nearest':
+        # a cell may be within reach though its centre is not
+        reach = reach + grid.resolution
     boxes = cone_boxes(readings.x, readings.y, readings.yaw, readings.half_angle, reach)
     box = (float(boxes[0].min()), float(boxes[1].max()), float(boxes[2].min()), float(boxes[3].max()))
     made = Grid.covering(box, grid.resolution)
@@ -266,6 +274,8 @@ def build_cone_index(
     ------
     Cancelled
         If `stop` was set.
+    InputError
+        If there are more than 2³¹ pairs.
     """
     stop = np.zeros(1, np.uint8) if stop is None else stop
     table = cone_table(readings, grid, model)
@@ -276,6 +286,11 @@ def build_cone_index(
     check(stop)
     free_start, band_start, seen_start, slot_start = (np.cumsum(start) for start in starts)
     free, band = int(free_start[-1]), int(band_start[-1])
+    if max(free, band) > np.iinfo(np.int32).max:
+        raise InputError(
+            f'{free + band} pairs of cells and readings are more than the {np.iinfo(np.int32).max} that fit: raise '
+            f'resolution, or map fewer readings at once'
+        )
     index = ConeIndex(
         free_start=free_start,
         free_cell=np.empty(free, np.int32),

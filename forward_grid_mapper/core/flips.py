@@ -169,15 +169,15 @@ def compute_gains(index: ConeIndex, state: FlipState, prior: float) -> None:
 
 @kernel
 def flip_in_order(
-    index: ConeIndex, causes: Causes, state: FlipState, prior: float, least: float, cells: NDArray[np.int64]
+    index: ConeIndex, causes: Causes, state: FlipState, prior: float, least: Floats, cells: NDArray[np.int64]
 ) -> tuple[int, float]:
-    """Flip those of `cells`, one after the other, that gain more than `least`; return their number and total gain."""
+    """Flip those of `cells`, in order, that gain more than their `least`; return their number and total gain."""
     flips, total = 0, 0.0
     for c in cells:
         if state.stop[0]:
             break
         gain = _gain(index, state, prior, c)
-        if gain > least:
+        if gain > least[c]:
             flip(index, causes, state, c)
             flips += 1
             total += gain
@@ -190,7 +190,7 @@ def shift_in_order(
     causes: Causes,
     state: FlipState,
     prior: float,
-    least: float,
+    least: Floats,
     cells: NDArray[np.int64],
     width: int,
 ) -> tuple[int, float]:
@@ -209,14 +209,14 @@ def shift_in_order(
         loss = _gain(index, state, prior, c)
         flip(index, causes, state, c)
         row, column = c // width, c % width
-        best, target = least - loss, c
+        best, target = -loss, c
         for dy in range(-1, 2):
             for dx in range(-1, 2):
                 if 0 <= row + dy < height and 0 <= column + dx < width:
                     other = c + dy * width + dx
                     if other != c and not state.occupied[other]:
                         gain = _gain(index, state, prior, other)
-                        if gain > best:
+                        if gain > best + (least[c] + least[other] if target == c else 0.0):
                             best, target = gain, other
         flip(index, causes, state, target)
         if target != c:

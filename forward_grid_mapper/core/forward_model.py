@@ -52,7 +52,7 @@ class Causes(NamedTuple):
 class Expectations:
     """The E-step: the probability of each cause of each reading, given the map. All float64, shape (N,).
 
-    `random` + `lost` + `no_echo` + `hit` is 1 (eq 12, 32). `rank` is Σ k·e_k, `squared_error` Σ e_k·(z − d_k)² in m²,
+    `random` + `lost` + `no_echo` + `hit` is 1 (eq 33-36). `rank` is Σ k·e_k, `squared_error` Σ e_k·(z − d_k)² in m²,
     `obstacles` K, the number of occupied cells in the cone up to its reach; `log_likelihood` is log p(z | m) in nats.
     """
 

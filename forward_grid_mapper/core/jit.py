@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import tempfile
 from collections.abc import Callable
@@ -23,23 +24,31 @@ def _writable(folder: Path) -> bool:
         return False
 
 
-def _place_cache() -> None:
-    """Give numba a cache folder where neither the package nor the home can be written.
+def _cache_folder() -> str:
+    """Return the folder for machine code of these very sources.
 
-    Numba looks for one beside the source and then in the user's cache, and refuses to load a cached kernel when it
-    finds none. A temporary folder of the user's own still spares later starts the compilation.
+    Numba renews a kernel when its own file changes, but not when a kernel that it calls does; so the folder's name
+    depends on all sources. It lies beside them, in the user's cache where they are read-only, or in a temporary folder
+    where the home is as well, which still spares later starts the compilation.
     """
-    if config.CACHE_DIR or _writable(Path(__file__).parent / '__pycache__'):
-        return
+    here = Path(__file__).parent
+    sources = b''.join(path.read_bytes() for path in sorted(here.glob('*.py')))
+    name = f'kernels_{hashlib.sha256(sources).hexdigest()[:16]}'
     home = Path(os.environ.get('XDG_CACHE_HOME') or Path(os.environ.get('HOME', '/')) / '.cache')
-    if not _writable(home / 'numba'):
-        config.CACHE_DIR = str(Path(tempfile.gettempdir()) / f'forward_grid_mapper_{os.getuid()}')
+    for folder in (config.CACHE_DIR, here / '__pycache__', home / 'forward_grid_mapper'):
+        if folder and _writable(Path(folder)):
+            return str(Path(folder) / name)
+    return str(Path(tempfile.gettempdir()) / f'forward_grid_mapper_{os.getuid()}' / name)
 
 
-_place_cache()
+CACHE = _cache_folder()
 
 
 def kernel(function: F) -> F:
     """Compile `function` at its first call, free of the GIL; keep the machine code on disk."""
-    compiled: Any = numba.njit(cache=True, nogil=True, error_model='numpy')(function)
+    before, config.CACHE_DIR = config.CACHE_DIR, CACHE
+    try:
+        compiled: Any = numba.njit(cache=True, nogil=True, error_model='numpy')(function)
+    finally:
+        config.CACHE_DIR = before
     return cast(F, compiled)

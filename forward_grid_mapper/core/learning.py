@@ -37,9 +37,11 @@ def learn(readings: Readings, grid: Grid, occupied: NDArray[Any], model: ModelPa
     values = {'p_rand': float(e.random.mean())}
     if model.p_lost > 0:
         values['p_lost'] = float(e.lost.mean())
-    hits = float(e.hit[readings.echo].sum())
+    # readings that state their own σ say nothing about the model's
+    unstated = readings.echo & (readings.sigma == 0)
+    hits = float(e.hit[unstated].sum())
     if hits > 0:
-        values['sigma'] = math.sqrt(float(e.squared_error[readings.echo].sum()) / hits)
+        values['sigma'] = math.sqrt(float(e.squared_error[unstated].sum()) / hits)
     # lost echoes and chance say nothing about the obstacles that stood in the way
     chances = float(e.rank.sum() + (e.obstacles * e.no_echo).sum())
     if chances > 0:

@@ -1,7 +1,8 @@
 """The standard log-odds map (eq 1-4 of the paper), updated reading by reading.
 
 Inverse sensor model. Let φ be a cell's angle off the axis, β the half angle and d its distance. A reading adds to the
-cells of its cone, weighted by 1 − (φ / β)² so that the edge of the cone says little (Moravec and Elfes 1985):
+cells of its cone, weighted by 1 − (φ / β)² so that the edge of the cone says little (Moravec and Elfes 1985); β is
+taken as large enough for the cone to be one and a half cells wide there, since a thin beam fills the cells it crosses:
 
     d < z − depth                  logit(live_p_free), or logit(live_p_free_no_echo) for a reading without echo
     z − depth ≤ d ≤ z + depth      logit(live_p_occupied); nothing for a reading without echo
@@ -25,6 +26,9 @@ from .parameters import Parameters
 from .readings import Readings
 
 QUANTUM = 2.0**-20
+HALF_WIDTH = 0.75
+"""Least half width of a cone in cells."""
+
 MARGIN = 64
 """Cells by which the array outgrows what is needed, so that a driving robot rarely makes it grow again."""
 
@@ -46,7 +50,8 @@ def _add(table: ConeTable, gains: Any, log_odds: Any, nearest: bool) -> None:
         for k in range(n):
             du = cells[k] % width + 0.5 - table.x[t]
             dv = cells[k] // width + 0.5 - table.y[t]
-            angle = math.atan2(cosine * dv - sine * du, cosine * du + sine * dv) / table.half_angle[t]
+            half_angle = max(table.half_angle[t], HALF_WIDTH / max(distances[k], HALF_WIDTH))
+            angle = math.atan2(cosine * dv - sine * du, cosine * du + sine * dv) / half_angle
             weight = max(1.0 - angle * angle, 0.0)
             if distances[k] < table.free[t]:
                 gain = free
@@ -55,12 +60,12 @@ def _add(table: ConeTable, gains: Any, log_odds: Any, nearest: bool) -> None:
             else:
                 continue
             step = math.floor(weight * gain / QUANTUM + 0.5) * QUANTUM
-            # a cell that a reading touches is known, even where the reading hardly says anything
-            flat[cells[k]] += step if step != 0.0 else math.copysign(QUANTUM, gain)
+            known = flat[cells[k]]
+            flat[cells[k]] = step if math.isnan(known) else known + step
 
 
 class LiveMap:
-    """The log-odds of every cell, on a grid that grows as readings come; 8 bytes a cell."""
+    """The log-odds of every cell, NaN where not observed, on a grid that grows as readings come; 8 bytes a cell."""
 
     def __init__(self, parameters: Parameters) -> None:
         self._parameters = parameters
@@ -84,10 +89,11 @@ class LiveMap:
         if not len(readings):
             return
         p = self._parameters
-        self.grid = grid_of(readings, p.model, p.grid, within=self.grid)
+        depth = max(p.live.live_depth, p.grid.resolution / 2)
+        self.grid = grid_of(readings, p.model, p.grid, within=self.grid, beyond=depth)
         self._grow()
         table = cone_table(readings, self._stored, p.model)
-        depth = max(p.live.live_depth / p.grid.resolution, 0.5)
+        depth /= p.grid.resolution
         table = table._replace(free=np.where(readings.echo, table.z - depth, table.z), reach=table.z + depth)
         gains = tuple(
             math.log(q / (1 - q)) for q in (p.live.live_p_occupied, p.live.live_p_free, p.live.live_p_free_no_echo)
@@ -95,13 +101,13 @@ class LiveMap:
         _add(table, gains, self._log_odds, p.model.cell_distance == 'nearest')
 
     def log_odds(self, grid: Grid | None = None) -> Floats:
-        """Return a copy of the log-odds on `grid` (by default the smallest one); 0 is not observed.
+        """Return a copy of the log-odds on `grid` (by default the map's own); NaN is not observed.
 
         `grid` may be larger than the map; it must be of the same resolution.
         """
         grid = grid or self.grid
         whole = self._stored.union(grid)
-        out = np.zeros(whole.shape)
+        out = np.full(whole.shape, np.nan)
         if self._stored.size:
             out[whole.window(self._stored)] = self._log_odds
         return np.array(out[whole.window(grid)])
@@ -110,8 +116,7 @@ class LiveMap:
         """Return the occupancy probabilities, p = 1 − 1 / (1 + e^l), NaN where not observed."""
         log_odds = self.log_odds(grid)
         with np.errstate(over='ignore'):
-            known = 1.0 - 1.0 / (1.0 + np.exp(log_odds))
-        return np.where(log_odds == 0.0, np.nan, known).astype(np.float32)
+            return (1.0 - 1.0 / (1.0 + np.exp(log_odds))).astype(np.float32)
 
     def _grow(self) -> None:
         inside = self._stored.union(self.grid)
@@ -120,7 +125,7 @@ class LiveMap:
         g = self.grid
         stored = Grid(g.resolution, g.column - MARGIN, g.row - MARGIN, g.width + 2 * MARGIN, g.height + 2 * MARGIN)
         stored = stored.union(self._stored)
-        grown = np.zeros(stored.shape)
+        grown = np.full(stored.shape, np.nan)
         if self._stored.size:
             grown[stored.window(self._stored)] = self._log_odds
         self._stored, self._log_odds = stored, grown

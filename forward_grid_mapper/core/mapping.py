@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .cone_index import ConeIndex, build_cone_index, effective_sigma, grid_of
+from .cone_index import ConeIndex, build_cone_index, check, effective_sigma, grid_of
 from .forward_model import causes_of, expectations
 from .grid import Grid
 from .learning import learn
 from .live_map import LiveMap
 from .maps import UNKNOWN, MapSet
-from .parameters import ModelParameters, Parameters
+from .parameters import Parameters
 from .readings import Readings
 from .search import Progress, Search, SearchResult
 from .uncertainty import marginals
@@ -31,9 +31,9 @@ def in_canonical_order(readings: Readings) -> Readings:
     Sums of floating point numbers depend on their order; two readings that are still equal are interchangeable.
     """
     rank = np.argsort(np.argsort(np.array(readings.sensor_names or ('',))))
-    return readings.select(
-        np.lexsort((readings.yaw, readings.y, readings.x, readings.z, rank[readings.sensor], readings.stamp))
-    )
+    r = readings
+    keys = (r.sigma, r.half_angle, r.z_max, r.yaw, r.y, r.x, r.z, rank[r.sensor], r.stamp)
+    return readings.select(np.lexsort(keys))
 
 
 class Mapper:
@@ -63,9 +63,7 @@ class Mapper:
         seen = np.diff(index.seen_start) + np.diff(index.slot_start) > 0
         return np.where(seen, occupied, UNKNOWN).reshape(grid.shape).astype(np.int8)
 
-    def run(
-        self, readings: Readings, watch: Watch = lambda stage, progress: None, live: LiveMap | None = None
-    ) -> MapSet:
+    def run(self, readings: Readings, watch: Watch = lambda stage, progress: None) -> MapSet:
         """Return the maps of `readings`.
 
         Parameters
@@ -73,8 +71,6 @@ class Mapper:
         readings : Readings
         watch : callable
             Called from this thread as the work goes on.
-        live : LiveMap, optional
-            A live map that already holds these readings; without it one is made.
 
         Raises
         ------
@@ -86,30 +82,28 @@ class Mapper:
         self._seconds = {}
         readings = in_canonical_order(readings)
         parameters = self._parameters
-        grid = grid_of(readings, parameters.model, parameters.grid)
-        with self._stage('live map', watch):
-            if live is None:
-                live = LiveMap(parameters)
-                live.add(readings)
-            live_map = live.probability(grid)
-        index, result = self._find(readings, grid, parameters.model, watch)
+        grid, index, result = self._find(readings, parameters, watch)
         for _ in range(self._learn_rounds):
             with self._stage('learning', watch):
                 model = learn(readings, grid, result.occupied.reshape(grid.shape), parameters.model)
                 parameters = dataclasses.replace(parameters, model=model)
-            index, result = self._find(readings, grid, model, watch)
+            grid, index, result = self._find(readings, parameters, watch)
+        with self._stage('live map', watch):
+            live = LiveMap(parameters)
+            live.add(readings)
+            live_map = live.probability(grid)
         with self._stage('uncertainty', watch):
             return self._collect(readings, grid, parameters, index, result, live_map)
 
-    def _find(
-        self, readings: Readings, grid: Grid, model: ModelParameters, watch: Watch
-    ) -> tuple[ConeIndex, SearchResult]:
+    def _find(self, readings: Readings, parameters: Parameters, watch: Watch) -> tuple[Grid, ConeIndex, SearchResult]:
+        model = parameters.model
+        grid = grid_of(readings, model, parameters.grid)
         with self._stage('index', watch):
             index = build_cone_index(readings, grid, model, self._stop)
         with self._stage('search', watch):
             causes = causes_of(readings, effective_sigma(readings, model, grid.resolution), model)
-            self._search, self._grid = Search(index, causes, grid.width, self._parameters.search, self._stop), grid
-            return index, self._search.run(lambda progress: watch('search', progress))
+            self._search, self._grid = Search(index, causes, grid.width, parameters.search, self._stop), grid
+            return grid, index, self._search.run(lambda progress: watch('search', progress))
 
     def _collect(
         self,
@@ -152,6 +146,7 @@ class Mapper:
 
     def _stage(self, name: str, watch: Watch) -> _Stage:
         watch(name, None)
+        check(self._stop)
         return _Stage(name, self._seconds)
 
 

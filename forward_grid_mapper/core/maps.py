@@ -31,7 +31,7 @@ class MapSet:
     readings : Readings
         The readings that the maps explain.
     unexplained : bool, shape (N,)
-        Readings whose most likely cause, given the ML map, is chance (eq 12's e_* above one half).
+        Readings whose most likely cause, given the ML map, is chance (e_* above one half).
     log_likelihood : float
         log p(Z | ml) in nats.
     objective : float

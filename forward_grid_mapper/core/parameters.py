@@ -133,7 +133,7 @@ class SearchParameters:
         "Prior probability of an occupied cell; 0.5 is the paper's plain ML, less removes dots and thins walls.",
         'probability',
         1e-6,
-        0.999999,
+        0.5,
     )
     shift_moves: bool = _param(True, 'Also try to move an occupied cell to a neighbouring one in a single step.')
     max_sweeps: int = _param(

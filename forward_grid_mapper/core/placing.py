@@ -66,6 +66,9 @@ JUMP = NANOSECONDS
 RETRY = NANOSECONDS // 20
 """How often, in message time, a pose that may still become known is asked for again."""
 
+FARTHEST = 2e7
+"""Metres from the origin beyond which no pose can be right: half the way round the Earth."""
+
 PATH_STEP = 0.05
 """Metres between points of the robot's path."""
 
@@ -273,7 +276,9 @@ class Placer:
             del stamps[: old - 1], poses[: old - 1]
 
     def finish(self) -> None:
-        """Say that no more messages come: what still waits is rejected."""
+        """Say that no more messages come: what still waits is placed if it can be, or rejected."""
+        if self._stamps:
+            self._settle_up_to(self._stamps[-1])
         for measured in sorted(self._waiting):
             self._reject(measured.frame_id, 'after_odometry' if self._stamps else 'no_odometry')
         self._waiting.clear()
@@ -290,6 +295,7 @@ class Placer:
         self._reject(measured.frame_id, 'unknown_mount')
 
     def _jump_back(self) -> None:
+        self._settle_up_to(self._stamps[-1])
         self.time_jumps += 1
         for measured in (*self._waiting, *(held for held, _ in self._held)):
             self._reject(measured.frame_id, 'time_jump')
@@ -303,8 +309,9 @@ class Placer:
     def _settle(self) -> None:
         """Place or reject every waiting reading whose fate is known."""
         newest = self._stamps[-1] if self._stamps else None
-        while self._waiting and newest is not None and self._waiting[0].stamp <= newest:
-            self._place(heapq.heappop(self._waiting))
+        if newest is not None:
+            # odometry may be late by up to JUMP, and a file can wait for it
+            self._settle_up_to(newest - JUMP if self._patient else newest)
         if self._patient:
             return
         now = max(self._newest_range or 0, newest or 0)
@@ -324,6 +331,10 @@ class Placer:
                     self._reject_unknown(measured)
                 else:
                     self._mount(measured, pose)
+
+    def _settle_up_to(self, stamp: int) -> None:
+        while self._waiting and self._waiting[0].stamp <= stamp:
+            self._place(heapq.heappop(self._waiting))
 
     def _place(self, measured: _Measurement) -> None:
         stamps = self._stamps
@@ -369,6 +380,8 @@ class Placer:
 
     def _fits(self, sensor: Pose2, z_max: float) -> bool:
         """Whether the map can grow to hold the reading; if so, it does."""
+        if not max(abs(sensor.x), abs(sensor.y)) < FARTHEST:
+            return False
         left, right, bottom, top = self._box
         box = (
             min(left, sensor.x - z_max),

@@ -5,7 +5,7 @@ occupied cells are moved to neighbours, and so on until neither gains. Ties keep
 
     J(m) = log p(Z | m) + logit(prior) · (number of occupied cells)
 
-never falls, and at the end no single flip raises it by more than `LEAST_GAIN`.
+never falls, and at the end no single flip raises it by more than `LEAST_GAIN` and the cell's share of `ROUNDING`.
 """
 
 from __future__ import annotations
@@ -23,7 +23,11 @@ from .forward_model import Causes
 from .parameters import SearchParameters
 
 LEAST_GAIN = 1e-4
-"""Nats that a flip must gain: a hundred times the rounding of float32 ratios, so that the search cannot go round."""
+"""Nats that a flip must gain."""
+
+ROUNDING = 1.2e-7
+"""Nats that it must gain in addition for each of the cell's readings: what float32 ratios may be off, so that the
+search cannot go round, not even where ten thousand readings are off to the same side."""
 
 
 @dataclass(frozen=True)
@@ -83,6 +87,7 @@ class Search:
             gain=np.zeros(cells),
             stop=np.zeros(1, np.uint8) if stop is None else stop,
         )
+        self.least = LEAST_GAIN + ROUNDING * (np.diff(index.seen_start) + np.diff(index.slot_start))
         self.progress = Progress(0, 0, 0, 0.0)
 
     def _gains(self) -> Floats:
@@ -108,10 +113,10 @@ class Search:
         converged = False
         while self.progress.sweeps < self._parameters.max_sweeps:
             gains = self._gains()
-            cells = np.flatnonzero(gains > LEAST_GAIN)
+            cells = np.flatnonzero(gains > self.least)
             if len(cells):
                 order = cells[np.argsort(-gains[cells], kind='stable')]
-                flips, gain = flip_in_order(self.index, self._causes, self.state, self._prior, LEAST_GAIN, order)
+                flips, gain = flip_in_order(self.index, self._causes, self.state, self._prior, self.least, order)
                 self._advance(1, flips, 0, gain, watch)
                 continue
             if not self._parameters.shift_moves or not self._shift(watch):
@@ -127,6 +132,6 @@ class Search:
         occupied = np.flatnonzero(self.state.occupied)
         # an order that a mirrored or turned map has too
         cells = occupied[np.argsort(-self.state.gain[occupied], kind='stable')]
-        shifts, gain = shift_in_order(self.index, self._causes, self.state, self._prior, LEAST_GAIN, cells, self._width)
+        shifts, gain = shift_in_order(self.index, self._causes, self.state, self._prior, self.least, cells, self._width)
         self._advance(1, 0, shifts, gain, watch)
         return shifts

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import zipfile
 from pathlib import Path
@@ -42,18 +43,21 @@ def write_npz(path: Path | str, maps: MapSet) -> None:
         If the file cannot be written.
     """
     path = Path(path)
-    with output_errors(path), path.open('wb') as file:
-        np.savez_compressed(
-            file,
-            live_map=maps.live.astype(np.float32),
-            ml_map=np.where(maps.ml == UNKNOWN, np.nan, maps.ml).astype(np.float32),
-            uncertainty_map=maps.uncertainty.astype(np.float32),
-            origin=np.array(maps.grid.origin, np.float64),
-            resolution=np.float64(maps.grid.resolution),
-            log_likelihood=np.float64(maps.log_likelihood),
-            objective=np.float64(maps.objective),
-            parameters=np.array(json.dumps(maps.parameters.flat())),
-        )
+    # in memory first: a ZipFile whose writing fails complains once more when it is collected
+    packed = io.BytesIO()
+    np.savez_compressed(
+        packed,
+        live_map=maps.live.astype(np.float32),
+        ml_map=np.where(maps.ml == UNKNOWN, np.nan, maps.ml).astype(np.float32),
+        uncertainty_map=maps.uncertainty.astype(np.float32),
+        origin=np.array(maps.grid.origin, np.float64),
+        resolution=np.float64(maps.grid.resolution),
+        log_likelihood=np.float64(maps.log_likelihood),
+        objective=np.float64(maps.objective),
+        parameters=np.array(json.dumps(maps.parameters.flat())),
+    )
+    with output_errors(path):
+        path.write_bytes(packed.getbuffer())
 
 
 def read_npz(path: Path | str) -> MapArchive:

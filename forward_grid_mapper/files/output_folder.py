@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import itertools
 import os
+import re
 import shutil
 import uuid
 from collections.abc import Iterator
@@ -13,6 +14,7 @@ from pathlib import Path
 
 from ..core.errors import OutputError
 
+_STAGING = re.compile(r'\.(?P<name>.+)\.[0-9a-f]{8}\.partial')
 _FULL = {errno.ENOSPC, errno.EDQUOT}
 # Errors that only writing can cause, so that they may be blamed on the output whoever meets them.
 _WRITE_ONLY = _FULL | {errno.EFBIG, errno.EROFS}
@@ -133,6 +135,7 @@ def _remove_empty(folders: list[Path]) -> None:
 
 
 def _output_error(path: Path, error: OSError) -> OutputError:
+    path = _as_asked_for(path)
     if error.errno in _FULL:
         return OutputError(f'{path}: the disk is full; free some space or choose another place with -o')
     if error.errno == errno.ENOTDIR:
@@ -140,3 +143,16 @@ def _output_error(path: Path, error: OSError) -> OutputError:
     if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
         return OutputError(f'{path}: no permission to write there; choose another place with -o')
     return OutputError(f'{path} cannot be written: {error.strerror or error}')
+
+
+def _as_asked_for(path: Path) -> Path:
+    """Return a path with the temporary folders of `output_folder` replaced by what they stand for."""
+    parts: list[str] = []
+    for part in path.parts:
+        if match := _STAGING.fullmatch(part):
+            # a nested one stands for the folder that it lies in
+            if not (parts and parts[-1] == match['name']) and not _STAGING.fullmatch(match['name']):
+                parts.append(match['name'])
+        else:
+            parts.append(part)
+    return Path(*parts)

@@ -23,6 +23,11 @@ class Health:
         self._last: dict[str, tuple[int, float]] = {}
         self._rejected = 0
         self._received = 0
+        self._slowest = 0
+
+    def taken(self, sent: int) -> None:
+        """Note that a reading was taken which was published at `sent`, nanoseconds of the system's clock."""
+        self._slowest = max(self._slowest, time.time_ns() - sent)
 
     def statuses(
         self, name: str, placer: Placer, run: Run | None, last_run: str, grid: Grid, paused: bool, extra: dict[str, Any]
@@ -35,6 +40,7 @@ class Health:
             'readings waiting for a pose': placer.waiting,
             'readings rejected': sum(placer.rejected.values()),
             **{f'rejected: {reason}': count for reason, count in sorted(placer.rejected.items())},
+            'longest delay of a reading (ms)': f'{self._slowest / 1e6:.1f}',
             'odometry received': placer.odometry_received,
             **{f'odometry rejected: {reason}': count for reason, count in sorted(placer.odometry_rejected.items())},
             'clock jumps back': placer.time_jumps,
@@ -43,6 +49,7 @@ class Health:
             'map size': f'{grid.width} x {grid.height} cells of {grid.resolution} m',
             **extra,
         }
+        self._slowest = 0
         em = {'state': str(run) if run else 'idle', 'last run': last_run}
         return [
             _status(f'{name}: readings', level, message, name, values),

@@ -41,6 +41,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             file=sys.stderr,
         )
         return 1
+    # callbacks get their turn soon where EM is between two kernels
+    sys.setswitchinterval(0.0005)
     from ..core.warm_up import warm_up
     from .mapper_node import MapperNode
 

@@ -112,7 +112,8 @@ class MapperNode(Node):
 
     # messages
 
-    def _on_range(self, message: Range) -> None:
+    def _on_range(self, message: Range, info: dict[str, int]) -> None:
+        self._health.taken(info['source_timestamp'])
         if self._paused:
             self._placer.reject(range_message(message), 'paused')
         else:

@@ -49,7 +49,9 @@ def tape() -> Tape:
     """Past a door with eight sonars; the numbers of a Range are exact in single precision, as in its message."""
     recording = door_drive(1, NOISY, 0, front_array())
     exact = [
-        m._replace(**{k: float(np.float32(getattr(m, k))) for k in ('range', 'min_range', 'max_range', 'field_of_view')})
+        m._replace(
+            **{k: float(np.float32(getattr(m, k))) for k in ('range', 'min_range', 'max_range', 'field_of_view')}
+        )
         for m in recording.ranges
     ]
     return Tape(recording.mounts, recording.odometry, exact)

@@ -30,9 +30,16 @@ from forward_grid_mapper.commands.offline import read_drive
 from forward_grid_mapper.core.mapping import in_canonical_order
 from forward_grid_mapper.core.messages import Pose2
 from forward_grid_mapper.core.parameters import Parameters
+from forward_grid_mapper.files import drawing
 
 FRAMES = [frame for frame, _ in tape().mounts]
 COUNT = len(tape().ranges)
+
+
+@pytest.fixture(autouse=True)
+def no_picture(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Drawing takes most of the time of a run, and no part in these tests."""
+    monkeypatch.setattr(drawing, 'draw', lambda path, picture: None)
 
 
 @pytest.fixture(scope='module')
@@ -46,9 +53,7 @@ def plain(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def every(step: int, **changes: Any) -> Tape:
     """The drive with every `step`-th Range changed."""
-    return tape()._replace(
-        ranges=[m._replace(**changes) if k % step == 0 else m for k, m in enumerate(tape().ranges)]
-    )
+    return tape()._replace(ranges=[m._replace(**changes) if k % step == 0 else m for k, m in enumerate(tape().ranges)])
 
 
 def refused_drive(capsys: pytest.CaptureFixture[str], folder: Path, drive: Tape, *options: object) -> str:
@@ -259,12 +264,7 @@ RANGE, ODOMETRY = type(tape().ranges[0]), type(tape().odometry[0])
     'late',
     [
         RANGE,
-        pytest.param(
-            ODOMETRY,
-            marks=pytest.mark.xfail(
-                strict=True, reason='core/placing.py places a reading before odometry that is late has come'
-            ),
-        ),
+        ODOMETRY,
     ],
 )
 def test_the_order_of_logging_does_not_matter(tmp_path: Path, late: type[Message]) -> None:

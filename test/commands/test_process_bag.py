@@ -18,6 +18,7 @@ from forward_grid_mapper.core.mapping import Mapper
 from forward_grid_mapper.core.messages import Pose2
 from forward_grid_mapper.core.parameters import TABLE, Parameters
 from forward_grid_mapper.core.placing import Placer
+from forward_grid_mapper.files import drawing
 from forward_grid_mapper.files.map_archive import read_npz
 from forward_grid_mapper.files.map_files import occupancy_values, read_map
 from forward_grid_mapper.simulation.drive import door_drive
@@ -25,6 +26,12 @@ from forward_grid_mapper.simulation.sonar import NOISY, front_array
 
 FRAMES = [frame for frame, _ in tape().mounts]
 DRIVE = ('door', '--seen', 1, '--sonars', 'front', '-q')
+
+
+@pytest.fixture(autouse=True)
+def quick_picture(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Drawing takes most of the time of a run; `plain` and the tests of paths draw for real."""
+    monkeypatch.setattr(drawing, 'draw', lambda path, picture: path.write_bytes(b''))
 
 
 @pytest.fixture(scope='module')
@@ -99,7 +106,11 @@ def test_all_files_are_there(plain: Path) -> None:
     assert (folder / 'maps.png').read_bytes().startswith(b'\x89PNG')
     archive = read_npz(folder / 'maps.npz')
     arrays = arrays_in(folder)
-    for name, mode, tolerance in (('ml_map', 'trinary', 0.0), ('live_map', 'raw', 0.006), ('uncertainty_map', 'raw', 0.006)):
+    for name, mode, tolerance in (
+        ('ml_map', 'trinary', 0.0),
+        ('live_map', 'raw', 0.006),
+        ('uncertainty_map', 'raw', 0.006),
+    ):
         meta = yaml.safe_load((folder / f'{name}.yaml').read_text())
         assert (meta['mode'], meta['image'], meta['negate']) == (mode, f'{name}.pgm', 0)
         grid, values = read_map(folder / f'{name}.yaml')
@@ -183,7 +194,10 @@ def test_what_is_printed(tmp_path: Path, plain: Path, capsys: pytest.CaptureFixt
 
 @pytest.mark.filterwarnings('ignore:Glyph')
 @pytest.mark.parametrize('name', ['with space', 'Büro 日本 😀', r'$x^{\frac', '50% of #1?', '-dash'])
-def test_odd_paths(tmp_path: Path, plain: Path, name: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_odd_paths(
+    tmp_path: Path, plain: Path, name: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.undo()
     bag = tmp_path / name / 'bag'
     shutil.copytree(plain / 'bag', bag)
     for which, path in (('folder', bag), ('file', bag / 'bag.mcap')):
@@ -193,7 +207,10 @@ def test_odd_paths(tmp_path: Path, plain: Path, name: str, capsys: pytest.Captur
     assert f'maps are in {tmp_path / name / name} file' in capsys.readouterr().out
 
 
-def test_a_path_that_is_no_text(tmp_path: Path, plain: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_path_that_is_no_text(
+    tmp_path: Path, plain: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.undo()
     folder = tmp_path / os.fsdecode(b'n\xfft')
     try:
         folder.mkdir()
@@ -208,7 +225,9 @@ def test_a_path_that_is_no_text(tmp_path: Path, plain: Path, capsys: pytest.Capt
 # ---- options
 
 
-def test_the_list_of_parameters_changes_nothing(tmp_path: Path, plain: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_list_of_parameters_changes_nothing(
+    tmp_path: Path, plain: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert code_of(process_bag.main, '--list-parameters') == 0
     listed = capsys.readouterr().out
     for row in TABLE:
@@ -269,7 +288,9 @@ def test_degrees_and_slashes_in_a_sensor(tmp_path: Path) -> None:
 def test_one_of_two_odometry_topics(tmp_path: Path, plain: Path) -> None:
     moved = [m._replace(frame_id='map', pose=Pose2(m.pose.y, m.pose.x, 1.0)) for m in tape().odometry]
     drive = tape()._replace(odometry=[*tape().odometry, *moved])
-    bag = write_tape(tmp_path / 'bag', drive, odometry_topic=lambda m: '/odom' if m.frame_id == 'odom' else '/laser/odom')
+    bag = write_tape(
+        tmp_path / 'bag', drive, odometry_topic=lambda m: '/odom' if m.frame_id == 'odom' else '/laser/odom'
+    )
     for name in ('/odom', 'odom'):
         report = mapped(bag, tmp_path / f'of {name.strip("/")} {len(name)}', '--odom-topic', name)
         assert (report['input']['odom_topic'], report['input']['odom_frame']) == ('/odom', 'odom')

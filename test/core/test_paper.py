@@ -22,7 +22,7 @@ from forward_grid_mapper.core.live_map import LiveMap
 from forward_grid_mapper.core.mapping import Mapper
 from forward_grid_mapper.core.parameters import ModelParameters, Parameters, SearchParameters, find
 from forward_grid_mapper.core.readings import Readings
-from forward_grid_mapper.core.search import LEAST_GAIN, Search
+from forward_grid_mapper.core.search import Search
 from forward_grid_mapper.core.uncertainty import marginals
 from forward_grid_mapper.simulation.drive import NOISY, corridor_drive, door_drive
 
@@ -277,15 +277,16 @@ Order = Callable[[np.ndarray, np.ndarray], np.ndarray]
 def climb(readings: Readings, grid: Grid, order: Order, model: ModelParameters = PAPER) -> np.ndarray:
     """Single flips, sweep by sweep, until none gains."""
     index, causes = prepare(readings, grid, model)
-    state = search(readings, grid, model).state
+    climber = search(readings, grid, model)
+    state, least = climber.state, climber.least
     refresh_all(index, causes, state)
     for _ in range(200):
         mark_cells(index, state)
         compute_gains(index, state, 0.0)
-        cells = np.flatnonzero(state.gain > LEAST_GAIN)
+        cells = np.flatnonzero(state.gain > least)
         if not len(cells):
             return state.occupied.reshape(grid.shape)
-        flip_in_order(index, causes, state, 0.0, LEAST_GAIN, order(cells, state.gain))
+        flip_in_order(index, causes, state, 0.0, least, order(cells, state.gain))
     raise AssertionError('the sweeps do not end')
 
 

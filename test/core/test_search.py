@@ -151,6 +151,22 @@ def test_evidence_is_zero_where_nothing_was_seen() -> None:
     assert result.occupied.reshape(GRID.shape)[0, 3] == 1
 
 
+def test_many_readings_that_round_alike_do_not_make_the_search_go_round() -> None:
+    silent, echoes = 10_000, 317
+    readings = Readings.from_columns(
+        x=0.05,
+        y=0.05,
+        yaw=0.0,
+        z=np.concatenate([np.full(silent, 1.5), np.full(echoes, 0.5)]),
+        z_max=1.5,
+        half_angle=0.01,
+    )
+    grid = Grid(0.1, 0, 0, 16, 1)
+    for p_rand in np.linspace(0.02, 0.2, 19):
+        model = ModelParameters(p_hit=0.05, p_rand=float(p_rand), p_lost=0.0, sigma=0.05)
+        assert make(readings, grid, model).run().converged
+
+
 def test_a_search_can_be_cancelled() -> None:
     search = make(random_readings(np.random.default_rng(0), GRID, 50))
     search.state.stop[0] = 1

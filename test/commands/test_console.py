@@ -1,0 +1,210 @@
+"""The command line from outside: exit codes, pipes, terminals, and the progress line."""
+
+from __future__ import annotations
+
+import io
+import os
+import re
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from drive_samples import FILES, tape, write_tape
+
+from forward_grid_mapper import __version__
+from forward_grid_mapper.__main__ import COMMANDS
+from forward_grid_mapper.commands import console, process_bag
+from forward_grid_mapper.commands.console import Ticker, readable
+from forward_grid_mapper.core.search import Progress
+
+MODULE = [sys.executable, '-m', 'forward_grid_mapper']
+
+
+@pytest.fixture(scope='module')
+def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A sound bag of the drive."""
+    return write_tape(tmp_path_factory.mktemp('plain') / 'bag', tape())
+
+
+def shell(*arguments: object, **environment: str) -> subprocess.CompletedProcess[str]:
+    """Run the module in a process of its own, with stdout buffered as it is for users."""
+    inherited = {k: v for k, v in os.environ.items() if k != 'PYTHONUNBUFFERED'}
+    command = [*MODULE, *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, check=False, env={**inherited, **environment})
+
+
+# ---- from outside
+
+
+def test_usage() -> None:
+    helped = shell('--help')
+    assert (helped.returncode, helped.stderr) == (0, '')
+    assert all(re.search(rf'^  {name} ', helped.stdout, re.MULTILINE) for name in COMMANDS)
+    for arguments in ((), ('map_bag',)):
+        refused = shell(*arguments)
+        assert (refused.returncode, refused.stdout, refused.stderr) == (2, '', helped.stdout)
+    assert shell('--version').stdout == f'{__version__}\n'
+
+
+def test_from_simulation_to_maps(tmp_path: Path) -> None:
+    simulated = shell('simulate', 'door', '--seen', 1, '-o', tmp_path / 'drive', '--sonars', 'front')
+    assert simulated.returncode == 0, simulated.stderr
+    command = simulated.stdout.splitlines()[-1].split()
+    assert command[:3] == ['python3', '-m', 'forward_grid_mapper']
+    done = shell(*command[3:], '-o', tmp_path / 'maps', '-q')
+    assert (done.returncode, done.stdout, done.stderr) == (0, f'maps are in {tmp_path / "maps"}\n', '')
+    assert {path.name for path in (tmp_path / 'maps').iterdir()} == FILES
+
+
+def test_errors_are_one_line(tmp_path: Path) -> None:
+    done = shell('process_bag', tmp_path / 'absent')
+    assert (done.returncode, done.stdout) == (1, '')
+    assert re.fullmatch(r'process_bag: error: .*absent does not exist.*\n', done.stderr)
+
+
+def test_a_reader_that_goes_away(tmp_path: Path, bag: Path) -> None:
+    """As `process_bag … | head` and `| true` do."""
+    for arguments in (['--list-parameters'], [str(bag), '-o', str(tmp_path / 'maps')]):
+        for unbuffered in ('', '1') if len(arguments) == 1 else ('',):
+            reader, writer = os.pipe()
+            os.close(reader)
+            environment = {**os.environ, 'PYTHONUNBUFFERED': unbuffered}
+            command = [*MODULE, 'process_bag', *arguments]
+            done = subprocess.run(
+                command, stdout=writer, stderr=subprocess.PIPE, text=True, check=False, env=environment
+            )
+            os.close(writer)
+            assert done.returncode == 1
+            assert not re.search('Traceback|Exception|error', done.stderr)
+    assert {path.name for path in (tmp_path / 'maps').iterdir()} == FILES
+
+
+@pytest.mark.skipif(not Path('/dev/full').exists(), reason='there is no /dev/full')
+def test_output_that_cannot_be_printed(tmp_path: Path, bag: Path) -> None:
+    for arguments in (['--list-parameters'], [str(bag), '-q', '-o', str(tmp_path / 'maps')]):
+        with Path('/dev/full').open('w') as full:
+            command = [*MODULE, 'process_bag', *arguments]
+            done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, check=False)
+        assert done.returncode == 1
+        assert re.fullmatch(r'process_bag: error: .*No space left on device\n', done.stderr)
+
+
+def test_a_terminal_that_cannot_show_a_name(tmp_path: Path, bag: Path) -> None:
+    done = shell('process_bag', bag, '-q', '-o', tmp_path / 'maps–日本', PYTHONIOENCODING='latin-1')
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.endswith('maps\\u2013\\u65e5\\u672c\n')
+
+
+def test_a_working_directory_that_is_gone(tmp_path: Path, bag: Path) -> None:
+    folder = tmp_path / 'gone'
+    folder.mkdir()
+    script = f'rmdir "{folder}" && exec "$@"'
+    command = ['sh', '-c', script, 'sh', *MODULE, 'process_bag', str(bag)]
+    environment = {**os.environ, 'PYTHONPATH': os.pathsep.join(filter(None, map(os.path.abspath, sys.path)))}
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False, env=environment)
+    assert done.returncode == 1
+    assert 'process_bag: error: ' in done.stderr and 'Traceback' not in done.stderr
+
+
+# ---- errors
+
+
+@pytest.mark.parametrize(
+    ('error', 'code', 'expected'),
+    [
+        (MemoryError(), 1, 'raise resolution'),
+        (FileNotFoundError(2, 'No such file or directory', 'there'), 1, "'there'"),
+        (KeyboardInterrupt(), 130, 'nothing was written'),
+    ],
+)
+def test_what_may_still_happen(
+    capsys: pytest.CaptureFixture[str], error: BaseException, code: int, expected: str
+) -> None:
+    def body(options: object) -> int:
+        raise error
+
+    assert console.run(process_bag.parser(), body, ['bag']) == code
+    out, err = capsys.readouterr()
+    assert out == '' and err.startswith('process_bag: ') and expected in err
+    print('still printing')
+    assert capsys.readouterr().out == 'still printing\n'
+
+
+def test_errors_of_ours_are_not_hidden() -> None:
+    def body(options: object) -> int:
+        raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        console.run(process_bag.parser(), body, ['bag'])
+
+
+def test_readable() -> None:
+    assert readable(Path('Büro 日本')) == 'Büro 日本'
+    assert readable(os.fsdecode(b'n\xfft')) == r'n\xfft'
+
+
+# ---- progress
+
+
+class Screen(io.StringIO):
+    """A terminal."""
+
+    def isatty(self) -> bool:
+        """Say yes."""
+        return True
+
+
+def test_silent_under_a_second() -> None:
+    for stream in (io.StringIO(), Screen()):
+        with Ticker(stream=stream) as ticker:
+            ticker.say('working')
+            time.sleep(0.4)
+        assert stream.getvalue() == ''
+
+
+def test_shows_longer_work() -> None:
+    streams = {'log': io.StringIO(), 'screen': Screen(), 'quiet': Screen(), 'idle': Screen()}
+    with (
+        Ticker(stream=streams['log']) as log,
+        Ticker(stream=streams['screen']) as screen,
+        Ticker(quiet=True, stream=streams['quiet']) as quiet,
+        Ticker(stream=streams['idle']),
+    ):
+        for ticker in (log, screen, quiet):
+            ticker.reading(1000, 12345)
+        time.sleep(1.4)
+        for ticker in (log, screen, quiet):
+            ticker.mapping('search', Progress(3, 1234, 5, 678.9))
+        time.sleep(1.4)
+    shown = {name: stream.getvalue() for name, stream in streams.items()}
+    assert shown['quiet'] == shown['idle'] == ''
+    reading, searching = 'reading: 1,000 of 12,345 messages', 'search: sweep 3, 1,234 flips, 679 nats gained'
+    assert re.fullmatch(rf' +\d s  {reading}\n +\d s  {searching}\n', shown['log'])
+    parts = shown['screen'].split('\r\033[K')
+    assert parts[0] == '' and parts[-1] == '', 'the line is cleared at the end'
+    assert [text for text in dict.fromkeys(part.partition(' s  ')[2] for part in parts) if text] == [reading, searching]
+    assert '\n' not in shown['screen']
+
+
+def test_the_first_run_says_why_it_takes_long(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(console, 'PATIENCE', 0.0)
+    stream = Screen()
+    with Ticker(stream=stream) as ticker:
+        ticker.mapping('live map', None)
+        time.sleep(0.5)
+    assert 'live map (the first run compiles' in stream.getvalue()
+
+
+def test_ends_at_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(console, 'PATIENCE', 0.0)
+    stream = Screen()
+    with pytest.raises(KeyboardInterrupt), Ticker(stream=stream) as ticker:
+        ticker.say('working')
+        time.sleep(0.5)
+        raise KeyboardInterrupt
+    length = len(stream.getvalue())
+    time.sleep(0.5)
+    assert len(stream.getvalue()) == length
+    assert stream.getvalue().endswith('\r\033[K')

@@ -1,0 +1,98 @@
+"""`experiment` and `demo`: they run, print a table and leave a picture."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+from drive_samples import FILES, code_of, everything_in, report_in
+
+from forward_grid_mapper.commands import demo, experiment
+
+
+@pytest.fixture(autouse=True)
+def few_gains(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The standard map has three settings instead of hundreds."""
+    monkeypatch.setattr(experiment, 'GAINS', experiment.GAINS[:: len(experiment.GAINS) // 3][:3])
+
+
+def test_door(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert code_of(experiment.main, 'door', '--seeds', 1) == 0
+    out = capsys.readouterr().out
+    rows = re.findall(r'^(noise-free|noisy) +n = (\d+) +(.*)$', out, re.MULTILINE)
+    assert [row[:2] for row in rows] == [(noise, n) for noise in ('noise-free', 'noisy') for n in ('1', '3', '16')]
+    for row in rows:
+        scores = re.findall(r'(\d\.\d{3})  (\d\.\d)-(\d\.\d)', row[2])
+        assert len(scores) == 4
+        assert all(0.0 <= float(f1) <= 1.0 and float(low) <= float(high) for f1, low, high in scores)
+        assert float(scores[0][0]) > 0.5, 'the forward map has lost the walls'
+    assert 'best gains of 3' in out
+    folder = tmp_path / 'experiment_door'
+    assert str(folder) in out
+    assert {path.name for path in folder.iterdir()} == {'figure.png', 'table.txt'}
+    assert (folder / 'figure.png').read_bytes().startswith(b'\x89PNG')
+    assert out.startswith((folder / 'table.txt').read_text('utf-8'))
+    assert everything_in(tmp_path) == sorted(map(str, (folder, *folder.iterdir())))
+
+
+def test_corridor(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    output = tmp_path / 'corridor'
+    assert code_of(experiment.main, 'corridor', '--seeds', 1, '-o', output) == 0
+    out = capsys.readouterr().out
+    rows = re.findall(r'^(forward|standard).* (\d\.\d{3}) +(\d)/6 +(\d\.\d\d) +\d+ +\d\.\d\d +\d+$', out, re.MULTILINE)
+    assert [row[0] for row in rows] == ['forward'] * 2 + ['standard'] * 3
+    assert re.search(r'half of the smooth wall: \d of 3\.', out)
+    assert {path.name for path in output.iterdir()} == {'figure.png', 'table.txt'}
+
+
+def test_parameters_count(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    tables = []
+    for name, options in (('a', ()), ('b', ('--set', 'p_hit=0.3', '--set', 'sigma=0.3'))):
+        assert code_of(experiment.main, 'door', '--seeds', 1, '-o', tmp_path / name, *options) == 0
+        lines = (tmp_path / name / 'table.txt').read_text('utf-8').splitlines()[-6:]
+        tables.append([re.findall(r'\d\.\d{3}', line) for line in lines])
+    forward, paper = ([[row[k] for row in table] for table in tables] for k in (0, 1))
+    assert forward[0] != forward[1]
+    assert paper[0] == paper[1]
+
+
+@pytest.mark.parametrize(
+    ('options', 'code', 'expected'),
+    [
+        (('door', '--seeds', 0), 1, '--seeds'),
+        (('door', '--set', 'phit=1'), 1, 'did you mean p_hit'),
+        (('window',), 2, 'door'),
+    ],
+)
+def test_wrong_options(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], options: tuple[object, ...], code: int, expected: str
+) -> None:
+    assert code_of(experiment.main, *options, '-o', tmp_path / 'out') == code
+    out, err = capsys.readouterr()
+    assert out == '' and 'experiment: error: ' in err and expected in err
+    assert everything_in(tmp_path) == []
+
+
+def test_demo(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert code_of(demo.main, '--seen', 1) == 0
+    folder = tmp_path / 'demo_output'
+    assert {path.name for path in (folder / 'maps').iterdir()} == FILES | {'scores.txt'}
+    report = report_in(folder / 'maps')
+    assert report['input']['bag'] == str(folder / 'bag'), 'not the temporary name'
+    assert (folder / 'bag').is_dir() and (folder / 'reference.yaml').is_file()
+    scores = (folder / 'maps' / 'scores.txt').read_text('utf-8')
+    out = capsys.readouterr().out
+    assert scores in out and str(folder / 'maps' / 'maps.png') in out
+    assert [line.split('  ')[0] for line in scores.splitlines()[1:]] == ['live map', 'ML map', 'uncertainty map']
+    assert code_of(demo.main, '--seen', 1) == 0
+    assert (tmp_path / 'demo_output_2' / 'maps' / 'maps.png').is_file()
+
+
+def test_demo_with_wrong_options(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for options in (('--seen', 0), ('--seed', -1), ('--params', tmp_path / 'absent.yaml')):
+        assert code_of(demo.main, '-o', tmp_path / 'out', *options) == 1
+        assert 'demo: error: ' in capsys.readouterr().err
+    assert everything_in(tmp_path) == []

@@ -1,0 +1,100 @@
+"""`simulate`: the recording, its true map and path, and wrong options."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from drive_samples import code_of, everything_in, in_turn, mapped, tape
+
+from forward_grid_mapper.bags import Bag
+from forward_grid_mapper.commands import simulate
+from forward_grid_mapper.files.map_files import read_map
+from forward_grid_mapper.simulation.drive import door_drive
+from forward_grid_mapper.simulation.sonar import NOISY, front_array
+from forward_grid_mapper.simulation.world import door_world
+
+SMALL = ('door', '--seen', 1, '--sonars', 'front')
+
+
+@pytest.mark.parametrize(('kind', 'name'), [('mcap', 'bag'), ('sqlite3', 'bag'), ('ros1', 'drive.bag')])
+def test_the_recording(tmp_path: Path, kind: str, name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = tmp_path / 'drive'
+    assert code_of(simulate.main, *SMALL, '-o', folder, '--format', kind) == 0
+    assert {path.name for path in folder.iterdir()} == {name, 'reference.yaml', 'reference.pgm', 'trajectory.csv'}
+    out, _ = capsys.readouterr()
+    assert f'{len(tape().ranges)} readings' in out and f'process_bag {folder / name}' in out
+    with Bag(folder / name) as bag:
+        assert list(bag.messages(bag.choose_topics())) == [message for _, message in in_turn(tape())]
+        transforms = bag.static_transforms()
+    for frame, pose in tape().mounts:
+        assert transforms.lookup('base_link', frame) == pytest.approx(pose)
+    grid, cells = read_map(folder / 'reference.yaml')
+    world = door_world()
+    assert grid == world.grid
+    np.testing.assert_array_equal(np.nan_to_num(cells, nan=-1.0), world.reference)
+    path_xy = np.loadtxt(folder / 'trajectory.csv', delimiter=',')
+    robot = door_drive(1, NOISY, 0, front_array()).robot
+    np.testing.assert_allclose(path_xy, robot[:, :2], atol=1e-4)
+
+
+def test_options_change_the_recording(tmp_path: Path) -> None:
+    recordings = {}
+    for options in ((), ('--seed', 1), ('--noise-free',), ('--seen', 2), ('--sonars', 'ring')):
+        folder = tmp_path / '-'.join(map(str, ('drive', *options)))
+        assert code_of(simulate.main, *SMALL, *options, '-q', '-o', folder) == 0
+        with Bag(folder / 'bag') as bag:
+            recordings[options] = list(bag.messages(bag.choose_topics()))
+    first = recordings.pop(())
+    assert all(other != first for other in recordings.values())
+    assert code_of(simulate.main, *SMALL, '-q', '-o', tmp_path / 'again') == 0
+    with Bag(tmp_path / 'again' / 'bag') as bag:
+        assert list(bag.messages(bag.choose_topics())) == first
+
+
+def test_the_corridor_can_be_mapped(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert code_of(simulate.main, 'corridor', '--sonars', 'front', '-q', '-o', tmp_path / 'drive') == 0
+    assert capsys.readouterr() == ('', '')
+    report = mapped(tmp_path / 'drive' / 'bag', tmp_path / 'maps')
+    assert report['counts']['accepted'] == 4000
+    assert report['input']['path_m'] == pytest.approx(59.2, abs=0.5)
+
+
+@pytest.mark.parametrize(
+    ('options', 'code', 'expected'),
+    [
+        (('door', '--seen', 0), 1, '--seen'),
+        (('corridor', '--passes', -1), 1, '--passes'),
+        (('door', '--seed', -1), 1, '--seed'),
+        (('office',), 2, 'door'),
+        (('door', '--format', 'zip'), 2, 'mcap'),
+    ],
+)
+def test_wrong_options(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], options: tuple[object, ...], code: int, expected: str
+) -> None:
+    assert code_of(simulate.main, *options, '-o', tmp_path / 'drive') == code
+    out, err = capsys.readouterr()
+    assert out == '' and 'simulate: error: ' in err and expected in err and 'Traceback' not in err
+    assert everything_in(tmp_path) == []
+
+
+def test_an_output_folder_must_be_given(capsys: pytest.CaptureFixture[str]) -> None:
+    assert code_of(simulate.main, 'door') == 2
+    assert '--output' in capsys.readouterr().err
+
+
+def test_nothing_is_overwritten(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / 'mine.txt').write_text('mine')
+    for path in (tmp_path, tmp_path / 'mine.txt', tmp_path / 'mine.txt' / 'drive'):
+        assert code_of(simulate.main, *SMALL, '-q', '-o', path) == 1
+        err = capsys.readouterr().err
+        assert err.startswith(f'simulate: error: {path}') and '-o' in err
+    assert everything_in(tmp_path) == [str(tmp_path / 'mine.txt')]
+
+
+def test_a_sqlite3_bag_that_cannot_be_there(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert code_of(simulate.main, *SMALL, '--format', 'sqlite3', '-o', tmp_path / 'what?') == 1
+    assert 'cannot have ?, # or %' in capsys.readouterr().err
+    assert everything_in(tmp_path) == []
