@@ -18,6 +18,7 @@ import platform
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
 os.environ['ROS_DOMAIN_ID'] = str(os.getpid() % 100)
@@ -34,7 +35,8 @@ SONARS = 24
 
 
 def cpu_seconds(pid: int) -> float:
-    fields = open(f'/proc/{pid}/stat').read().rpartition(')')[2].split()
+    """Return the seconds of CPU that a process has used."""
+    fields = Path(f'/proc/{pid}/stat').read_text().rpartition(')')[2].split()
     return (int(fields[11]) + int(fields[12])) / os.sysconf('SC_CLK_TCK')
 
 
@@ -70,9 +72,11 @@ class Load:
                     self.counts[key] = int(values[f'readings {key}'])
 
     def stamp(self, header: object) -> None:
+        """Stamp a message with now."""
         header.stamp.sec, header.stamp.nanosec = divmod(time.time_ns(), 1_000_000_000)
 
     def run(self, rate: float, seconds: float, em: bool) -> None:
+        """Publish `rate` readings a second for so many seconds."""
         begin = time.monotonic()
         fired = moved = 0
         running = None
@@ -112,6 +116,7 @@ class Load:
 
 
 def main() -> None:
+    """Run the benchmark."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument('--rates', type=float, nargs='+', default=[480, 1000, 2000, 3000, 4000])
     parser.add_argument('--seconds', type=float, default=10.0, help='at each rate (default 10)')

@@ -1,4 +1,4 @@
-"""`demo`: simulate a drive, map it from its bag, and score the three maps against the truth."""
+"""`demo`: simulate a drive into a bag, replay it to the node, run EM, and score the three maps against the truth."""
 
 from __future__ import annotations
 
@@ -7,14 +7,16 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from ..core.errors import MapperError, ParameterError
 from ..core.mapping import Mapper
-from ..core.maps import MapSet
 from ..core.parameters import Parameters
-from ..files.output_folder import free_name, output_folder
+from ..files.figure import Tile, write_figure
+from ..files.map_archive import MapArchive, read_npz
+from ..files.output_folder import free_name, output_errors, output_folder
 from ..files.results import write_results
 from ..simulation.drive import Recording
 from ..simulation.score import Scores, score_map, threshold, visible_surface
-from .console import Ticker, readable, run
+from .console import Ticker, run
 from .offline import read_drive
 from .options import add_mapping_options, chosen_parameters
 from .simulate import SONARS, record, write_recording
@@ -28,17 +30,20 @@ def parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
     made = argparse.ArgumentParser(
         COMMAND,
-        description="Simulate the paper's drive past an open door into a bag, map the bag, and score the maps.",
+        description="The main job for real: simulates the paper's drive past an open door into a bag, starts the node, "
+        'replays the bag to it over DDS, runs EM, saves the maps, and scores them against the truth.',
     )
     made.add_argument('-o', '--output', metavar='DIR', help='new folder (default: demo_output)')
     made.add_argument('--world', choices=('door', 'corridor'), default='door', help='default: door')
     made.add_argument('--seen', type=int, default=3, metavar='N', help='sweeps in front of the door (default 3)')
+    made.add_argument('--rate', type=float, default=10.0, metavar='R', help='speed of the replay (default 10)')
+    made.add_argument('--offline', action='store_true', help='map the bag with process_bag instead, without ROS')
     made.add_argument('--seed', type=int, default=0, help='of the noise (default 0)')
     add_mapping_options(made)
     return made
 
 
-def score_all(maps: MapSet, recording: Recording) -> dict[str, Scores]:
+def score_all(maps: MapArchive, recording: Recording) -> dict[str, Scores]:
     """Score the three maps against the world of the recording."""
     visible = visible_surface(recording.world, recording.readings, SURFACE_DEPTH)
     decided = {'live map': threshold(maps.live), 'ML map': maps.ml, 'uncertainty map': threshold(maps.uncertainty)}
@@ -54,35 +59,74 @@ def score_table(scores: dict[str, Scores]) -> str:
     return '\n'.join(lines)
 
 
+def through_node(folder: Path, bag: Path, recording: Recording, options: argparse.Namespace, ticker: Ticker) -> str:
+    """Replay a bag to the node and save its maps as `folder`/maps; return what EM said."""
+    from .live_node import LiveNode
+
+    ros = {'range_reliability': 'reliable', 'odom_reliability': 'reliable', 'save_directory': str(folder)}
+    parameters = Parameters.from_flat(ros, base=chosen_parameters(options)[0])
+    with LiveNode(folder, parameters, recording.mounts) as node:
+        ticker.say('starting the node')
+        node.call('reset')
+        ticker.say(f'replaying the bag to the node, {options.rate:g} times as fast as it was recorded')
+        node.run('replay_bag', str(bag), '--rate', str(options.rate), '--quiet')
+        ticker.say('running EM')
+        told = node.call('run_em')
+        ticker.say('saving the maps')
+        saved = Path(node.call('save_maps').split(', ')[0]).parent
+    saved.rename(folder / 'maps')
+    return told
+
+
+def offline(folder: Path, bag: Path, options: argparse.Namespace, ticker: Ticker) -> str:
+    """Map a bag without ROS into `folder`/maps; return what EM did."""
+    parameters = chosen_parameters(options)[0]
+    drive = read_drive(bag, parameters, {}, progress=ticker.reading)
+    maps = Mapper(parameters).run(drive.placer.readings, ticker.mapping)
+    write_results(folder / 'maps', maps, drive.source, drive.path_xy, 'The demo, offline')
+    return f'{len(maps.readings)} readings, {sum(maps.statistics["seconds"].values()):.2f} seconds'
+
+
+def ros_is_here() -> bool:
+    """Whether the node can run."""
+    try:
+        import rclpy  # noqa: F401
+    except ImportError:
+        return False
+    return True
+
+
 def demo(options: argparse.Namespace) -> int:
     """Do what the command line asks for."""
-    parameters: Parameters = chosen_parameters(options)[0]
     output = Path(options.output) if options.output else free_name(Path.cwd(), 'demo_output')
-    with Ticker() as ticker:
+    if not options.offline and not ros_is_here():
+        raise MapperError('ROS 2 is not there: source its setup.bash, pip install .[ros], or use --offline')
+    if not 0.1 <= options.rate <= 100:
+        raise ParameterError('--rate must lie between 0.1 and 100')
+    with Ticker() as ticker, output_folder(output) as folder:
         ticker.say('simulating')
         recording = record(options.world, options.seen, 1, False, options.seed, SONARS['ring']())
-        with output_folder(output) as folder:
-            bag = write_recording(folder, recording)
-            drive = read_drive(bag, parameters, {}, progress=ticker.reading)
-            drive.source['bag'] = readable(output / bag.name)
-            maps = Mapper(parameters).run(drive.placer.readings, ticker.mapping)
-            ticker.say('writing')
-            world = recording.world
-            title = f'The {world.name} world, simulated'
-            table = score_table(score_all(maps, recording))
-            write_results(
-                folder / 'maps',
-                maps,
-                drive.source,
-                drive.path_xy,
-                title,
-                (world.grid, world.reference),
-                {'scores.txt': table + '\n'},
-            )
-    seconds = sum(maps.statistics['seconds'].values())
-    print(f'{len(maps.readings):,} readings became three maps in {seconds:.2f} s:\n')
-    print(table)
-    print(f'\nthe picture is {output / "maps" / "maps.png"}, the report {output / "maps" / "report.txt"}')
+        bag = write_recording(folder, recording)
+        if options.offline:
+            told = offline(folder, bag, options, ticker)
+        else:
+            told = through_node(folder, bag, recording, options, ticker)
+        ticker.say('scoring')
+        maps = read_npz(folder / 'maps' / 'maps.npz')
+        table = score_table(score_all(maps, recording))
+        left, right, bottom, top = recording.world.grid.extent
+        tiles = [
+            Tile('truth', recording.world.grid, recording.world.reference),
+            Tile('standard log-odds map', maps.grid, maps.live),
+            Tile('maximum likelihood map', maps.grid, maps.ml),
+            Tile('uncertainty map', maps.grid, maps.uncertainty),
+        ]
+        rows = [tiles] if options.world == 'door' else [[tile] for tile in tiles]
+        write_figure(folder / 'demo.png', f'The {options.world} world, simulated', rows, (left, right, bottom, top))
+        with output_errors(folder):
+            (folder / 'scores.txt').write_text(table + '\n', encoding='utf-8')
+    print(f'EM {"offline" if options.offline else "in the node"}: {told}\n\n{table}\n')
+    print(f'the picture is {output / "demo.png"}; the maps as for Nav2 and their report are in {output / "maps"}')
     return 0
 
 

@@ -46,7 +46,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     from ..core.warm_up import warm_up
     from .mapper_node import MapperNode
 
-    rclpy.init(args=['mapper', *arguments], signal_handler_options=SignalHandlerOptions.NO)
+    try:
+        rclpy.init(args=['mapper', *arguments], signal_handler_options=SignalHandlerOptions.NO)
+    except Exception as error:  # rclpy raises classes of its C extension, for a parameter file with a fault for one
+        print(f'mapper: error: {error}', file=sys.stderr)
+        return 1
     node = None
     try:
         node = MapperNode()

@@ -1,0 +1,183 @@
+"""`replay_bag` over DDS, heard from another process."""
+
+from __future__ import annotations
+
+import random
+import signal
+import time
+from collections.abc import Iterator
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import pytest
+from replay_samples import CLOCK, ODOMETRY, RANGE, SENSORS, START, Wire, messages_in, wire, write_bag
+
+from forward_grid_mapper.core.messages import NANOSECONDS, stamp_of
+
+DOMAIN = random.randint(1, 100)
+
+
+@pytest.fixture
+def dds() -> Iterator[Wire]:
+    with wire(DOMAIN) as made:
+        yield made
+
+
+def stamps_of(messages: list[Any]) -> list[int]:
+    return [stamp_of(message.header) for message in messages]
+
+
+@pytest.mark.parametrize('kind', ['mcap', 'sqlite3', 'ros1'])
+def test_every_message_arrives_in_order_as_it_was(dds: Wire, tmp_path: Path, kind: str) -> None:
+    bag = write_bag(tmp_path, kind)
+    listener = dds.listen()
+    code, out, err = listener.hear(dds.replay(bag, '--rate', 10))
+    assert code == 0, err
+    assert '40 Range and 40 Odometry' in out
+    assert listener.plain == messages_in(bag)
+    for topic in SENSORS:
+        stamps = [
+            message.header.stamp.sec * NANOSECONDS + message.header.stamp.nanosec for message in listener.on(topic)
+        ]
+        assert stamps == sorted(stamps)
+    assert all(message.radiation_type == 0 for message in listener.on('/sonar'))
+
+
+def test_a_best_effort_listener_hears_everything(dds: Wire, tmp_path: Path) -> None:
+    bag = write_bag(tmp_path, topic=lambda frame: f'/{frame}')
+    topics = {'/sonar_0': RANGE, '/sonar_1': RANGE, '/odom': ODOMETRY}
+    listener = dds.listen(topics, reliable=False)
+    code, _, err = listener.hear(dds.replay(bag, '--rate', 10, '--best-effort'))
+    assert code == 0, err
+    assert listener.plain == messages_in(bag)
+    assert {message.header.frame_id for message in listener.on('/sonar_1')} == {'sonar_1'}
+
+
+def test_it_keeps_the_pace_of_the_stamps(dds: Wire, tmp_path: Path) -> None:
+    bag = write_bag(tmp_path, count=5, period=1.0)
+    arrived = []
+    listener = dds.listen(reliable=False)
+    replay = dds.replay(bag, '--rate', 4)
+    while replay.running:
+        count = len(listener.on('/odom'))
+        listener.spin(until=lambda count=count: len(listener.on('/odom')) > count or not replay.running)
+        arrived.append(time.monotonic())
+    gaps = [b - a for a, b in pairwise(arrived[:5])]
+    assert all(0.15 < gap < 0.6 for gap in gaps), gaps
+    assert replay.end()[0] == 0
+
+
+def test_the_clock_follows_the_bag_and_ticks_between_messages(dds: Wire, tmp_path: Path) -> None:
+    bag = write_bag(tmp_path, count=5, period=1.0)
+    listener = dds.listen({**SENSORS, '/clock': CLOCK})
+    code, _, err = listener.hear(dds.replay(bag, '--rate', 4, '--clock', 20))
+    assert code == 0, err
+    times = [NANOSECONDS * message.clock.sec + message.clock.nanosec for message in listener.on('/clock')]
+    assert times == sorted(times)
+    last = START + 4 * NANOSECONDS + 1000
+    assert times[0] == START
+    assert times[-1] == last
+    # a second between messages is five ticks
+    assert 20 < len(times) < 45
+    assert max(b - a for a, b in pairwise(times)) < 0.9 * NANOSECONDS
+
+
+def test_it_plays_as_often_as_asked(dds: Wire, tmp_path: Path) -> None:
+    bag = write_bag(tmp_path, count=10)
+    listener = dds.listen({**SENSORS, '/clock': CLOCK})
+    code, out, err = listener.hear(dds.replay(bag, '--rate', 10, '--loop', 2, '--clock'))
+    assert code == 0, err
+    assert '20 Range and 20 Odometry' in out
+    assert stamps_of(listener.on('/odom')) == 2 * [START + i * NANOSECONDS // 10 for i in range(10)]
+    times = [NANOSECONDS * message.clock.sec + message.clock.nanosec for message in listener.on('/clock')]
+    assert sum(b < a for a, b in pairwise(times)) == 1
+
+
+def test_it_waits_for_all_its_listeners(dds: Wire, tmp_path: Path) -> None:
+    bag = write_bag(tmp_path)
+    early = dds.listen({'/sonar': RANGE}, reliable=False)
+    replay = dds.replay(bag, '--rate', 20)
+    until = time.monotonic() + 2.5
+    early.spin(until=lambda: time.monotonic() > until)
+    assert not early.got
+    late = dds.listen({'/odom': ODOMETRY}, reliable=False)
+    late.spin(until=lambda: len(late.got) == 40)
+    early.spin(until=lambda: len(early.got) == 40)
+    assert replay.end()[0] == 0
+
+
+def test_without_listeners_it_names_the_topics(dds: Wire, tmp_path: Path) -> None:
+    code, out, err = dds.replay(write_bag(tmp_path), '--wait', 0.2).end()
+    assert (code, out) == (1, '')
+    assert 'Traceback' not in err
+    assert '/sonar: nobody listens to sensor_msgs/msg/Range' in err
+    assert '/odom: nobody listens to nav_msgs/msg/Odometry' in err
+    assert '--remap' in err
+
+
+def test_with_listeners_that_do_not_fit_it_says_why(dds: Wire, tmp_path: Path) -> None:
+    listener = dds.listen({'/robot/odom': ODOMETRY, '/sonar': RANGE})
+    replay = dds.replay(write_bag(tmp_path), '--wait', 8, '--best-effort')
+    code, _, err = listener.hear(replay)
+    assert code == 1
+    assert '/odom: nav_msgs/msg/Odometry is listened to on /robot/odom' in err
+    assert '/sonar: listener wants it reliable' in err
+
+
+def test_topics_can_be_renamed(dds: Wire, tmp_path: Path) -> None:
+    bag = write_bag(tmp_path)
+    listener = dds.listen({'/robot/odom': ODOMETRY, '/robot/sonar': RANGE}, reliable=False)
+    options = ('--rate', 20, '--remap', 'odom:=/robot/odom', '--ros-args', '-r', '/sonar:=/robot/sonar')
+    code, _, err = listener.hear(dds.replay(bag, *options))
+    assert code == 0, err
+    assert listener.plain == messages_in(bag)
+
+
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_that_comes_twice_ends_it_in_order(dds: Wire, tmp_path: Path, number: signal.Signals) -> None:
+    listener = dds.listen()
+    replay = dds.replay(write_bag(tmp_path), '--loop')
+    listener.spin(until=lambda: len(listener.got) > 4)
+    replay.signal(number)
+    time.sleep(0.02)
+    replay.signal(number)
+    code, out, err = replay.end(10)
+    assert code == 0, err
+    assert out.startswith('stopped after')
+    assert 'Traceback' not in err
+
+
+def test_it_can_be_stopped_while_it_waits(dds: Wire, tmp_path: Path) -> None:
+    replay = dds.replay(write_bag(tmp_path))
+    time.sleep(1.5)
+    replay.signal(signal.SIGINT)
+    code, out, err = replay.end(10)
+    assert code == 0, err
+    assert 'stopped after 0 Range' in out
+
+
+def test_without_tf2_it_says_what_the_mapper_lacks(dds: Wire, tmp_path: Path) -> None:
+    try:
+        import tf2_msgs.msg  # noqa: F401
+    except ImportError:
+        pass
+    else:
+        pytest.skip('tf2_msgs is installed')
+    code, _, err = dds.replay(write_bag(tmp_path), '--wait', 0, '--rate', 100).end()
+    assert code == 0
+    assert 'static transforms are not replayed' in err
+    assert 'sensors.FRAME.pose' in err
+
+
+def test_static_transforms_reach_whoever_comes_later(dds: Wire, tmp_path: Path) -> None:
+    pytest.importorskip('tf2_msgs.msg', reason='tf2_msgs is not installed')
+    replay = dds.replay(write_bag(tmp_path))
+    time.sleep(1.0)
+    listener = dds.listen({'/tf_static': 'tf2_msgs/msg/TFMessage', **SENSORS}, latched=False)
+    late = dds.listen({'/tf_static': 'tf2_msgs/msg/TFMessage'}, latched=True)
+    listener.spin(until=lambda: bool(listener.on('/sonar')))
+    late.spin(until=lambda: bool(late.got))
+    assert {item.child_frame_id for item in late.got[0][1].transforms} == {'sonar_0', 'sonar_1'}
+    replay.signal(signal.SIGINT)
+    assert replay.end()[0] == 0

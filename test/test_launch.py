@@ -1,0 +1,149 @@
+"""The launch file, with stand-ins for `launch` and `launch_ros` where they are not installed."""
+
+from __future__ import annotations
+
+import runpy
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import pytest
+import yaml
+
+from forward_grid_mapper.files.parameter_file import load_parameters
+
+ROOT = Path(__file__).resolve().parents[1]
+FILE = ROOT / 'launch' / 'mapper.launch.py'
+MODULES = {
+    'launch': ['LaunchDescription'],
+    'launch.actions': ['DeclareLaunchArgument'],
+    'launch.conditions': ['IfCondition'],
+    'launch.substitutions': ['LaunchConfiguration', 'PathJoinSubstitution'],
+    'launch_ros': [],
+    'launch_ros.actions': ['Node'],
+    'launch_ros.parameter_descriptions': ['ParameterValue'],
+    'launch_ros.substitutions': ['FindPackageShare'],
+}
+
+
+class Call:
+    """What a class of launch was called with."""
+
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        self.arguments = arguments
+        self.options = options
+
+    @property
+    def kind(self) -> str:
+        return type(self).__name__
+
+    def resolve(self, values: dict[str, str]) -> Any:
+        """The value of a substitution when the launch arguments have these values."""
+        if self.kind == 'LaunchConfiguration':
+            return values[self.arguments[0]]
+        if self.kind == 'PathJoinSubstitution':
+            return '/'.join(str(resolved(part, values)) for part in self.arguments[0])
+        if self.kind == 'FindPackageShare':
+            return f'share/{self.arguments[0]}'
+        if self.kind == 'ParameterValue':
+            text = resolved(self.arguments[0], values)
+            assert self.options['value_type'] is bool
+            return yaml.safe_load(text)
+        if self.kind == 'IfCondition':
+            return resolved(self.arguments[0], values) == 'true'
+        raise AssertionError(f'{self.kind} is no substitution')
+
+
+def resolved(value: Any, values: dict[str, str]) -> Any:
+    """`value` with all substitutions carried out."""
+    if isinstance(value, Call):
+        return value.resolve(values)
+    if isinstance(value, dict):
+        return {key: resolved(item, values) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return type(value)(resolved(item, values) for item in value)
+    return value
+
+
+@pytest.fixture
+def description() -> Iterator[list[Call]]:
+    """What the launch file describes."""
+    with pytest.MonkeyPatch.context() as patch:
+        for name, kinds in MODULES.items():
+            module = ModuleType(name)
+            for kind in kinds:
+                setattr(module, kind, type(kind, (Call,), {}))
+            patch.setitem(sys.modules, name, module)
+        yield runpy.run_path(str(FILE))['generate_launch_description']().arguments[0]
+
+
+def launched(description: list[Call], **given: str) -> dict[str, dict[str, Any]]:
+    """Options of the nodes that would start, by executable."""
+    values: dict[str, str] = {}
+    for call in description:
+        if call.kind == 'DeclareLaunchArgument':
+            name = call.arguments[0]
+            values[name] = given.pop(name, None) or resolved(call.options['default_value'], values)
+            assert values[name] in call.options.get('choices', [values[name]])
+    assert not given, 'these arguments are not declared'
+    nodes = [resolved(call.options, values) for call in description if call.kind == 'Node']
+    return {node['executable']: node for node in nodes if node.get('condition', True)}
+
+
+def test_by_default_it_starts_the_node_alone(description: list[Call]) -> None:
+    nodes = launched(description)
+    assert set(nodes) == {'mapper'}
+    node = nodes['mapper']
+    assert (node['package'], node['name'], node['namespace']) == ('forward_grid_mapper', 'forward_grid_mapper', '')
+    file, overrides = node['parameters']
+    assert overrides == {'use_sim_time': False}
+    assert load_parameters(ROOT / file.removeprefix('share/forward_grid_mapper/')).values
+    assert node['arguments'] == ['--ros-args', '--log-level', 'info']
+
+
+def test_every_argument_tells_what_it_is_for(description: list[Call]) -> None:
+    arguments = [call for call in description if call.kind == 'DeclareLaunchArgument']
+    assert {'namespace', 'params_file', 'use_sim_time', 'rviz', 'log_level'} <= {
+        call.arguments[0] for call in arguments
+    }
+    assert all(call.options['description'] for call in arguments)
+
+
+def test_arguments_reach_the_node(description: list[Call]) -> None:
+    given = {
+        'params_file': '/my.yaml',
+        'use_sim_time': 'true',
+        'sonar': '/range',
+        'odom': 'wheels',
+        'log_level': 'debug',
+    }
+    node = launched(description, **given)['mapper']
+    assert node['parameters'] == ['/my.yaml', {'use_sim_time': True}]
+    assert dict(node['remappings'])['sonar'] == '/range'
+    assert dict(node['remappings'])['odom'] == 'wheels'
+    assert node['arguments'][-1] == 'debug'
+
+
+def test_a_namespace_moves_what_rviz_listens_to_with_the_node(description: list[Call]) -> None:
+    nodes = launched(description, rviz='true', namespace='robot', odom='wheels')
+    node, rviz = nodes['mapper'], nodes['rviz2']
+    assert node['namespace'] == rviz['namespace'] == 'robot'
+    for moved in (node, rviz):
+        assert {('/tf', 'tf'), ('/tf_static', 'tf_static')} <= set(moved['remappings'])
+    folder, config = rviz['arguments']
+    assert folder == '-d'
+    renamed = dict(rviz['remappings'])
+    displays = yaml.safe_load((ROOT / config.removeprefix('share/forward_grid_mapper/')).read_text())
+    for display in displays['Visualization Manager']['Displays']:
+        if topic := display.get('Topic', {}).get('Value'):
+            assert not renamed[topic].startswith('/'), f'{topic} would not follow the namespace'
+    assert renamed['/odom'] == 'wheels'
+
+
+def test_launch_itself_takes_the_file() -> None:
+    pytest.importorskip('launch_ros', reason='launch_ros is not installed (a sourced ROS 2)')
+    made = runpy.run_path(str(FILE))['generate_launch_description']()
+    names = {argument.name for argument in made.get_launch_arguments()}
+    assert {'namespace', 'params_file', 'rviz'} <= names

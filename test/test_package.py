@@ -1,0 +1,199 @@
+"""What installs the package, and the files that come with it: they agree with each other and with the code."""
+
+from __future__ import annotations
+
+import importlib
+import re
+import runpy
+import subprocess
+import xml.etree.ElementTree as ElementTree
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import setuptools
+import yaml
+
+import forward_grid_mapper
+from forward_grid_mapper.core.parameters import Parameters
+from forward_grid_mapper.files.parameter_file import load_parameters
+from forward_grid_mapper.files.parameter_text import dump_parameters, parameters_markdown
+from forward_grid_mapper.simulation.sonar import SonarArray, front_array, sonar_ring
+
+ROOT = Path(__file__).resolve().parents[1]
+NAME = 'forward_grid_mapper'
+DEPENDENCIES = {
+    'exec_depend': {
+        *('ament_index_python', 'diagnostic_msgs', 'geometry_msgs', 'launch', 'launch_ros', 'nav_msgs', 'rclpy'),
+        *('rosgraph_msgs', 'sensor_msgs', 'std_srvs', 'tf2_msgs', 'tf2_ros'),
+        *('python3-matplotlib', 'python3-numba', 'python3-numpy', 'python3-rosbags-pip', 'python3-yaml'),
+    },
+    'test_depend': {'python3-hypothesis', 'python3-pil', 'python3-pytest', 'python3-scipy'},
+}
+"""Names of ROS packages, and keys of rosdep for the rest."""
+
+IMPORTS = {'python3-yaml': 'PyYAML', 'python3-rosbags-pip': 'rosbags', 'python3-pil': 'pillow'}
+"""The names of those keys on the Python side, where they differ by more than the prefix."""
+
+MAPS = [f'/{NAME}/{name}' for name in ('live_map', 'ml_map', 'uncertainty_map')]
+
+
+@pytest.fixture(scope='module')
+def manifest() -> ElementTree.Element:
+    return ElementTree.parse(ROOT / 'package.xml').getroot()
+
+
+@pytest.fixture(scope='module')
+def setup() -> dict[str, Any]:
+    """What setup.py hands to setuptools."""
+    given: dict[str, Any] = {}
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(ROOT)
+        patch.setattr(setuptools, 'setup', lambda **options: given.update(options))
+        runpy.run_path('setup.py')
+    return given
+
+
+def text_of(manifest: ElementTree.Element, tag: str) -> str:
+    return (manifest.findtext(tag) or '').strip()
+
+
+def test_the_manifest_is_valid() -> None:
+    package = pytest.importorskip('catkin_pkg.package', reason='catkin_pkg is not installed')
+    assert package.parse_package(str(ROOT / 'package.xml'), warnings=[]).validate() is None
+
+
+def test_the_manifest_names_what_colcon_and_rosdep_need(manifest: ElementTree.Element) -> None:
+    assert (manifest.tag, manifest.get('format')) == ('package', '3')
+    assert manifest.findtext('export/build_type') == 'ament_python'
+    assert text_of(manifest, 'license') == 'Apache-2.0'
+    assert (ROOT / 'LICENSE').read_text().lstrip().startswith('Apache License')
+    for tag, names in DEPENDENCIES.items():
+        found = [element.text for element in manifest.findall(tag)]
+        assert sorted(found) == sorted(names)
+
+
+def test_the_manifest_names_a_maintainer(manifest: ElementTree.Element, setup: dict[str, Any]) -> None:
+    maintainer = manifest.find('maintainer')
+    assert maintainer is not None
+    assert re.fullmatch(r'[\w.+-]+@[\w-]+(\.[\w-]+)+', maintainer.get('email', ''))
+    assert (maintainer.text, maintainer.get('email')) == (setup['maintainer'], setup['maintainer_email'])
+
+
+def test_name_version_and_licence_are_the_same_everywhere(manifest: ElementTree.Element, setup: dict[str, Any]) -> None:
+    assert text_of(manifest, 'name') == setup['name'] == NAME
+    assert text_of(manifest, 'version') == setup['version'] == forward_grid_mapper.__version__
+    assert text_of(manifest, 'license') == setup['license']
+
+
+def test_pip_installs_what_rosdep_installs(setup: dict[str, Any]) -> None:
+    extras = setup['extras_require']
+    required = [*setup['install_requires'], *extras['offline'], *extras['test']]
+    by_pip = {re.split(r'[<>=\[ ]', line)[0] for line in required}
+    keys = {key for names in DEPENDENCIES.values() for key in names if key.startswith('python3-')}
+    assert {IMPORTS.get(key, key.removeprefix('python3-')) for key in keys} == by_pip
+    for line in extras['ros']:
+        assert line.startswith('ros-jazzy-')
+
+
+def test_every_command_can_be_started(setup: dict[str, Any]) -> None:
+    from forward_grid_mapper.__main__ import COMMANDS
+
+    scripts = dict(line.split(' = ') for line in setup['entry_points']['console_scripts'])
+    assert scripts == {name: f'{NAME}.{module}:main' for name, (module, _) in COMMANDS.items()}
+    for target in scripts.values():
+        module, function = target.split(':')
+        assert callable(getattr(importlib.import_module(module), function))
+
+
+@pytest.mark.parametrize('folder', ['config', 'launch', 'rviz'])
+def test_every_file_of_a_folder_is_installed(setup: dict[str, Any], folder: str) -> None:
+    installed = dict(setup['data_files'])
+    present = sorted(str(path.relative_to(ROOT)) for path in (ROOT / folder).rglob('*') if path.suffix != '.pyc')
+    present = [name for name in present if (ROOT / name).is_file()]
+    assert present
+    assert installed[f'share/{NAME}/{folder}'] == present
+
+
+def test_the_package_is_in_the_ament_index(setup: dict[str, Any]) -> None:
+    installed = dict(setup['data_files'])
+    assert installed['share/ament_index/resource_index/packages'] == [f'resource/{NAME}']
+    assert installed[f'share/{NAME}'] == ['package.xml']
+    assert (ROOT / 'resource' / NAME).is_file()
+    assert f'$base/lib/{NAME}' in (ROOT / 'setup.cfg').read_text()
+
+
+def test_every_package_with_code_is_installed(setup: dict[str, Any]) -> None:
+    folders = {path.parent.relative_to(ROOT) for path in (ROOT / NAME).rglob('*.py')}
+    assert sorted(setup['packages']) == sorted('.'.join(folder.parts) for folder in folders)
+
+
+def test_the_lists_of_parameters_are_up_to_date() -> None:
+    advice = 'run scripts/update_docs'
+    assert (ROOT / 'config/mapper.yaml').read_text('utf-8') == dump_parameters(Parameters()), advice
+    assert (ROOT / 'docs/parameters.md').read_text('utf-8') == parameters_markdown(), advice
+
+
+@pytest.mark.parametrize(('name', 'sonars'), [('ring_24', sonar_ring()), ('front_8', front_array())])
+def test_examples_hold_the_poses_of_the_simulated_sonars(name: str, sonars: SonarArray) -> None:
+    values, mounts, node = load_parameters(ROOT / 'config' / f'{name}.yaml')
+    assert Parameters.from_flat(values).node.range_topics == ('sonar',)
+    assert not node
+    assert list(mounts) == list(sonars.names)
+    np.testing.assert_allclose(list(mounts.values()), [pose for _, pose in sonars.mounts], atol=1e-4)
+
+
+@pytest.mark.parametrize('name', ['mapper', 'ring_24', 'front_8'])
+def test_ros_loads_the_parameter_files(name: str) -> None:
+    rclpy = pytest.importorskip('rclpy', reason='rclpy is not installed (the extra ros, or a sourced ROS 2)')
+    path = ROOT / 'config' / f'{name}.yaml'
+    values, mounts, _ = load_parameters(path)
+    context = rclpy.Context()
+    rclpy.init(args=['--ros-args', '--params-file', str(path)], context=context)
+    try:
+        node = rclpy.create_node(NAME, context=context, automatically_declare_parameters_from_overrides=True)
+        for row, value in values.items():
+            loaded = node.get_parameter(row).value
+            assert type(loaded) is type(value) or isinstance(value, tuple)
+            assert loaded == (list(value) if isinstance(value, tuple) else value)
+        for frame, pose in mounts.items():
+            assert list(node.get_parameter(f'sensors.{frame}.pose').value) == list(pose)
+        node.destroy_node()
+    finally:
+        context.try_shutdown()
+
+
+def test_rviz_shows_the_three_maps() -> None:
+    document = yaml.safe_load((ROOT / 'rviz' / f'{NAME}.rviz').read_text())
+    manager = document['Visualization Manager']
+    assert manager['Global Options']['Fixed Frame'] == 'odom'
+    displays = {display['Name']: display for display in manager['Displays']}
+    maps = [display for display in displays.values() if display['Class'] == 'rviz_default_plugins/Map']
+    assert [display['Topic']['Value'] for display in maps] == MAPS
+    for display in maps:
+        assert display['Topic']['Durability Policy'] == 'Transient Local'
+        assert display['Topic']['Reliability Policy'] == 'Reliable'
+    assert {display['Name']: display['Alpha'] for display in maps if display['Enabled'] and display['Alpha'] == 1} == {
+        'ML map': 1
+    }
+    assert displays['Odometry path']['Topic']['Value'] == '/odom'
+    assert displays['TF']['Enabled']
+
+
+def tracked_files() -> list[Path]:
+    try:
+        listed = subprocess.run(['git', 'ls-files', '-z'], cwd=ROOT, capture_output=True, check=True).stdout
+    except (OSError, subprocess.CalledProcessError):
+        pytest.skip('this is not a git checkout')
+    return [path for name in listed.decode().split('\0') if name and (path := ROOT / name).is_file()]
+
+
+def test_no_file_names_the_host_of_a_registry() -> None:
+    # in parts, since this file is one of those that are searched
+    parts = [('pypi', 'org'), ('pythonhosted', 'org'), ('npmjs', 'org'), ('npmjs', 'com'), ('deb', 'debian', 'org')]
+    parts += [('packages', 'ros', 'org'), ('archive', 'ubuntu', 'com'), ('proxy', 'golang', 'org'), ('crates', 'io')]
+    hosts = re.compile('|'.join(re.escape('.'.join(names)) for names in parts), re.IGNORECASE)
+    for path in tracked_files():
+        found = hosts.search(path.read_text('utf-8', errors='replace'))
+        assert not found, f'{path.relative_to(ROOT)} names {found[0]}'
