@@ -177,7 +177,11 @@ def corridor(options: argparse.Namespace, parameters: Parameters, ticker: Ticker
         gap = max(s.longest_gap for s in o.scores)
         lines.append(f'{name:26s}{o.f1:7.3f}{doors(o):10d}/6{wall(o):13.2f}{dots:12.0f}{cover:10.2f}{gap:5d}')
     lines.append('')
-    lines.append(f'Gains of the standard map with 6/6 doors and half of the smooth wall: {len(both)} of {len(tried)}.')
+    good = [o for o in both if o.f1 >= 0.8]
+    lines.append(
+        f'Of {len(tried)} gains of the standard map, {len(both)} show 6/6 doors and half of the smooth wall; '
+        f'with an F1 of at least 0.80: {len(good)}.'
+    )
     world = cases[0].recording.world
     tiles = [o.tile._replace(title=f'{name}, F1 {o.f1:.2f}, {doors(o)}/6 doors') for name, o in named.items()]
     return '\n'.join(lines), [[Tile('truth', world.grid, world.reference)], *([tile] for tile in tiles)]

@@ -1,0 +1,61 @@
+"""Where compiled kernels are kept, down to installs and homes that cannot be written."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import pytest
+
+PACKAGE = Path(__file__).resolve().parents[2] / 'forward_grid_mapper'
+PROGRAM = """
+import sys, time
+from forward_grid_mapper.core import jit, warm_up
+begin = time.perf_counter()
+maps = warm_up.warm_up()
+print(time.perf_counter() - begin, jit.CACHE, warm_up.__file__)
+"""
+
+
+def run(install: Path, temporary: Path) -> tuple[float, Path]:
+    """Map with a copy of the package; return the seconds and the folder of kernels."""
+    changes = {'PYTHONPATH': str(install), 'HOME': '/dev/null', 'TMPDIR': str(temporary), 'XDG_CACHE_HOME': ''}
+    environment = {k: v for k, v in os.environ.items() if k != 'NUMBA_CACHE_DIR'} | changes
+    done = subprocess.run(
+        [sys.executable, '-c', PROGRAM], env=environment, capture_output=True, text=True, check=True, cwd=install
+    )
+    seconds, cache, file = done.stdout.split()
+    assert Path(file).is_relative_to(install), 'another copy of the package ran'
+    return float(seconds), Path(cache)
+
+
+@pytest.fixture
+def install(tmp_path: Path) -> Path:
+    folder = tmp_path / 'install'
+    shutil.copytree(PACKAGE, folder / PACKAGE.name, ignore=shutil.ignore_patterns('__pycache__'))
+    return folder
+
+
+def test_a_read_only_install_and_home_keep_kernels_in_a_temporary_folder(install: Path, tmp_path: Path) -> None:
+    # a file in the folder's place keeps even root from making it
+    (install / PACKAGE.name / 'core' / '__pycache__').write_text('')
+    temporary = tmp_path / 'temporary'
+    temporary.mkdir()
+    first, cache = run(install, temporary)
+    assert cache.is_relative_to(temporary)
+    again, _ = run(install, temporary)
+    assert again < first / 2
+
+
+def test_kernels_lie_beside_the_sources_and_are_renewed_with_any_of_them(install: Path) -> None:
+    temporary = Path(tempfile.gettempdir())
+    _, before = run(install, temporary)
+    assert before.parent == install / PACKAGE.name / 'core' / '__pycache__'
+    with (install / PACKAGE.name / 'core' / 'cone.py').open('a') as file:
+        file.write('\n# changed\n')
+    _, after = run(install, temporary)
+    assert after != before
