@@ -44,6 +44,8 @@ class FlipState(NamedTuple):
         Readings whose ratios changed since the last call of `mark_cells`.
     dirty : uint8, shape (cells,)
         Cells whose gain may have changed since it was last computed.
+    settled : uint8, shape (cells,)
+        Cells that no move helps, as long as none of their readings changes.
     gain : float64, shape (cells,)
         The last computed gain of flipping each cell, prior included, nats.
     stop : uint8, shape (1,)
@@ -57,6 +59,7 @@ class FlipState(NamedTuple):
     free_ratio: NDArray[np.float32]
     changed: NDArray[np.uint8]
     dirty: NDArray[np.uint8]
+    settled: NDArray[np.uint8]
     gain: Floats
     stop: NDArray[np.uint8]
 
@@ -87,7 +90,6 @@ def _refresh(index: ConeIndex, causes: Causes, state: FlipState, t: int) -> None
         state.band_ratio[index.band_slot[k]] = (floor + flipped) * scale
     state.occupy_ratio[t] = (floor + total * q) * scale
     state.free_ratio[t] = (floor + total / q) * scale
-    state.changed[t] = 1
 
 
 @kernel
@@ -100,6 +102,7 @@ def refresh_all(index: ConeIndex, causes: Causes, state: FlipState) -> None:
         _refresh(index, causes, state, t)
     state.changed[:] = 0
     state.dirty[:] = 1
+    state.settled[:] = 0
 
 
 @kernel
@@ -146,15 +149,26 @@ def flip(index: ConeIndex, causes: Causes, state: FlipState, c: int) -> None:
 
 
 @kernel
+def mark_readings(index: ConeIndex, state: FlipState, c: int) -> None:
+    """Note that the readings that see cell c changed."""
+    for k in range(index.seen_start[c], index.seen_start[c + 1]):
+        state.changed[index.seen_reading[k]] = 1
+    for slot in range(index.slot_start[c], index.slot_start[c + 1]):
+        state.changed[index.slot_reading[slot]] = 1
+
+
+@kernel
 def mark_cells(index: ConeIndex, state: FlipState) -> None:
-    """Make dirty all cells of the readings that changed."""
+    """Make all cells of the readings that changed dirty, and no longer settled."""
     for t in range(len(state.changed)):
         if state.changed[t]:
             state.changed[t] = 0
             for k in range(index.free_start[t], index.free_start[t + 1]):
                 state.dirty[index.free_cell[k]] = 1
+                state.settled[index.free_cell[k]] = 0
             for k in range(index.band_start[t], index.band_start[t + 1]):
                 state.dirty[index.band_cell[k]] = 1
+                state.settled[index.band_cell[k]] = 0
 
 
 @kernel
@@ -179,6 +193,7 @@ def flip_in_order(
         gain = _gain(index, state, prior, c)
         if gain > least[c]:
             flip(index, causes, state, c)
+            mark_readings(index, state, c)
             flips += 1
             total += gain
     return flips, total
@@ -219,7 +234,11 @@ def shift_in_order(
                         if gain > best + (least[c] + least[other] if target == c else 0.0):
                             best, target = gain, other
         flip(index, causes, state, target)
-        if target != c:
+        if target == c:
+            state.settled[c] = 1
+        else:
+            mark_readings(index, state, c)
+            mark_readings(index, state, target)
             moves += 1
             total += loss + best
     return moves, total

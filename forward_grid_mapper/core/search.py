@@ -84,6 +84,7 @@ class Search:
             free_ratio=np.empty(readings, np.float32),
             changed=np.zeros(readings, np.uint8),
             dirty=np.ones(cells, np.uint8),
+            settled=np.zeros(cells, np.uint8),
             gain=np.zeros(cells),
             stop=np.zeros(1, np.uint8) if stop is None else stop,
         )
@@ -129,7 +130,7 @@ class Search:
         return SearchResult(self.state.occupied, evidence, self.progress, converged)
 
     def _shift(self, watch: Callable[[Progress], None]) -> int:
-        occupied = np.flatnonzero(self.state.occupied)
+        occupied = np.flatnonzero(self.state.occupied & ~self.state.settled)
         # an order that a mirrored or turned map has too
         cells = occupied[np.argsort(-self.state.gain[occupied], kind='stable')]
         shifts, gain = shift_in_order(self.index, self._causes, self.state, self._prior, self.least, cells, self._width)
