@@ -6,7 +6,14 @@ from setuptools import find_packages, setup
 
 NAME = 'forward_grid_mapper'
 SHARE = f'share/{NAME}'
-COMMANDS = ('process_bag', 'simulate', 'experiment', 'demo')
+COMMANDS = {
+    'mapper': 'node.main',
+    'process_bag': 'commands.process_bag',
+    'replay_bag': 'commands.replay_bag',
+    'simulate': 'commands.simulate',
+    'experiment': 'commands.experiment',
+    'demo': 'commands.demo',
+}
 
 
 def shared(folder):
@@ -52,6 +59,6 @@ setup(
         'lint': ['ruff>=0.17,<0.18', 'mypy>=1.15,<3', 'types-PyYAML>=6'],
     },
     entry_points={
-        'console_scripts': [f'{command} = {NAME}.commands.{command}:main' for command in COMMANDS],
+        'console_scripts': [f'{command} = {NAME}.{module}:main' for command, module in COMMANDS.items()],
     },
 )

@@ -6,9 +6,9 @@ import importlib
 import re
 import runpy
 import subprocess
-import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -25,7 +25,7 @@ ROOT = Path(__file__).resolve().parents[1]
 NAME = 'forward_grid_mapper'
 DEPENDENCIES = {
     'exec_depend': {
-        *('ament_index_python', 'diagnostic_msgs', 'geometry_msgs', 'launch', 'launch_ros', 'nav_msgs', 'rclpy'),
+        *('diagnostic_msgs', 'geometry_msgs', 'launch', 'launch_ros', 'nav_msgs', 'rclpy'),
         *('rosgraph_msgs', 'sensor_msgs', 'std_srvs', 'tf2_msgs', 'tf2_ros'),
         *('python3-matplotlib', 'python3-numba', 'python3-numpy', 'python3-rosbags-pip', 'python3-yaml'),
     },

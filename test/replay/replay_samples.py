@@ -57,10 +57,10 @@ def write_bag(
     return path
 
 
-def messages_in(path: Path) -> list[RangeMessage | OdometryMessage]:
+def messages_in(path: Path, odom_topic: str | None = None) -> list[RangeMessage | OdometryMessage]:
     """What the offline tool would read from a bag."""
     with Bag(path) as bag:
-        return list(bag.messages(bag.choose_topics()))
+        return list(bag.messages(bag.choose_topics(None, odom_topic)))
 
 
 class Replay:

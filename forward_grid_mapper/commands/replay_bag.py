@@ -1,0 +1,172 @@
+"""`replay_bag`: plays a bag's ranges, odometry and static transforms over DDS, where `ros2 bag` is not installed."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import sys
+import time
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+from ..bags.choice import ODOMETRY, RANGE
+from ..bags.decoder import TF_MESSAGE
+from ..bags.reader import Bag
+from ..core.errors import MapperError
+from .console import Ticker, run
+from .player import CLOCK, Player
+from .publishers import Publishers, renamed
+from .ros_messages import MISFITS, message_class, static_transforms
+from .stop_signal import StopSignal
+
+COMMAND = 'replay_bag'
+CLOCK_TYPE = 'rosgraph_msgs/msg/Clock'
+
+
+def parser() -> argparse.ArgumentParser:
+    """Return the parser of the command line."""
+    made = argparse.ArgumentParser(
+        COMMAND,
+        description="Replay a recorded drive to the mapper: publishes a bag's Range, Odometry and static transforms, "
+        'with their own stamps and in their order, once somebody listens to all of them.',
+        epilog='--ros-args and what follows it goes to ROS.',
+    )
+    made.add_argument('bag', help='ROS 2 bag folder, single .mcap or .db3 file, or ROS 1 .bag')
+    made.add_argument('--rate', type=_positive, default=1.0, metavar='R', help='times as fast as recorded (default 1)')
+    made.add_argument(
+        '--loop', nargs='?', type=_times, const=0, default=1, metavar='N', help='play N times; without N until stopped'
+    )
+    made.add_argument(
+        '--clock',
+        nargs='?',
+        type=_positive,
+        const=40.0,
+        metavar='HZ',
+        help="publish the bag's time on /clock, between messages too at HZ of wall time (default 40)",
+    )
+    made.add_argument('--range-topics', nargs='+', metavar='TOPIC', help='Range topics (default: all in the bag)')
+    made.add_argument('--odom-topic', metavar='TOPIC', help='Odometry topic (needed if the bag has several)')
+    made.add_argument(
+        '--remap', nargs='+', action='extend', default=[], metavar='OLD:=NEW', help='publish topics under other names'
+    )
+    made.add_argument(
+        '--wait',
+        type=_number,
+        default=30.0,
+        metavar='S',
+        help='how long to wait for subscribers of every topic before giving up (default 30); 0 begins at once',
+    )
+    quality = made.add_mutually_exclusive_group()
+    quality.add_argument('--reliable', action='store_true', default=True, help='every subscriber can hear (default)')
+    quality.add_argument('--best-effort', dest='reliable', action='store_false', help='as sensor drivers publish')
+    made.add_argument('-q', '--quiet', action='store_true', help='print nothing but errors')
+    return made
+
+
+def replay(options: argparse.Namespace, ros_arguments: Sequence[str]) -> int:
+    """Do what the command line asks for."""
+    with StopSignal() as stop, Bag(options.bag) as bag, Ticker(options.quiet) as ticker:
+        topics = bag.choose_topics(options.range_topics, options.odom_topic)
+        sensors = {**dict.fromkeys(topics.range_topics, RANGE), topics.odom_topic: ODOMETRY}
+        clock = {CLOCK: CLOCK_TYPE} if options.clock else {}
+        with Publishers(ros_arguments, options.reliable, stop) as publishers:
+            fixed: dict[str, list[Any]] = {}
+            for topic, message in bag.static_originals():
+                fixed.setdefault(topic, []).append(message)
+            names = renamed({**sensors, **dict.fromkeys(fixed, TF_MESSAGE), **clock}, options.remap)
+            for topic, transforms in _static(fixed, options.quiet).items():
+                publishers.add(names[topic], TF_MESSAGE, latched=True)
+                publishers.publish_latched(names[topic], transforms=transforms)
+            for topic, msgtype in {names[topic]: kind for topic, kind in {**sensors, **clock}.items()}.items():
+                publishers.add(topic, msgtype)
+            player = Player(bag, topics, names, publishers, stop, options.clock, ticker.say)
+            ticker.say('waiting for subscribers')
+            if options.wait:
+                publishers.wait_for_subscribers(sorted({names[topic] for topic in sensors}), options.wait)
+            begin, passes = time.monotonic(), 0
+            while not stop.is_set() and (not options.loop or passes < options.loop):
+                passes += 1
+                player.play(options.rate, 'replaying' if options.loop == 1 else f'replaying, time {passes}')
+            seconds = time.monotonic() - begin
+            ticker.say('waiting until subscribers have acknowledged')
+            publishers.finish()
+    _warn(bag, player)
+    if not options.quiet:
+        counts = f'{player.played[RANGE]:,} Range and {player.played[ODOMETRY]:,} Odometry messages'
+        print(f'{"stopped after" if stop.is_set() else "replayed"} {counts} in {seconds:.1f} s')
+    return 0
+
+
+def _static(messages: Mapping[str, Iterable[Any]], quiet: bool) -> dict[str, list[Any]]:
+    """Return the transforms of each tf_static topic as ROS messages; if that cannot be, none, and say so."""
+    try:
+        if messages:
+            message_class(TF_MESSAGE)
+        return {topic: static_transforms(found) for topic, found in messages.items()}
+    except (MapperError, *MISFITS) as error:
+        if not quiet:
+            _print_warning(
+                f'static transforms are not replayed ({error}); give the mapper the poses of the sensors as '
+                f'parameters sensors.FRAME.pose: [x, y, yaw]'
+            )
+        return {}
+
+
+def _warn(bag: Bag, player: Player) -> None:
+    """Tell what of the bag was not played as it is."""
+    if bag.truncated:
+        _print_warning(bag.truncated)
+    for topic, count in (player.unusable + Counter(bag.undecodable)).items():
+        _print_warning(f'{count} messages on {topic} do not fit their type and were skipped')
+    if player.jumps:
+        _print_warning(f'the stamps went back or left a gap {player.jumps} times, which was not waited for')
+
+
+def _print_warning(text: str) -> None:
+    print(f'{COMMAND}: warning: {text}', file=sys.stderr)
+
+
+def _positive(text: str) -> float:
+    value = _number(text)
+    if not value:
+        raise argparse.ArgumentTypeError(f'{text!r} is not more than 0')
+    return value
+
+
+def _number(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 0 <= value < math.inf:
+        raise argparse.ArgumentTypeError(f'{text!r} is not a number from 0 up (the bag goes before the options)')
+    return value
+
+
+def _times(text: str) -> int:
+    if not text.isdecimal() or not int(text):
+        raise argparse.ArgumentTypeError(f'{text!r} is not a number of times (the bag goes before the options)')
+    return int(text)
+
+
+def split_ros_arguments(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
+    """Part our own arguments from ROS's, which go from each `--ros-args` to the next `--` or the end."""
+    own: list[str] = []
+    ros: list[str] = []
+    for argument in arguments:
+        if argument == '--ros-args' or (ros and ros[-1] != '--'):
+            ros.append(argument)
+        else:
+            own.append(argument)
+    return own, ros
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command; return its exit code."""
+    own, ros = split_ros_arguments(sys.argv[1:] if arguments is None else arguments)
+    return run(parser(), lambda options: replay(options, ros), own)
+
+
+if __name__ == '__main__':
+    sys.exit(main())
