@@ -1,0 +1,151 @@
+"""Sensor poses and the map frame from TF, with a buffer that stands in for tf2_ros'."""
+
+from __future__ import annotations
+
+import math
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+pytest.importorskip('rclpy', reason='stamps are asked for with rclpy')
+
+from forward_grid_mapper.core.messages import NANOSECONDS, OdometryMessage, Pose2, RangeMessage
+from forward_grid_mapper.core.placing import LATER, Placer
+from forward_grid_mapper.node import frames
+from forward_grid_mapper.node.frames import MapFrame, Mounts, Transforms, planar
+
+
+class TransformError(Exception):
+    """The base of tf2's exceptions."""
+
+
+class LookupFailed(TransformError):
+    """A frame is not known."""
+
+
+class ExtrapolationFailed(TransformError):
+    """The frame is known, but not at this time."""
+
+
+ExtrapolationFailed.__name__ = 'ExtrapolationException'
+
+
+def transform(x: float, y: float, yaw: float = 0.0, pitch: float = 0.0) -> Any:
+    """A `geometry_msgs/Transform`: first turned by yaw, then by pitch."""
+    a, b = yaw / 2, pitch / 2
+    rotation = SimpleNamespace(
+        x=-math.sin(a) * math.sin(b),
+        y=math.cos(a) * math.sin(b),
+        z=math.sin(a) * math.cos(b),
+        w=math.cos(a) * math.cos(b),
+    )
+    return SimpleNamespace(rotation=rotation, translation=SimpleNamespace(x=x, y=y, z=0.3))
+
+
+class Buffer:
+    """Answers as `tf2_ros.Buffer` does, without waiting."""
+
+    def __init__(self) -> None:
+        self.known: dict[tuple[str, str], Any] = {}
+        self.until = 1 << 62
+        self.asked = 0
+
+    def lookup_transform(self, target: str, source: str, time: Any) -> Any:
+        self.asked += 1
+        if (target, source) not in self.known:
+            raise LookupFailed(source)
+        if time.nanoseconds > self.until:
+            raise ExtrapolationFailed(source)
+        found = self.known[target, source]
+        return SimpleNamespace(transform=found(time.nanoseconds) if callable(found) else found)
+
+
+@pytest.fixture
+def buffer() -> Buffer:
+    return Buffer()
+
+
+@pytest.fixture
+def transforms(buffer: Buffer) -> Transforms:
+    return Transforms(buffer, TransformError)
+
+
+def test_parameters_win_over_tf(buffer: Buffer, transforms: Transforms) -> None:
+    buffer.known['base', 'sonar'] = transform(1.0, 2.0)
+    assert Mounts({}, transforms)('base', 'sonar', 0) == Pose2(1.0, 2.0, 0.0)
+    assert Mounts({'sonar': Pose2(3, 4, 5)}, transforms)('base', '/sonar', 0) == Pose2(3, 4, 5)
+    assert Mounts({}, transforms)('/base', '/sonar', 0) == Pose2(1.0, 2.0, 0.0)
+
+
+def test_without_tf_an_unknown_frame_is_unknown_at_once() -> None:
+    assert Mounts({}, Transforms())('base', 'sonar', 0) is None
+
+
+def test_poses_are_projected_and_steep_sensors_refused(buffer: Buffer, transforms: Transforms) -> None:
+    pose = planar(transform(1.0, 2.0, yaw=2.5, pitch=0.5))
+    assert pose is not None
+    assert pose.yaw == pytest.approx(2.5)
+    buffer.known['base', 'down'] = transform(0.0, 0.0, pitch=1.5)
+    mounts = Mounts({}, transforms)
+    assert mounts('base', 'down', 0) is None
+    assert mounts.steep == {'down'}
+
+
+def test_a_frame_that_is_not_there_is_asked_for_only_now_and_then(
+    buffer: Buffer, transforms: Transforms, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now = 0.0
+    monkeypatch.setattr(frames.time, 'monotonic', lambda: now)
+    mounts = Mounts({}, transforms)
+    assert all(mounts('base', 'ghost', k) is LATER for k in range(50))
+    assert buffer.asked == 1
+    now += 1.0
+    buffer.known['base', 'ghost'] = transform(1.0, 0.0)
+    assert mounts('base', 'ghost', 99) == Pose2(1.0, 0.0, 0.0)
+
+
+def test_a_moving_mount_is_taken_at_the_readings_stamp_even_if_tf_is_late(
+    buffer: Buffer, transforms: Transforms
+) -> None:
+    buffer.known['base', 'servo'] = lambda stamp: transform(0.0, 0.0, yaw=stamp / NANOSECONDS)
+    buffer.until = 0
+    placer = Placer(Mounts({}, transforms))
+    for tenth in range(5):
+        stamp = tenth * NANOSECONDS // 10
+        placer.add_odometry(OdometryMessage(stamp, 'odom', 'base', Pose2(0, 0, 0)))
+        placer.add_range(RangeMessage(stamp, 'servo', 1.0, 0.1, 3.0, 0.3))
+    assert placer.waiting == 4
+    buffer.until = 1 << 62
+    placer.add_odometry(OdometryMessage(NANOSECONDS, 'odom', 'base', Pose2(0, 0, 0)))
+    assert placer.waiting == 0
+    assert sorted(placer.readings.yaw) == pytest.approx([0.0, 0.1, 0.2, 0.3, 0.4])
+
+
+def test_odometry_is_given_in_the_map_frame_once_tf_knows_it(buffer: Buffer, transforms: Transforms) -> None:
+    frame = MapFrame('map', transforms, timeout=1.0)
+    first, second = (OdometryMessage(k * NANOSECONDS // 2, 'odom', 'base', Pose2(1.0, 0.0, 0.0)) for k in (0, 1))
+    buffer.known['map', 'odom'] = transform(10.0, 5.0, yaw=math.pi / 2)
+    buffer.until = -1
+    assert frame.convert(first) == []
+    buffer.until = 1 << 62
+    ready = frame.convert(second)
+    assert [message.stamp for message in ready] == [first.stamp, second.stamp]
+    assert all(message.frame_id == 'map' for message in ready)
+    assert ready[0].pose == pytest.approx((10.0, 6.0, math.pi / 2))
+
+
+def test_odometry_without_a_transform_is_dropped_after_the_timeout(buffer: Buffer, transforms: Transforms) -> None:
+    frame = MapFrame('map', transforms, timeout=1.0)
+    for k in range(10):
+        assert frame.convert(OdometryMessage(k * NANOSECONDS, 'odom', 'base', Pose2(0, 0, 0))) == []
+    assert frame.dropped == 8
+    # the clock jumps back
+    assert frame.convert(OdometryMessage(0, 'odom', 'base', Pose2(0, 0, 0))) == []
+    assert frame.dropped == 10
+
+
+@pytest.mark.parametrize('name', ['', 'odom', '/odom'])
+def test_without_another_map_frame_odometry_passes(transforms: Transforms, name: str) -> None:
+    message = OdometryMessage(0, 'odom', 'base', Pose2(0, 0, 0))
+    assert MapFrame(name, transforms, 1.0).convert(message) == [message]
