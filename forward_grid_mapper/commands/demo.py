@@ -16,7 +16,7 @@ from ..files.output_folder import free_name, output_errors, output_folder
 from ..files.results import write_results
 from ..simulation.drive import Recording
 from ..simulation.score import Scores, score_map, threshold, visible_surface
-from .console import Ticker, run
+from .console import Ticker, readable, run
 from .offline import read_drive
 from .options import add_mapping_options, chosen_parameters
 from .simulate import SONARS, record, write_recording
@@ -78,10 +78,11 @@ def through_node(folder: Path, bag: Path, recording: Recording, options: argpars
     return told
 
 
-def offline(folder: Path, bag: Path, options: argparse.Namespace, ticker: Ticker) -> str:
-    """Map a bag without ROS into `folder`/maps; return what EM did."""
+def offline(folder: Path, bag: Path, output: Path, options: argparse.Namespace, ticker: Ticker) -> str:
+    """Map a bag without ROS into `folder`/maps, to be known as `output`/maps; return what EM did."""
     parameters = chosen_parameters(options)[0]
     drive = read_drive(bag, parameters, {}, progress=ticker.reading)
+    drive.source['bag'] = readable(output / bag.name)
     maps = Mapper(parameters).run(drive.placer.readings, ticker.mapping)
     write_results(folder / 'maps', maps, drive.source, drive.path_xy, 'The demo, offline')
     return f'{len(maps.readings)} readings, {sum(maps.statistics["seconds"].values()):.2f} seconds'
@@ -108,7 +109,7 @@ def demo(options: argparse.Namespace) -> int:
         recording = record(options.world, options.seen, 1, False, options.seed, SONARS['ring']())
         bag = write_recording(folder, recording)
         if options.offline:
-            told = offline(folder, bag, options, ticker)
+            told = offline(folder, bag, output, options, ticker)
         else:
             told = through_node(folder, bag, recording, options, ticker)
         ticker.say('scoring')

@@ -61,7 +61,7 @@ class Mapper:
     @staticmethod
     def _observed(index: ConeIndex, occupied: NDArray[np.uint8], grid: Grid) -> NDArray[np.int8]:
         seen = np.diff(index.seen_start) + np.diff(index.slot_start) > 0
-        return np.where(seen, occupied, UNKNOWN).reshape(grid.shape).astype(np.int8)
+        return np.where(seen, occupied.astype(np.int8), np.int8(UNKNOWN)).reshape(grid.shape)
 
     def run(self, readings: Readings, watch: Watch = lambda stage, progress: None) -> MapSet:
         """Return the maps of `readings`.

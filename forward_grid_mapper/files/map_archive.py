@@ -57,7 +57,7 @@ def write_npz(path: Path | str, maps: MapSet) -> None:
         parameters=np.array(json.dumps(maps.parameters.flat())),
     )
     with output_errors(path):
-        path.write_bytes(packed.getbuffer())
+        path.write_bytes(packed.getvalue())
 
 
 def read_npz(path: Path | str) -> MapArchive:

@@ -88,7 +88,7 @@ def write_raw(path_stem: Path | str, grid: Grid, probability: NDArray[np.float32
         If a file cannot be written.
     """
     percent = occupancy_values(probability)
-    pixels = np.where(percent < 0, RAW_UNKNOWN_PIXEL, percent).astype(np.uint8)
+    pixels = np.where(percent < 0, RAW_UNKNOWN_PIXEL, percent.astype(np.int16)).astype(np.uint8)
     return _write(Path(path_stem), grid, pixels, 'raw')
 
 

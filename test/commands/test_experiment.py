@@ -6,7 +6,7 @@ import re
 from pathlib import Path
 
 import pytest
-from drive_samples import FILES, code_of, everything_in, report_in
+from drive_samples import code_of, everything_in
 
 from forward_grid_mapper.commands import demo, experiment
 
@@ -43,7 +43,7 @@ def test_corridor(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = capsys.readouterr().out
     rows = re.findall(r'^(forward|standard).* (\d\.\d{3}) +(\d)/6 +(\d\.\d\d) +\d+ +\d\.\d\d +\d+$', out, re.MULTILINE)
     assert [row[0] for row in rows] == ['forward'] * 2 + ['standard'] * 3
-    assert re.search(r'half of the smooth wall: \d of 3\.', out)
+    assert re.search(r'Of 3 gains of the standard map, \d show .* half of the smooth wall', out)
     assert {path.name for path in output.iterdir()} == {'figure.png', 'table.txt'}
 
 
@@ -77,18 +77,32 @@ def test_wrong_options(
 
 def test_demo(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     monkeypatch.chdir(tmp_path)
-    assert code_of(demo.main, '--seen', 1) == 0
+    assert code_of(demo.main, '--seen', 1, '--offline') == 0
     folder = tmp_path / 'demo_output'
-    assert {path.name for path in (folder / 'maps').iterdir()} == FILES | {'scores.txt'}
-    report = report_in(folder / 'maps')
-    assert report['input']['bag'] == str(folder / 'bag'), 'not the temporary name'
-    assert (folder / 'bag').is_dir() and (folder / 'reference.yaml').is_file()
-    scores = (folder / 'maps' / 'scores.txt').read_text('utf-8')
+    assert {path.name for path in folder.iterdir()} == {
+        'bag',
+        'demo.png',
+        'maps',
+        'reference.pgm',
+        'reference.yaml',
+        'scores.txt',
+        'trajectory.csv',
+    }
     out = capsys.readouterr().out
-    assert scores in out and str(folder / 'maps' / 'maps.png') in out
-    assert [line.split('  ')[0] for line in scores.splitlines()[1:]] == ['live map', 'ML map', 'uncertainty map']
-    assert code_of(demo.main, '--seen', 1) == 0
+    assert (folder / 'scores.txt').read_text().strip() in out
+    assert re.search(r'^ML map +0\.\d{3}', out, re.MULTILINE)
+    assert code_of(demo.main, '--seen', 1, '--offline') == 0
     assert (tmp_path / 'demo_output_2' / 'maps' / 'maps.png').is_file()
+
+
+def test_demo_through_the_node(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip('rclpy', reason='the demo replays to the node over DDS')
+    assert code_of(demo.main, '--seen', 1, '--rate', 20, '-o', tmp_path / 'out') == 0
+    out = capsys.readouterr().out
+    assert 'EM in the node' in out
+    assert re.search(r'^ML map +0\.\d{3}', out, re.MULTILINE)
+    assert (tmp_path / 'out' / 'demo.png').is_file()
+    assert (tmp_path / 'out' / 'maps' / 'report.txt').is_file()
 
 
 def test_demo_with_wrong_options(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
