@@ -178,6 +178,18 @@ def walk(table: Any, t: int, shape: Any, nearest: bool, cells: Any, distances: A
 
 
 @kernel
+def walk_with_room(
+    table: Any, t: int, shape: Any, nearest: bool, cells: Any, distances: Any
+) -> tuple[int, NDArray[np.int32], Floats]:
+    """Do as `walk` does; where the arrays are too short, go on with longer ones. Return them after the number."""
+    n = walk(table, t, shape, nearest, cells, distances)
+    if n > len(cells):
+        cells, distances = np.empty(2 * n, np.int32), np.empty(2 * n, np.float64)
+        n = walk(table, t, shape, nearest, cells, distances)
+    return n, cells, distances
+
+
+@kernel
 def _count(table: Any, shape: Any, nearest: bool, starts: Any, stop: Any) -> int:
     """Count the pairs by reading and by cell, each into the place after its own; return the largest cone.
 
@@ -189,10 +201,7 @@ def _count(table: Any, shape: Any, nearest: bool, starts: Any, stop: Any) -> int
     for t in range(len(table.x)):
         if stop[0]:
             break
-        n = walk(table, t, shape, nearest, cells, distances)
-        if n > len(cells):
-            cells, distances = np.empty(2 * n, np.int32), np.empty(2 * n, np.float64)
-            n = walk(table, t, shape, nearest, cells, distances)
+        n, cells, distances = walk_with_room(table, t, shape, nearest, cells, distances)
         largest = max(largest, n)
         for k in range(n):
             if distances[k] < table.free[t]:

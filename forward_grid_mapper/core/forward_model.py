@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from .cone_index import ConeTable, Floats, cone_table, walk
+from .cone_index import ConeTable, Floats, cone_table, walk_with_room
 from .grid import Grid
 from .jit import kernel
 from .parameters import ModelParameters
@@ -83,10 +83,7 @@ def _expect(
     flat = occupied.ravel()
     cells, distances = np.empty(1024, np.int32), np.empty(1024, np.float64)
     for t in range(len(table.x)):
-        n = walk(table, t, (height, width), nearest, cells, distances)
-        if n > len(cells):
-            cells, distances = np.empty(2 * n, np.int32), np.empty(2 * n, np.float64)
-            n = walk(table, t, (height, width), nearest, cells, distances)
+        n, cells, distances = walk_with_room(table, t, (height, width), nearest, cells, distances)
         m = 0
         for k in range(n):
             if flat[cells[k]] == 1:

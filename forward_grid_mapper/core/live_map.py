@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .cone_index import ConeTable, Floats, cone_table, grid_of, walk
+from .cone_index import ConeTable, Floats, cone_table, grid_of, walk_with_room
 from .grid import Grid
 from .jit import kernel
 from .parameters import Parameters
@@ -40,10 +40,7 @@ def _add(table: ConeTable, gains: Any, log_odds: Any, nearest: bool) -> None:
     flat = log_odds.ravel()
     cells, distances = np.empty(1024, np.int32), np.empty(1024, np.float64)
     for t in range(len(table.x)):
-        n = walk(table, t, (height, width), nearest, cells, distances)
-        if n > len(cells):
-            cells, distances = np.empty(2 * n, np.int32), np.empty(2 * n, np.float64)
-            n = walk(table, t, (height, width), nearest, cells, distances)
+        n, cells, distances = walk_with_room(table, t, (height, width), nearest, cells, distances)
         echo = table.z[t] < table.z_max[t]
         free = gains[1] if echo else gains[2]
         cosine, sine = math.cos(table.yaw[t]), math.sin(table.yaw[t])
