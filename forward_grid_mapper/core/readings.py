@@ -113,6 +113,9 @@ class ReadingBuffer:
         self._size += 1
 
     def snapshot(self, start: int = 0) -> Readings:
-        """Return readings `start` … N−1 as views; later appends do not change them."""
-        views = {name: column[start : self._size] for name, column in self._columns.items()}
+        """Return readings `start` … N−1 as views; later appends do not change them, and may go on in another thread."""
+        # the size first: columns that are looked up after it hold at least as many
+        size = self._size
+        columns = self._columns
+        views = {name: column[start:size] for name, column in columns.items()}
         return Readings(**views, sensor_names=tuple(self._names))

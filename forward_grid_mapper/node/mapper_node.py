@@ -64,7 +64,9 @@ class MapperNode(Node):
         self._paused = False
         self._last_run = 'none yet'
         self._told: set[str] = set()
-        self._generation = 0
+        # EM's results count only if nothing was reset since it began; both are published under the lock, so that
+        # maps that were forgotten cannot come after the empty ones
+        self._generation = self._run_generation = 0
         self._lock = threading.Lock()
         self._health = diagnostics.Health()
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
@@ -182,11 +184,12 @@ class MapperNode(Node):
 
         def finish(outcome: Outcome) -> None:
             with self._lock:
-                current = generation == self._generation
-                if current and outcome.maps is not None:
+                if generation != self._generation:
+                    outcome = Outcome(None, 'EM was cancelled by reset')
+                elif outcome.maps is not None:
                     self._maps = outcome.maps
-            if not current:
-                outcome = Outcome(None, 'EM was cancelled by reset')
+                    self._publish('ml_map', outcome.maps.grid, outcome.maps.ml)
+                    self._publish('uncertainty_map', outcome.maps.grid, outcome.maps.uncertainty)
             if outcome.maps is None:
                 self._last_run = outcome.message
                 self.get_logger().warning(f'EM: {outcome.message}')
@@ -194,11 +197,12 @@ class MapperNode(Node):
                 maps = outcome.maps
                 self._last_run = summary(maps, sum(maps.statistics['seconds'].values()))
                 self.get_logger().info(f'EM: {self._last_run}')
-                self._publish('ml_map', maps.grid, maps.ml)
-                self._publish('uncertainty_map', maps.grid, maps.uncertainty)
             done(outcome)
 
-        return self._em.start(self._placer.readings, self.parameters, finish) is not None
+        if self._em.start(self._placer.readings, self.parameters, finish) is None:
+            return False
+        self._run_generation = generation
+        return True
 
     def _watch(self, run: Run) -> None:
         """Show the map found so far, and the progress, at most `publish_rate` times a second."""
@@ -207,16 +211,16 @@ class MapperNode(Node):
             return
         self._watched = now
         found = run.mapper.so_far()
-        if found is not None:
-            self.get_logger().info(f'EM: {run}')
-            self._publish('ml_map', *found)
+        if found is None:
+            return
+        self.get_logger().info(f'EM: {run}')
+        with self._lock:
+            if self._run_generation == self._generation:
+                self._publish('ml_map', *found)
 
     # services
 
     def _reset(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        with self._lock:
-            self._generation += 1
-            self._maps = None
         self._em.cancel()
         forgotten = len(self._placer.buffer)
         self._placer.clear()
@@ -225,8 +229,11 @@ class MapperNode(Node):
         self._last_run = 'none since the reset'
         # late subscribers must not get the maps that were forgotten
         nothing = Grid(self.parameters.grid.resolution, 0, 0, 1, 1)
-        for name in MAPS:
-            self._publish(name, nothing, np.full(nothing.shape, -1, np.int8))
+        with self._lock:
+            self._generation += 1
+            self._maps = None
+            for name in MAPS:
+                self._publish(name, nothing, np.full(nothing.shape, -1, np.int8))
         response.success, response.message = True, f'{forgotten} readings and all maps were forgotten'
         return response
 
