@@ -43,6 +43,7 @@ class LiveNode:
 
     def __enter__(self) -> LiveNode:
         import rclpy
+        from rclpy.signals import SignalHandlerOptions
 
         os.environ.update(self.environment)
         with self._log.open('wb') as log:
@@ -51,7 +52,7 @@ class LiveNode:
                 stdout=log,
                 stderr=subprocess.STDOUT,
             )
-        rclpy.init()
+        rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
         self._client = rclpy.create_node('forward_grid_mapper_demo')
         return self
 
@@ -65,7 +66,10 @@ class LiveNode:
             rclpy.try_shutdown()
         if self._process is not None:
             self._process.terminate()
-            self._process.wait(15)
+            try:
+                self._process.wait(15)
+            except subprocess.TimeoutExpired:
+                self._process.kill()
 
     def _start(self, arguments: Sequence[str], **options: Any) -> subprocess.Popen[bytes]:
         return subprocess.Popen(
@@ -80,7 +84,12 @@ class LiveNode:
         MapperError
             If it fails.
         """
-        if self._start(arguments).wait() != 0:
+        process = self._start(arguments)
+        try:
+            code = process.wait()
+        finally:
+            process.terminate()
+        if code != 0:
             raise MapperError(f'{arguments[0]} failed; {self._told()}')
 
     def call(self, service: str) -> str:

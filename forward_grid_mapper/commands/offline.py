@@ -72,6 +72,11 @@ class Mounts:
             self.used[frame] = '/tf_static'
         return pose
 
+    @property
+    def unused(self) -> list[str]:
+        """Frames with a given pose that no reading asked for."""
+        return sorted(set(self._given) - {frame.lstrip('/') for frame in self.used})
+
     def explain(self, base_frame: str, frames: Sequence[str]) -> str:
         """Say what to do about frames without a pose."""
         known = self._transforms.frames
@@ -165,6 +170,10 @@ def _warnings(bag: Bag, placer: Placer, lookup: Mounts) -> list[str]:
         warnings.append(f'{count} messages on {topic} do not fit their type and were skipped')
     if placer.unknown_frames:
         warnings.append(lookup.explain(placer.base_frame, sorted(placer.unknown_frames)))
+    if unused := lookup.unused:
+        warnings.append(
+            f'poses were given for {", ".join(unused)}, but no reading has such a frame; is the name right?'
+        )
     if placer.time_jumps:
         warnings.append(f"odometry's clock jumped back {placer.time_jumps} times; what waited for a pose was dropped")
     for reason, count in placer.odometry_rejected.items():

@@ -113,7 +113,7 @@ def grid_of(
         If there are no readings, or the grid would exceed `max_cells`.
     """
     if not len(readings):
-        raise InputError('no reading was accepted, so there is nothing to map; the report says why each was rejected')
+        raise InputError('no reading was accepted, so there is nothing to map; the counts of rejected readings say why')
     reach = reach_of(readings, effective_sigma(readings, model, grid.resolution), model.cut)
     reach = np.maximum(reach, readings.z + beyond if beyond else 0.0)
     if model.cell_distance == 'nearest':

@@ -38,7 +38,13 @@ def _cache_folder() -> str:
     for folder in (config.CACHE_DIR, here / '__pycache__', home / 'forward_grid_mapper'):
         if folder and _writable(Path(folder)):
             return str(Path(folder) / name)
-    return str(Path(tempfile.gettempdir()) / f'forward_grid_mapper_{os.getuid()}' / name)
+    shared = Path(tempfile.gettempdir()) / f'forward_grid_mapper_{os.getuid()}'
+    shared.mkdir(mode=0o700, exist_ok=True)
+    owner = shared.lstat()
+    # machine code is run as it is found, so it must not be possible for others to have put it there
+    if owner.st_uid != os.getuid() or owner.st_mode & 0o077 or shared.is_symlink():
+        shared = Path(tempfile.mkdtemp(prefix='forward_grid_mapper_'))
+    return str(shared / name)
 
 
 CACHE = _cache_folder()

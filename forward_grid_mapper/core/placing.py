@@ -42,13 +42,13 @@ REASONS = {
     'pose_gap': 'odometry has a gap longer than max_pose_gap here',
     'time_jump': 'the clock jumped back while the reading waited for its pose',
     'too_many_waiting': 'too many readings waited for odometry at once',
-    'too_far_away': 'the map would have more than max_cells cells; is the pose right?',
+    'too_far_away': 'the map would have more than max_cells cells; are pose and max_range right?',
     'paused': 'the mapper was paused',
 }
 """Why a reading is rejected, in words."""
 
 ODOMETRY_REASONS = {
-    'bad_pose': 'the pose is not finite or its quaternion is not normalised',
+    'bad_pose': 'the pose is not finite, absurdly far away, or its quaternion is not normalised',
     'other_frame': 'the frame_id or child_frame_id differs from that of the first odometry message',
 }
 """Why an odometry message is rejected, in words."""
@@ -179,7 +179,7 @@ class Placer:
         self._clock = clock
         self._mounts = mounts
         self.parameters = (parameters or Parameters()).placing
-        self._grid = (parameters or Parameters()).grid
+        self._all = parameters or Parameters()
         self._box = (math.inf, -math.inf, math.inf, -math.inf)
         self._patient = patient
         self.buffer = ReadingBuffer()
@@ -244,7 +244,7 @@ class Placer:
     def add_odometry(self, message: OdometryMessage) -> None:
         """Take one Odometry message."""
         self.odometry_received += 1
-        if message.pose is None:
+        if message.pose is None or not max(abs(message.pose.x), abs(message.pose.y)) < FARTHEST:
             self.odometry_rejected['bad_pose'] += 1
             return
         if not self.map_frame and not self.base_frame:
@@ -363,7 +363,7 @@ class Placer:
             self._reject_unknown(measured)
             return
         sensor = pose.compose(mount)
-        if not self._fits(sensor, measured.z_max):
+        if not self._fits(sensor, self._reach(measured)):
             self._reject(measured.frame_id, 'too_far_away')
             return
         self.buffer.append(
@@ -378,19 +378,26 @@ class Placer:
             stamp=measured.stamp,
         )
 
-    def _fits(self, sensor: Pose2, z_max: float) -> bool:
+    def _reach(self, measured: _Measurement) -> float:
+        """Return how far from the sensor the maps take note of a reading, and two cells more, in metres."""
+        p = self._all
+        cell = p.grid.resolution
+        explained = measured.z + p.model.cut * max(measured.sigma or p.model.sigma, cell / 2)
+        return max(min(explained, measured.z_max), measured.z + max(p.live.live_depth, cell / 2)) + 2 * cell
+
+    def _fits(self, sensor: Pose2, reach: float) -> bool:
         """Whether the map can grow to hold the reading; if so, it does."""
         if not max(abs(sensor.x), abs(sensor.y)) < FARTHEST:
             return False
         left, right, bottom, top = self._box
         box = (
-            min(left, sensor.x - z_max),
-            max(right, sensor.x + z_max),
-            min(bottom, sensor.y - z_max),
-            max(top, sensor.y + z_max),
+            min(left, sensor.x - reach),
+            max(right, sensor.x + reach),
+            min(bottom, sensor.y - reach),
+            max(top, sensor.y + reach),
         )
-        cell = self._grid.resolution
-        if not ((box[1] - box[0]) / cell + 1) * ((box[3] - box[2]) / cell + 1) <= self._grid.max_cells:
+        cell = self._all.grid.resolution
+        if not ((box[1] - box[0]) / cell + 1) * ((box[3] - box[2]) / cell + 1) <= self._all.grid.max_cells:
             return False
         self._box = box
         return True

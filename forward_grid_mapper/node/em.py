@@ -100,6 +100,8 @@ class EmWorker:
             # a run must never take the live map with it
             self._log(f'EM failed: {error!r}')
             outcome = Outcome(None, f'EM failed: {error!r}')
+        # whoever is told that the run has ended may start the next
+        self._run = None
         try:
             done(outcome)
         finally:

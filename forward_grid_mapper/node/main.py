@@ -33,8 +33,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     stopper = Stopper()
     try:
         import rclpy
+        from rclpy.exceptions import NameValidationException
         from rclpy.executors import SingleThreadedExecutor
         from rclpy.signals import SignalHandlerOptions
+        from rclpy.utilities import remove_ros_args
     except ImportError as error:
         print(
             f"mapper: error: ROS 2 is not there ({error}): source its setup.bash, or pip install '.[ros]'",
@@ -51,6 +53,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except Exception as error:  # rclpy raises classes of its C extension, for a parameter file with a fault for one
         print(f'mapper: error: {error}', file=sys.stderr)
         return 1
+    left = remove_ros_args(['mapper', *arguments])[1:]
+    if left:
+        print(
+            f'mapper: error: {" ".join(left)} means nothing; ROS options come after --ros-args\n{USAGE}',
+            file=sys.stderr,
+        )
+        return 2
     node = None
     try:
         node = MapperNode()
@@ -65,7 +74,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         executor.spin()
     except _Stop:
         pass
-    except MapperError as error:
+    except (MapperError, NameValidationException, ValueError) as error:
         print(f'mapper: error: {error}', file=sys.stderr)
         return 1
     finally:

@@ -68,6 +68,7 @@ class MapperNode(Node):
         # maps that were forgotten cannot come after the empty ones
         self._generation = self._run_generation = 0
         self._lock = threading.Lock()
+        self._saving = threading.Lock()
         self._health = diagnostics.Health()
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._watched = 0.0
@@ -80,7 +81,7 @@ class MapperNode(Node):
         self._mounts = Mounts(self._given_mounts, transforms)
         self._map_frame = MapFrame(node.map_frame, transforms, self.parameters.placing.pose_timeout)
         if node.map_frame and not transforms.available:
-            self.get_logger().error(f'map_frame is {node.map_frame}, but tf2_ros is not installed')
+            raise MapperError(f'map_frame is {node.map_frame}, but tf2_ros is not installed to look it up')
         self._placer = Placer(self._mounts, self.parameters)
         self._maps_out = {name: self.create_publisher(OccupancyGrid, f'~/{name}', LATCHED) for name in MAPS}
         self._latest = {name: self._message(Grid(self.parameters.grid.resolution, 0, 0, 0, 0), None) for name in MAPS}
@@ -142,7 +143,8 @@ class MapperNode(Node):
 
     def _message(self, grid: Grid, values: Any) -> OccupancyGrid:
         values = np.zeros(grid.shape, np.int8) if values is None else values
-        frame = self._placer.map_frame or self.parameters.node.map_frame
+        # tf2 refuses the leading slash that ROS 1 had
+        frame = (self._placer.map_frame or self.parameters.node.map_frame).lstrip('/')
         return grid_message(grid, values, frame, self.get_clock().now().to_msg())
 
     def _publish(self, name: str, grid: Grid, values: Any) -> None:
@@ -154,8 +156,13 @@ class MapperNode(Node):
         """Bring the live map up to date; readings are added in batches, which costs a hundredth of one by one."""
         count = len(self._placer.buffer)
         if count > self._live_count:
-            self._live.add(self._placer.buffer.snapshot(self._live_count))
+            new = self._placer.buffer.snapshot(self._live_count)
             self._live_count = count
+            try:
+                self._live.add(new)
+            except MapperError as error:
+                # a timer that raises would end the node
+                self.get_logger().error(f'{len(new)} readings are not in the live map: {error}')
 
     def _publish_live(self) -> None:
         self._update_live()
@@ -261,7 +268,10 @@ class MapperNode(Node):
     def _save(self, reply: Reply, live: tuple[Grid, NDArray[np.float32]]) -> None:
         try:
             maps = self._maps_to_save()
-            reply.send(True, self._write(maps.with_live(*live), len(maps.readings)))
+            # one after the other, so that each finds a name of its own
+            with self._saving:
+                told = self._write(maps.with_live(*live), len(maps.readings))
+            reply.send(True, told)
         except MapperError as error:
             reply.send(False, str(error))
         except Exception as error:
@@ -273,7 +283,8 @@ class MapperNode(Node):
         run = self._em.current
         if self._maps is None and run is not None:
             run.finished.wait()
-        if self._maps is None:
+        maps = self._maps
+        if maps is None:
             ended = threading.Event()
             outcomes: list[Outcome] = []
 
@@ -287,7 +298,7 @@ class MapperNode(Node):
             if outcomes[0].maps is None:
                 raise MapperError(f'there is no map to save: {outcomes[0].message}')
             return outcomes[0].maps
-        return self._maps
+        return maps
 
     def _write(self, maps: MapSet, explained: int) -> str:
         placer = self._placer

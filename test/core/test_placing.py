@@ -224,11 +224,20 @@ def test_bad_odometry_is_counted() -> None:
 
 def test_an_absurd_pose_is_refused() -> None:
     p = placer()
-    for second, x in ((0.0, 0.0), (0.1, 1e9), (0.2, 0.0)):
+    for second, x in ((0.0, 0.0), (0.1, 1e6), (0.2, 1e9), (0.3, 0.0)):
         p.add_odometry(odometry(second, x))
         p.add_range(sonar(second))
-    assert p.rejected == {'too_far_away': 1}
+    # half way back from 1e6 m the pose is as absurd
+    assert p.rejected == {'too_far_away': 2}
+    assert p.odometry_rejected == {'bad_pose': 1}
     assert len(p.buffer) == 2
+
+
+def test_a_long_max_range_does_not_matter_where_echoes_are_near() -> None:
+    p = placer(max_cells=10_000)
+    p.add_odometry(odometry(0.0))
+    p.add_range(sonar(0.0, max_range=3e38))
+    assert len(p.buffer) == 1
 
 
 def test_odometry_kept_is_bounded_unless_patient() -> None:
