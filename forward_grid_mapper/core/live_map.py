@@ -61,6 +61,11 @@ def _add(table: ConeTable, gains: Any, log_odds: Any, nearest: bool) -> None:
             flat[cells[k]] = step if math.isnan(known) else known + step
 
 
+def arc_depth(parameters: Parameters) -> float:
+    """Return half the depth of the arc that an echo marks, in metres: the parameter's, or half a cell."""
+    return max(parameters.live.live_depth, parameters.grid.resolution / 2)
+
+
 class LiveMap:
     """The log-odds of every cell, NaN where not observed, on a grid that grows as readings come; 8 bytes a cell."""
 
@@ -86,7 +91,7 @@ class LiveMap:
         if not len(readings):
             return
         p = self._parameters
-        depth = max(p.live.live_depth, p.grid.resolution / 2)
+        depth = arc_depth(p)
         self.grid = grid_of(readings, p.model, p.grid, within=self.grid, beyond=depth)
         self._grow()
         table = cone_table(readings, self._stored, p.model)

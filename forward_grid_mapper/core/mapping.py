@@ -14,7 +14,7 @@ from .cone_index import ConeIndex, build_cone_index, check, effective_sigma, gri
 from .forward_model import causes_of, expectations
 from .grid import Grid
 from .learning import learn
-from .live_map import LiveMap
+from .live_map import LiveMap, arc_depth
 from .maps import UNKNOWN, MapSet
 from .parameters import Parameters
 from .readings import Readings
@@ -97,7 +97,8 @@ class Mapper:
 
     def _find(self, readings: Readings, parameters: Parameters, watch: Watch) -> tuple[Grid, ConeIndex, SearchResult]:
         model = parameters.model
-        grid = grid_of(readings, model, parameters.grid)
+        # that of the live map, so that all three maps are of one shape
+        grid = grid_of(readings, model, parameters.grid, beyond=arc_depth(parameters))
         with self._stage('index', watch):
             index = build_cone_index(readings, grid, model, self._stop)
         with self._stage('search', watch):
