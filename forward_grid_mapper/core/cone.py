@@ -32,19 +32,20 @@ class Cone(NamedTuple):
 
 
 @kernel
-def make_cone(x: float, y: float, yaw: float, half_angle: float, reach: float) -> Cone:
-    """Return the sector of a reading; `half_angle` in (0, π/2)."""
-    right_x, right_y = math.cos(yaw - half_angle), math.sin(yaw - half_angle)
-    left_x, left_y = math.cos(yaw + half_angle), math.sin(yaw + half_angle)
-    cos_half = math.cos(half_angle)
-    top = 1.0 if math.sin(yaw) >= cos_half else max(0.0, right_y, left_y)
-    bottom = -1.0 if -math.sin(yaw) >= cos_half else min(0.0, right_y, left_y)
+def make_cone(x: float, y: float, axis: tuple[float, float], half: tuple[float, float], reach: float) -> Cone:
+    """Return the sector of a reading; `axis` is a unit vector, `half` sine and cosine of the half angle in (0, π/2)."""
+    axis_x, axis_y = axis
+    sine, cosine = half
+    right_x, right_y = axis_x * cosine + axis_y * sine, axis_y * cosine - axis_x * sine
+    left_x, left_y = axis_x * cosine - axis_y * sine, axis_y * cosine + axis_x * sine
+    top = 1.0 if axis_y >= cosine else max(0.0, right_y, left_y)
+    bottom = -1.0 if -axis_y >= cosine else min(0.0, right_y, left_y)
     return Cone(
         x,
         y,
         reach,
-        math.cos(yaw),
-        math.sin(yaw),
+        axis_x,
+        axis_y,
         right_x,
         right_y,
         left_x,
@@ -94,6 +95,42 @@ def axis_run(cone: Cone, row: int) -> tuple[int, int]:
         return 0, -1
     a, b = cone.x + begin * cone.axis_x, cone.x + end * cone.axis_x
     return int(math.floor(min(a, b))), int(math.floor(max(a, b)))
+
+
+@kernel
+def within(x: float, v: float, radius: float, nearest: bool) -> tuple[int, int]:
+    """Return the first and last column of a row whose cells are at most `radius` away; last < first if none is.
+
+    `x` is the apex, `v` the row's height above it; the distance is that of `distance`.
+    """
+    v = max(abs(v) - 0.5, 0.0) if nearest else v
+    chord = radius * radius - v * v
+    if radius < 0.0 or chord < 0.0:
+        return 0, -1
+    half = math.sqrt(chord) + (0.5 if nearest else 0.0)
+    return int(math.ceil(x - half - 0.5)), int(math.floor(x + half - 0.5))
+
+
+@kernel
+def row_runs(cone: Cone, row: int, radius: float, width: int, nearest: bool) -> tuple[int, int, int, int]:
+    """Return the cells of the cone in a row, at most `radius` away and on the grid, as two runs: first, last, twice.
+
+    The first run is left of the second. A run is empty where its last column is before its first; one run is the rule.
+    """
+    first, last = within(cone.x, row + 0.5 - cone.y, radius, nearest)
+    first, last = max(first, 0), min(last, width - 1)
+    a, b = wedge_run(cone, row)
+    c, d = axis_run(cone, row)
+    a, b, c, d = max(a, first), min(b, last), max(c, first), min(d, last)
+    if b < a:
+        return c, d, 0, -1
+    if d < c:
+        return a, b, 0, -1
+    if c <= b + 1 and a <= d + 1:
+        return min(a, c), max(b, d), 0, -1
+    if a < c:
+        return a, b, c, d
+    return c, d, a, b
 
 
 @kernel

@@ -1,4 +1,4 @@
-"""Flips of single cells in O(1) a reading: the M-step with an exact mini E-step in both directions.
+"""Flips of single cells: the M-step with an exact mini E-step in both directions, and what every cell would gain by it.
 
 Write p(z_t | m) = c + T, where c gathers the causes that no map changes and T the obstacles and max range. For a cell
 at distance d, let A be the share of T from occupied cells before it, W = share · (1 − p_hit)^(occupied cells before it)
@@ -7,238 +7,360 @@ and g = N(z; d, σ). Then flipping the cell makes of T
     occupy   T' = A + W p_hit g + (T − A) (1 − p_hit)
     free     T' = A + (T − A − W p_hit g) / (1 − p_hit)
 
-and multiplies p(z_t | m) by (c + T') / (c + T) (ALGORITHM §5; eq 37-40 of the paper with its constants mended). These
-ratios are kept: one for each band slot, in the order by cell, and two for each reading, which serve all cells of its
-free zone (g = 0, A = 0). The gain of a flip is then the log of a product read front to back, and only an accepted flip
-recomputes the ratios of the readings that see the cell.
+and multiplies p(z_t | m) by (c + T') / (c + T) (ALGORITHM §5; eq 37-40 of the paper with its constants mended). The log
+of this ratio is the same for all free cells of the free zone (A = 0, g = 0), and for the free cells between two
+occupied ones of the band it is that of a straight line in g.
+
+The sum of these logs over the readings of a cell is its evidence: what flipping it gains. It is kept for every cell at
+once. A flip recomputes the readings that see the cell and pushes the differences to their cells, so that to know what
+any other flip gains takes nothing but a look.
 """
 
 from __future__ import annotations
 
-import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .cone_index import ConeIndex, Floats
-from .forward_model import Causes
+from .cone import row_runs, within
+from .cones import Cones, cone_of
 from .jit import kernel
+from .logs import QUANTUM, Ratios, quantise_logs
+from .pairs import WORDS_PER_RUN, Bench, Lattice, Pairs, make
+from .tiles import CHUNK, SHIFT, Tiles
 
-NEIGHBOURS = 8
+EDGE = 1e-6
+"""Cells; nearer to a cone's edge than this, it takes the cone's own arithmetic to tell which side a cell is on."""
+
+LEAST_RATIO = 1e-30
+"""What rounding must leave of a likelihood ratio."""
+
+SHARE = np.dtype(
+    [
+        ('floor', np.float64),
+        ('no_echo', np.float64),
+        ('through', np.float64),
+        ('at', np.int64),
+        ('changed', np.int64),
+        ('stored', np.int32),
+        ('runs', np.int32),
+        ('bands', np.int32),
+        ('blocking', np.int32),
+        ('weight', np.int32),
+        ('occupy', np.int32),
+        ('release', np.int32),
+        ('likelihood', np.int32),
+    ],
+    align=True,
+)
+"""What is kept for a reading beside its cone.
+
+floor, no_echo
+    The densities p_rand / z_max + p_lost · N(z; z_max, σ) and N(z; z_max, σ) in 1/m, which no map changes.
+blocking, through
+    Occupied cells in the free zone, and the share of the reading that they leave to the band,
+    (1 − p_rand − p_lost) (1 − p_hit)^blocking.
+stored, at, runs, bands
+    Whether its pairs are stored, where in `Pairs`, and how many runs and band pairs there are.
+weight
+    How many equal readings this one stands for.
+occupy, release
+    Log of the likelihood ratio of occupying, or freeing, a cell of the free zone, in units of `logs.QUANTUM`.
+likelihood
+    log p(z | m), in the same units.
+changed
+    The clock when it was last recomputed.
+"""
 
 
-class FlipState(NamedTuple):
-    """The map under search and what is kept for each reading.
+class Model(NamedTuple):
+    """p_hit, and the share of readings that the map explains, 1 − p_rand − p_lost."""
+
+    p_hit: float
+    share: float
+
+
+class Maps(NamedTuple):
+    """What is kept for every cell.
 
     Attributes
     ----------
-    occupied : uint8, shape (cells,)
-    blocking : int32, shape (N,)
-        Occupied cells in each reading's free zone.
-    band_ratio : float32, shape (band pairs,)
-        Likelihood ratio of flipping the slot's cell.
-    occupy_ratio, free_ratio : float32, shape (N,)
-        Likelihood ratio of occupying, or freeing, one cell of the free zone.
-    changed : uint8, shape (N,)
-        Readings whose ratios changed since the last call of `mark_cells`.
-    dirty : uint8, shape (cells,)
-        Cells whose gain may have changed since it was last computed.
-    settled : uint8, shape (cells,)
-        Cells that no move helps, as long as none of their readings changes.
-    gain : float64, shape (cells,)
-        The last computed gain of flipping each cell, prior included, nats.
+    occupied : uint8
+        The map.
+    evidence : int64
+        Log-likelihood gain of flipping the cell, in units of `logs.QUANTUM`.
+    seen : int32
+        Number of readings that see the cell.
+    """
+
+    occupied: NDArray[np.uint8]
+    evidence: NDArray[np.int64]
+    seen: NDArray[np.int32]
+
+
+class State(NamedTuple):
+    """All that the kernels work on.
+
+    Attributes
+    ----------
+    cones, shares : records of `CONE` and `SHARE`, shape (N,)
+    seers : int32, shape (N, 2)
+        The readings that see the cell at hand, and 1 if it is in their free zone.
+    clock : int64, shape (1,)
+        Counts flips.
     stop : uint8, shape (1,)
         Set to 1 from any thread to cancel.
     """
 
-    occupied: NDArray[np.uint8]
-    blocking: NDArray[np.int32]
-    band_ratio: NDArray[np.float32]
-    occupy_ratio: NDArray[np.float32]
-    free_ratio: NDArray[np.float32]
-    changed: NDArray[np.uint8]
-    dirty: NDArray[np.uint8]
-    settled: NDArray[np.uint8]
-    gain: Floats
+    lattice: Lattice
+    model: Model
+    cones: Cones
+    shares: NDArray[np.void]
+    pairs: Pairs
+    tiles: Tiles
+    maps: Maps
+    bench: Bench
+    ratios: Ratios
+    seers: NDArray[np.int32]
+    clock: NDArray[np.int64]
     stop: NDArray[np.uint8]
 
 
 @kernel
-def _refresh(index: ConeIndex, causes: Causes, state: FlipState, t: int) -> None:
-    """Recompute the ratios of reading t from the map."""
-    p, q = causes.p_hit, 1.0 - causes.p_hit
-    first, last = index.band_start[t], index.band_start[t + 1]
-    begin = causes.share * q ** state.blocking[t]
-    weight, total = begin, 0.0
-    for k in range(first, last):
-        if state.occupied[index.band_cell[k]]:
-            total += weight * p * index.band_density[k]
+def explain(model: Model, share: Any, occupied: Any, pairs: Pairs, at: int, ratios: Ratios, out: Any) -> None:
+    """Compute the log ratios of a reading from the map into `out`, in the order of its band.
+
+    Those of occupying and freeing a cell of the free zone, and the log-likelihood of the reading, come after them.
+
+    Parameters
+    ----------
+    share : record of SHARE
+        Of which `through` must be right.
+    pairs, at
+        Where its pairs begin.
+    """
+    # unsigned, so that an index need not be asked whether it counts from the end
+    one, m = np.uint64(1), np.uint64(share.bands)
+    cell = np.uint64(at + WORDS_PER_RUN * share.runs)
+    density = cell + m
+    p, q = model.p_hit, 1.0 - model.p_hit
+    floor, ratio = share.floor, ratios.ratio
+    weight, total = share.through, 0.0
+    obstacles = np.uint64(0)
+    for k in range(m):
+        if occupied[pairs.cell[cell + k]]:
+            # the places of obstacles, which are needed until their logs are written here
+            out[obstacles] = k
+            obstacles += one
+            total += weight * p * pairs.density[density + k]
             weight *= q
-    total += weight * causes.no_echo[t]
-    floor = causes.random[t] + causes.lost[t]
+    total += weight * share.no_echo
     scale = 1.0 / (floor + total)
-    before, weight = 0.0, begin
-    for k in range(first, last):
-        term = weight * p * index.band_density[k]
-        if state.occupied[index.band_cell[k]]:
-            flipped = before + max(total - before - term, 0.0) / q
+    before, weight = 0.0, share.through
+    begin = np.uint64(0)
+    for i in range(obstacles + one):
+        end = np.uint64(out[i]) if i < obstacles else m
+        base = np.float32(max((floor + before + max(total - before, 0.0) * q) * scale, LEAST_RATIO))
+        slope = np.float32(weight * p * scale)
+        for k in range(begin, end):
+            ratio[k] = base + slope * pairs.density[density + k]
+        if i < obstacles:
+            term = weight * p * pairs.density[density + end]
+            ratio[end] = max((floor + before + max(total - before - term, 0.0) / q) * scale, LEAST_RATIO)
             before += term
             weight *= q
-        else:
-            flipped = before + term + max(total - before, 0.0) * q
-        state.band_ratio[index.band_slot[k]] = (floor + flipped) * scale
-    state.occupy_ratio[t] = (floor + total * q) * scale
-    state.free_ratio[t] = (floor + total / q) * scale
+            begin = end + one
+    ratio[m] = (floor + total * q) * scale
+    ratio[m + one] = (floor + total / q) * scale
+    ratio[m + one + one] = floor + total
+    quantise_logs(ratios, share.bands + 3, out)
 
 
 @kernel
-def refresh_all(index: ConeIndex, causes: Causes, state: FlipState) -> None:
-    """Bring every reading's ratios in line with the map; all cells become dirty."""
-    for t in range(len(state.blocking)):
-        state.blocking[t] = 0
-        for k in range(index.free_start[t], index.free_start[t + 1]):
-            state.blocking[t] += state.occupied[index.free_cell[k]]
-        _refresh(index, causes, state, t)
-    state.changed[:] = 0
-    state.dirty[:] = 1
-    state.settled[:] = 0
+def _push_free(share: Any, pairs: Pairs, at: int, maps: Maps, steps: tuple[int, int]) -> None:
+    """Add steps[0] to the evidence of the free cells of the free zone, steps[1] to that of the occupied."""
+    for k in range(np.uint64(at), np.uint64(at + WORDS_PER_RUN * share.runs), np.uint64(WORDS_PER_RUN)):
+        for c in range(np.uint64(pairs.cell[k]), np.uint64(pairs.cell[k + np.uint64(1)]) + np.uint64(1)):
+            maps.evidence[c] += steps[1] if maps.occupied[c] else steps[0]
 
 
 @kernel
-def evidence(index: ConeIndex, state: FlipState, c: int) -> float:
-    """Return log p(Z | m with cell c flipped) − log p(Z | m) in nats."""
-    total = 0.0
-    product = 1.0
-    since = 0
-    for slot in range(index.slot_start[c], index.slot_start[c + 1]):
-        product *= state.band_ratio[slot]
-        since += 1
-        # sixteen ratios stay far inside the range of float64, and save fifteen logs
-        if since == 16:
-            total += math.log(product)
-            product = 1.0
-            since = 0
-    ratio = state.free_ratio if state.occupied[c] else state.occupy_ratio
-    for k in range(index.seen_start[c], index.seen_start[c + 1]):
-        product *= ratio[index.seen_reading[k]]
-        since += 1
-        if since == 16:
-            total += math.log(product)
-            product = 1.0
-            since = 0
-    return total + math.log(product)
+def _note(share: Any, new: Any) -> None:
+    """Keep what `explain` left after the band."""
+    m = share.bands
+    share.occupy, share.release, share.likelihood = new[m], new[m + 1], new[m + 2]
 
 
 @kernel
-def _gain(index: ConeIndex, state: FlipState, prior: float, c: int) -> float:
-    return evidence(index, state, c) + (-prior if state.occupied[c] else prior)
+def _enter(model: Model, share: Any, maps: Maps, pairs: Pairs, at: int, room: tuple[Ratios, Any]) -> None:
+    """Explain a reading, and add all that it says to the evidence."""
+    ratios, new = room
+    blocking = 0
+    for k in range(np.uint64(at), np.uint64(at + WORDS_PER_RUN * share.runs), np.uint64(WORDS_PER_RUN)):
+        for c in range(np.uint64(pairs.cell[k]), np.uint64(pairs.cell[k + np.uint64(1)]) + np.uint64(1)):
+            blocking += maps.occupied[c]
+    share.blocking = blocking
+    share.through = model.share * (1.0 - model.p_hit) ** blocking
+    explain(model, share, maps.occupied, pairs, at, ratios, new)
+    _note(share, new)
+    weight = share.weight
+    _push_free(share, pairs, at, maps, (weight * share.occupy, weight * share.release))
+    cell = np.uint64(at + WORDS_PER_RUN * share.runs)
+    log = cell + np.uint64(2 * share.bands)
+    for k in range(np.uint64(share.bands)):
+        maps.evidence[pairs.cell[cell + k]] += weight * new[k]
+        pairs.log[log + k] = new[k]
 
 
 @kernel
-def flip(index: ConeIndex, causes: Causes, state: FlipState, c: int) -> None:
-    """Flip cell c and bring the readings that see it up to date."""
-    state.occupied[c] ^= 1
-    step = 1 if state.occupied[c] else -1
-    for k in range(index.seen_start[c], index.seen_start[c + 1]):
-        t = index.seen_reading[k]
-        state.blocking[t] += step
-        _refresh(index, causes, state, t)
-    for slot in range(index.slot_start[c], index.slot_start[c + 1]):
-        _refresh(index, causes, state, index.slot_reading[slot])
+def _see(share: Any, pairs: Pairs, at: int, seen: Any) -> None:
+    """Count the reading in all of its cells."""
+    for k in range(at, at + WORDS_PER_RUN * share.runs, WORDS_PER_RUN):
+        for c in range(np.uint64(pairs.cell[k]), np.uint64(pairs.cell[k + 1]) + np.uint64(1)):
+            seen[c] += 1
+    cell = at + WORDS_PER_RUN * share.runs
+    for k in range(cell, cell + share.bands):
+        seen[pairs.cell[k]] += 1
 
 
 @kernel
-def mark_readings(index: ConeIndex, state: FlipState, c: int) -> None:
-    """Note that the readings that see cell c changed."""
-    for k in range(index.seen_start[c], index.seen_start[c + 1]):
-        state.changed[index.seen_reading[k]] = 1
-    for slot in range(index.slot_start[c], index.slot_start[c + 1]):
-        state.changed[index.slot_reading[slot]] = 1
+def enter_all(s: State, begin: int, end: int, new: bool) -> None:
+    """Explain the readings `begin` to `end` by the map, and add all that they say to the evidence.
 
-
-@kernel
-def mark_cells(index: ConeIndex, state: FlipState) -> None:
-    """Make all cells of the readings that changed dirty, and no longer settled."""
-    for t in range(len(state.changed)):
-        if state.changed[t]:
-            state.changed[t] = 0
-            for k in range(index.free_start[t], index.free_start[t + 1]):
-                state.dirty[index.free_cell[k]] = 1
-                state.settled[index.free_cell[k]] = 0
-            for k in range(index.band_start[t], index.band_start[t + 1]):
-                state.dirty[index.band_cell[k]] = 1
-                state.settled[index.band_cell[k]] = 0
-
-
-@kernel
-def compute_gains(index: ConeIndex, state: FlipState, prior: float) -> None:
-    """Compute the gain of every dirty cell; untouched cells have none and stay as they are."""
-    for c in range(len(state.dirty)):
-        if state.dirty[c]:
-            state.dirty[c] = 0
-            seen = index.seen_start[c + 1] - index.seen_start[c] + index.slot_start[c + 1] - index.slot_start[c]
-            state.gain[c] = _gain(index, state, prior, c) if seen else -math.inf
-
-
-@kernel
-def flip_in_order(
-    index: ConeIndex, causes: Causes, state: FlipState, prior: float, least: Floats, cells: NDArray[np.int64]
-) -> tuple[int, float]:
-    """Flip those of `cells`, in order, that gain more than their `least`; return their number and total gain."""
-    flips, total = 0, 0.0
-    for c in cells:
-        if state.stop[0]:
-            break
-        gain = _gain(index, state, prior, c)
-        if gain > least[c]:
-            flip(index, causes, state, c)
-            mark_readings(index, state, c)
-            flips += 1
-            total += gain
-    return flips, total
-
-
-@kernel
-def shift_in_order(
-    index: ConeIndex,
-    causes: Causes,
-    state: FlipState,
-    prior: float,
-    least: Floats,
-    cells: NDArray[np.int64],
-    width: int,
-) -> tuple[int, float]:
-    """Move occupied cells to the free neighbour that gains most; return the number of moves and their total gain.
-
-    The two flips of a move are evaluated together: the cell is freed, its neighbours are asked, and it is occupied
-    again when none of them gains more than `least`.
+    New readings are counted in `seen`, and their pairs are made first.
     """
-    moves, total = 0, 0.0
-    height = len(state.occupied) // width
-    for c in cells:
-        if state.stop[0]:
+    room = (s.ratios, s.bench.new)
+    for t in range(begin, end):
+        if s.stop[0]:
             break
-        if not state.occupied[c]:
-            continue
-        loss = _gain(index, state, prior, c)
-        flip(index, causes, state, c)
-        row, column = c // width, c % width
-        best, target = -loss, c
-        for dy in range(-1, 2):
-            for dx in range(-1, 2):
-                if 0 <= row + dy < height and 0 <= column + dx < width:
-                    other = c + dy * width + dx
-                    if other != c and not state.occupied[other]:
-                        gain = _gain(index, state, prior, other)
-                        if gain > best + (least[c] + least[other] if target == c else 0.0):
-                            best, target = gain, other
-        flip(index, causes, state, target)
-        if target == c:
-            state.settled[c] = 1
+        share = s.shares[t]
+        pairs, at = (s.pairs, share.at) if share.stored else (s.bench.pairs, 0)
+        if new or not share.stored:
+            make(s.cones, s.lattice, t, pairs, at, (share.runs, share.bands), s.bench)
+        if new:
+            _see(share, pairs, at, s.maps.seen)
+        _enter(s.model, share, s.maps, pairs, at, room)
+        share.changed = s.clock[0]
+
+
+@kernel
+def weigh(s: State, readings: Any) -> None:
+    """Let each of `readings` stand for one more that says the same."""
+    maps, bench = s.maps, s.bench
+    for t in readings:
+        share = s.shares[t]
+        share.weight += 1
+        share.changed = s.clock[0]
+        pairs, at = (s.pairs, share.at) if share.stored else (bench.pairs, 0)
+        if not share.stored:
+            make(s.cones, s.lattice, t, bench.pairs, 0, (share.runs, share.bands), bench)
+        explain(s.model, share, maps.occupied, pairs, at, s.ratios, bench.new)
+        _push_free(share, pairs, at, maps, (share.occupy, share.release))
+        cell = np.uint64(at + WORDS_PER_RUN * share.runs)
+        for k in range(np.uint64(share.bands)):
+            maps.evidence[pairs.cell[cell + k]] += bench.new[k]
+        _see(share, pairs, at, maps.seen)
+
+
+@kernel
+def _zone(reading: Any, lattice: Lattice, row: int, column: int) -> int:
+    """Return 2 if a cell is in the free zone of a cone, 1 if in its band, 0 if in neither."""
+    du, dv = column + 0.5 - reading.x, row + 0.5 - reading.y
+    along = du * reading.axis_x + dv * reading.axis_y
+    across = abs(dv * reading.axis_x - du * reading.axis_y)
+    outside = across * reading.cosine - along * reading.sine
+    if (outside > EDGE and across > 0.7072) or along > reading.reach + 1.5:
+        return 0
+    away = du * du + dv * dv
+    if not lattice.nearest and outside < -EDGE:
+        if away > (reading.reach + EDGE) ** 2:
+            return 0
+        if reading.free > EDGE and away < (reading.free - EDGE) ** 2:
+            return 2
+        if away < (reading.reach - EDGE) ** 2 and (reading.free < 0.0 or away > (reading.free + EDGE) ** 2):
+            return 1
+    # a cell at an edge, or one that only the axis crosses
+    cone = cone_of(reading, lattice.nearest)
+    a, b, c, d = row_runs(cone, row, reading.reach, lattice.width, lattice.nearest)
+    if not cone.bottom <= row <= cone.top or not (a <= column <= b or c <= column <= d):
+        return 0
+    first, last = within(cone.x, dv, reading.free, lattice.nearest)
+    return 2 if first <= column <= last else 1
+
+
+@kernel
+def find_seers(s: State, c: int) -> int:
+    """List the readings that see cell c in `seers`; return their number."""
+    row, column = c // s.lattice.width, c % s.lattice.width
+    tile = (row >> SHIFT) * s.tiles.across + (column >> SHIFT)
+    chunk, end = s.tiles.head[tile], s.tiles.fill[tile]
+    n = 0
+    while chunk >= 0:
+        for k in range(end):
+            t = s.tiles.chunks[chunk, k]
+            zone = _zone(s.cones[t], s.lattice, row, column)
+            if zone:
+                s.seers[n, 0] = t
+                s.seers[n, 1] = zone - 1
+                n += 1
+        chunk, end = s.tiles.chunks[chunk, CHUNK], CHUNK
+    return n
+
+
+@kernel
+def _renew(model: Model, share: Any, maps: Maps, pairs: Pairs, at: int, room: tuple[Ratios, Any]) -> None:
+    """Explain a reading anew, and push what changed to the evidence."""
+    ratios, new = room
+    explain(model, share, maps.occupied, pairs, at, ratios, new)
+    m, weight = share.bands, share.weight
+    cell = np.uint64(at + WORDS_PER_RUN * share.runs)
+    log = cell + np.uint64(2 * m)
+    for k in range(np.uint64(m)):
+        maps.evidence[pairs.cell[cell + k]] += weight * (new[k] - pairs.log[log + k])
+        pairs.log[log + k] = new[k]
+    _push_free(share, pairs, at, maps, (weight * (new[m] - share.occupy), weight * (new[m + 1] - share.release)))
+    _note(share, new)
+
+
+@kernel
+def flip(s: State, c: int) -> None:
+    """Flip cell c and bring the evidence of all cells up to date."""
+    n = find_seers(s, c)
+    maps, bench = s.maps, s.bench
+    own = 0
+    for i in range(n):
+        if s.seers[i, 1]:
+            share = s.shares[s.seers[i, 0]]
+            own += share.weight * (share.release - share.occupy)
+    # where the cell is in the free zone, its own share is that of an occupied cell from now on, or of a free one
+    maps.evidence[c] += -own if maps.occupied[c] else own
+    maps.occupied[c] ^= 1
+    step = 1 if maps.occupied[c] else -1
+    s.clock[0] += 1
+    room = (s.ratios, bench.new)
+    for i in range(n):
+        t = s.seers[i, 0]
+        share = s.shares[t]
+        if not share.stored:
+            make(s.cones, s.lattice, t, bench.pairs, 0, (share.runs, share.bands), bench)
+            maps.occupied[c] ^= 1
+            explain(s.model, share, maps.occupied, bench.pairs, 0, s.ratios, bench.new)
+            maps.occupied[c] ^= 1
+            log = WORDS_PER_RUN * share.runs + 2 * share.bands
+            for k in range(share.bands):
+                bench.pairs.log[log + k] = bench.new[k]
+        if s.seers[i, 1]:
+            share.blocking += step
+            share.through = s.model.share * (1.0 - s.model.p_hit) ** share.blocking
+        if share.stored:
+            _renew(s.model, share, maps, s.pairs, share.at, room)
         else:
-            mark_readings(index, state, c)
-            mark_readings(index, state, target)
-            moves += 1
-            total += loss + best
-    return moves, total
+            _renew(s.model, share, maps, bench.pairs, 0, room)
+        share.changed = s.clock[0]
+
+
+@kernel
+def gain_of(s: State, prior: float, c: int) -> float:
+    """Return what flipping cell c gains, prior included, in nats."""
+    return float(s.maps.evidence[c] * QUANTUM + (-prior if s.maps.occupied[c] else prior))

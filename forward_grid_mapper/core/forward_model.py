@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from .cone_index import ConeTable, Floats, cone_table, walk_with_room
+from .cones import Cones, Floats, cone_table, walk_with_room
 from .grid import Grid
 from .jit import kernel
 from .parameters import ModelParameters
@@ -76,13 +76,13 @@ def causes_of(readings: Readings, sigma: Floats, model: ModelParameters) -> Caus
 
 @kernel
 def _expect(
-    table: ConeTable, causes: Causes, occupied: Any, nearest: bool, cut: float, resolution: float, out: Any
+    table: Cones, causes: Causes, occupied: Any, nearest: bool, cut: float, resolution: float, out: Any
 ) -> None:
     """Fill `out` (8, N) with the rows of `Expectations`, in its order."""
     height, width = occupied.shape
     flat = occupied.ravel()
     cells, distances = np.empty(1024, np.int32), np.empty(1024, np.float64)
-    for t in range(len(table.x)):
+    for t in range(len(table)):
         n, cells, distances = walk_with_room(table, t, (height, width), nearest, cells, distances)
         m = 0
         for k in range(n):
@@ -90,11 +90,11 @@ def _expect(
                 distances[m] = distances[k]
                 m += 1
         hits = np.sort(distances[:m])
-        sigma = table.sigma[t]
+        sigma = table[t].sigma
         weight = causes.share
         hit, rank, squared = 0.0, 0.0, 0.0
         for k in range(m):
-            error = (table.z[t] - hits[k]) / sigma
+            error = (table[t].z - hits[k]) / sigma
             if abs(error) <= cut:
                 term = weight * causes.p_hit * math.exp(-0.5 * error * error)
                 term /= math.sqrt(2.0 * math.pi) * sigma * resolution
@@ -125,7 +125,7 @@ def expectations(readings: Readings, grid: Grid, occupied: NDArray[Any], model: 
     model : ModelParameters
     """
     table = cone_table(readings, grid, model)
-    causes = causes_of(readings, table.sigma * grid.resolution, model)
+    causes = causes_of(readings, table['sigma'] * grid.resolution, model)
     out = np.empty((8, len(readings)))
     filled = np.ascontiguousarray(np.asarray(occupied) == 1).view(np.uint8)
     _expect(table, causes, filled, model.cell_distance == 'nearest', model.cut, grid.resolution, out)

@@ -1,8 +1,9 @@
 """The standard log-odds map (eq 1-4 of the paper), updated reading by reading.
 
 Inverse sensor model. Let φ be a cell's angle off the axis, β the half angle and d its distance. A reading adds to the
-cells of its cone, weighted by 1 − (φ / β)² so that the edge of the cone says little (Moravec and Elfes 1985); β is
-taken as large enough for the cone to be one and a half cells wide there, since a thin beam fills the cells it crosses:
+cells of its cone, weighted by 1 − (sin φ / sin β)² so that the edge of the cone says little (after Moravec and Elfes
+1985, who have the angles themselves); β is taken as large enough for the cone to be one and a half cells wide there,
+since a thin beam fills the cells it crosses:
 
     d < z − depth                  logit(live_p_free), or logit(live_p_free_no_echo) for a reading without echo
     z − depth ≤ d ≤ z + depth      logit(live_p_occupied); nothing for a reading without echo
@@ -19,7 +20,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .cone_index import ConeTable, Floats, cone_table, grid_of, walk_with_room
+from .cone import row_runs, within
+from .cones import Cones, Floats, cone_of, cone_table, grid_of
 from .grid import Grid
 from .jit import kernel
 from .parameters import Parameters
@@ -34,31 +36,58 @@ MARGIN = 64
 
 
 @kernel
-def _add(table: ConeTable, gains: Any, log_odds: Any, nearest: bool) -> None:
+def _add_run(
+    row: Any, first: int, last: int, offset: tuple[float, float], beam: tuple[float, float, float], gain: float
+) -> None:
+    """Add the increments of a run of cells in one row.
+
+    Parameters
+    ----------
+    row : float64
+        Log-odds.
+    offset
+        From the sensor to the centre of column 0 of the row, cells.
+    beam
+        Unit vector of the axis, squared sine of the half angle.
+    """
+    if first > last:
+        return
+    u, v = offset
+    axis_x, axis_y, sine2 = beam
+    scale = gain / QUANTUM
+    for column in range(np.uint64(first), np.uint64(last + 1)):
+        du = u + column
+        across = axis_x * v - axis_y * du
+        width2 = max(sine2 * (du * du + v * v), HALF_WIDTH * HALF_WIDTH)
+        step = math.floor(max(1.0 - across * across / width2, 0.0) * scale + 0.5) * QUANTUM
+        known = row[column]
+        row[column] = (0.0 if math.isnan(known) else known) + step
+
+
+@kernel
+def _add(cones: Cones, gains: Any, log_odds: Any, nearest: bool) -> None:
     """Add every reading's increments; `gains` are those of occupied, free, and free without echo."""
     height, width = log_odds.shape
-    flat = log_odds.ravel()
-    cells, distances = np.empty(1024, np.int32), np.empty(1024, np.float64)
-    for t in range(len(table.x)):
-        n, cells, distances = walk_with_room(table, t, (height, width), nearest, cells, distances)
-        echo = table.z[t] < table.z_max[t]
+    for t in range(len(cones)):
+        reading = cones[t]
+        cone = cone_of(reading, nearest)
+        echo = reading.z < reading.z_max
         free = gains[1] if echo else gains[2]
-        cosine, sine = math.cos(table.yaw[t]), math.sin(table.yaw[t])
-        for k in range(n):
-            du = cells[k] % width + 0.5 - table.x[t]
-            dv = cells[k] // width + 0.5 - table.y[t]
-            half_angle = max(table.half_angle[t], HALF_WIDTH / max(distances[k], HALF_WIDTH))
-            angle = math.atan2(cosine * dv - sine * du, cosine * du + sine * dv) / half_angle
-            weight = max(1.0 - angle * angle, 0.0)
-            if distances[k] < table.free[t]:
-                gain = free
-            elif echo:
-                gain = gains[0]
-            else:
-                continue
-            step = math.floor(weight * gain / QUANTUM + 0.5) * QUANTUM
-            known = flat[cells[k]]
-            flat[cells[k]] = step if math.isnan(known) else known + step
+        beam = (reading.axis_x, reading.axis_y, reading.sine**2)
+        for y in range(max(cone.bottom, 0), min(cone.top, height - 1) + 1):
+            v = y + 0.5 - reading.y
+            a, b, c, d = row_runs(cone, y, reading.reach, width, nearest)
+            inner, outer = within(reading.x, v, reading.free, nearest)
+            if outer < inner:
+                inner, outer = width, width - 1
+            for first, last in ((a, b), (c, d)):
+                if first > last:
+                    continue
+                row, offset = log_odds[y], (0.5 - reading.x, v)
+                _add_run(row, max(first, inner), min(last, outer), offset, beam, free)
+                if echo:
+                    _add_run(row, first, min(last, inner - 1), offset, beam, gains[0])
+                    _add_run(row, max(first, outer + 1), last, offset, beam, gains[0])
 
 
 def arc_depth(parameters: Parameters) -> float:
@@ -96,7 +125,8 @@ class LiveMap:
         self._grow()
         table = cone_table(readings, self._stored, p.model)
         depth /= p.grid.resolution
-        table = table._replace(free=np.where(readings.echo, table.z - depth, table.z), reach=table.z + depth)
+        table['free'] = np.where(readings.echo, table['z'] - depth, table['z'])
+        table['reach'] = table['z'] + depth
         gains = tuple(
             math.log(q / (1 - q)) for q in (p.live.live_p_occupied, p.live.live_p_free, p.live.live_p_free_no_echo)
         )

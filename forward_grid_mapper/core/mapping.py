@@ -10,15 +10,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .cone_index import ConeIndex, build_cone_index, check, effective_sigma, grid_of
-from .forward_model import causes_of, expectations
+from .cones import check, grid_of
+from .evidence import Evidence
 from .grid import Grid
 from .learning import learn
 from .live_map import LiveMap, arc_depth
-from .maps import UNKNOWN, MapSet
+from .maps import UNKNOWN, MapSet, part_of
 from .parameters import Parameters
 from .readings import Readings
 from .search import Progress, Search, SearchResult
+from .threads import cores
 from .uncertainty import marginals
 
 Watch = Callable[[str, Progress | None], None]
@@ -43,7 +44,6 @@ class Mapper:
         """Prepare a run; `learn_rounds` > 0 alternates the search with updates of the model (`learning`)."""
         self._parameters, self._learn_rounds = parameters, learn_rounds
         self._search: Search | None = None
-        self._grid: Grid | None = None
         self._stop = np.zeros(1, np.uint8)
         self._seconds: dict[str, float] = {}
 
@@ -53,17 +53,15 @@ class Mapper:
 
     def so_far(self) -> tuple[Grid, NDArray[np.int8]] | None:
         """Return the grid and a copy of the ML map that the search has reached, or None before it; any thread."""
-        search, grid = self._search, self._grid
-        if search is None or grid is None:
-            return None
-        return grid, self._observed(search.index, search.state.occupied, grid)
+        search = self._search
+        return None if search is None else (search.evidence.grid, search.evidence.observed())
 
-    @staticmethod
-    def _observed(index: ConeIndex, occupied: NDArray[np.uint8], grid: Grid) -> NDArray[np.int8]:
-        seen = np.diff(index.seen_start) + np.diff(index.slot_start) > 0
-        return np.where(seen, occupied.astype(np.int8), np.int8(UNKNOWN)).reshape(grid.shape)
-
-    def run(self, readings: Readings, watch: Watch = lambda stage, progress: None) -> MapSet:
+    def run(
+        self,
+        readings: Readings,
+        watch: Watch = lambda stage, progress: None,
+        start: tuple[Grid, NDArray[np.int8]] | None = None,
+    ) -> MapSet:
         """Return the maps of `readings`.
 
         Parameters
@@ -71,6 +69,8 @@ class Mapper:
         readings : Readings
         watch : callable
             Called from this thread as the work goes on.
+        start : Grid and int8, optional
+            A map to start the search from, 1 where occupied; by default the empty one.
 
         Raises
         ------
@@ -82,60 +82,61 @@ class Mapper:
         self._seconds = {}
         readings = in_canonical_order(readings)
         parameters = self._parameters
-        grid, index, result = self._find(readings, parameters, watch)
+        evidence, result = self._find(readings, parameters, watch, start)
         for _ in range(self._learn_rounds):
             with self._stage('learning', watch):
-                model = learn(readings, grid, result.occupied.reshape(grid.shape), parameters.model)
-                parameters = dataclasses.replace(parameters, model=model)
-            grid, index, result = self._find(readings, parameters, watch)
+                ml = result.occupied.reshape(evidence.grid.shape)
+                parameters = dataclasses.replace(parameters, model=learn(readings, evidence.grid, ml, parameters.model))
+            evidence, result = self._find(readings, parameters, watch)
         with self._stage('live map', watch):
             live = LiveMap(parameters)
             live.add(readings)
-            live_map = live.probability(grid)
+            live_map = live.probability(evidence.grid)
         with self._stage('uncertainty', watch):
-            return self._collect(readings, grid, parameters, index, result, live_map)
+            return self._collect(readings, parameters, evidence, result, live_map)
 
-    def _find(self, readings: Readings, parameters: Parameters, watch: Watch) -> tuple[Grid, ConeIndex, SearchResult]:
-        model = parameters.model
-        # that of the live map, so that all three maps are of one shape
-        grid = grid_of(readings, model, parameters.grid, beyond=arc_depth(parameters))
-        with self._stage('index', watch):
-            index = build_cone_index(readings, grid, model, self._stop)
-        with self._stage('search', watch):
-            causes = causes_of(readings, effective_sigma(readings, model, grid.resolution), model)
-            self._search, self._grid = Search(index, causes, grid.width, parameters.search, self._stop), grid
-            return grid, index, self._search.run(lambda progress: watch('search', progress))
-
-    def _collect(
+    def _find(
         self,
         readings: Readings,
-        grid: Grid,
         parameters: Parameters,
-        index: ConeIndex,
-        result: SearchResult,
-        live_map: Any,
+        watch: Watch,
+        start: tuple[Grid, NDArray[np.int8]] | None = None,
+    ) -> tuple[Evidence, SearchResult]:
+        # the grid of the live map, so that all three maps are of one shape
+        grid = grid_of(readings, parameters.model, parameters.grid, beyond=arc_depth(parameters))
+        asked = parameters.search
+        with self._stage('index', watch):
+            memory, threads = asked.max_memory * 1e6, asked.threads or cores()
+            occupied = None if start is None else (part_of(*start, grid) == 1).astype(np.uint8)
+            evidence = Evidence(grid, parameters.model, memory, threads, self._stop, occupied)
+            evidence.extend(readings)
+        with self._stage('search', watch):
+            self._search = Search(evidence, asked)
+            return evidence, self._search.run(lambda progress: watch('search', progress))
+
+    def _collect(
+        self, readings: Readings, parameters: Parameters, evidence: Evidence, result: SearchResult, live_map: Any
     ) -> MapSet:
-        ml = self._observed(index, result.occupied, grid)
+        ml = evidence.observed()
         uncertainty = np.where(
-            ml != UNKNOWN, marginals(result.evidence, parameters.search).reshape(grid.shape), np.float32(np.nan)
+            ml != UNKNOWN, marginals(result.evidence, parameters.search).reshape(ml.shape), np.float32(np.nan)
         )
-        explained = expectations(readings, grid, ml, parameters.model)
-        likelihood = float(explained.log_likelihood.sum())
         occupied = int((ml == 1).sum())
         prior = parameters.search.prior
         return MapSet(
-            grid=grid,
+            grid=evidence.grid,
             live=live_map,
             ml=ml,
             uncertainty=uncertainty,
             readings=readings,
-            unexplained=explained.random > 0.5,
-            log_likelihood=likelihood,
-            objective=likelihood + occupied * float(np.log(prior / (1 - prior))),
+            unexplained=parameters.model.p_rand / readings.z_max > 0.5 * evidence.likelihoods,
+            log_likelihood=evidence.log_likelihood,
+            objective=evidence.log_likelihood + occupied * float(np.log(prior / (1 - prior))),
             parameters=parameters,
             statistics={
-                'pairs': index.pairs,
-                'bytes_per_pair': (index.nbytes + 4 * len(index.band_cell)) / max(index.pairs, 1),
+                'pairs': evidence.pairs,
+                'bytes_per_pair': evidence.nbytes / max(evidence.pairs, 1),
+                'readings_not_stored': evidence.unstored,
                 'occupied': occupied,
                 'flips': result.progress.flips,
                 'shifts': result.progress.shifts,

@@ -15,6 +15,21 @@ from .readings import Readings
 UNKNOWN = -1
 
 
+def part_of(grid: Grid, values: NDArray[np.int8], wanted: Grid) -> NDArray[np.int8]:
+    """Return a map on another grid of its lattice; cells that it does not have are unknown.
+
+    Parameters
+    ----------
+    grid : Grid
+    values : int8, shape `grid.shape`
+    wanted : Grid
+    """
+    whole = grid.union(wanted)
+    out = np.full(whole.shape, UNKNOWN, np.int8)
+    out[whole.window(grid)] = values
+    return np.array(out[whole.window(wanted)])
+
+
 @dataclass(frozen=True)
 class MapSet:
     """The three maps of one set of readings. Arrays have shape `grid.shape`; row 0 has the smallest y.

@@ -139,6 +139,14 @@ class SearchParameters:
     max_sweeps: int = _param(
         200, 'Bound on the sweeps over the map; the report says when it was reached.', 'sweeps', 1, 100_000
     )
+    threads: int = _param(0, 'Threads of a search, 0 for one a core; the maps do not depend on it.', 'threads', 0, 256)
+    max_memory: int = _param(
+        4000,
+        'Memory for pairs of cells and readings; beyond it they are made anew each time: the same maps, but slower.',
+        'MB',
+        0,
+        1_000_000,
+    )
     alpha: float = _param(
         0.8,
         'Weight of the evidence in the uncertainty map (eq 45); 0 leaves only the prior, 1 trusts the one map found.',
@@ -204,7 +212,14 @@ class NodeParameters:
         "Frame of the maps, if another than odometry's, whose transform to odometry's frame TF gives.",
         read_only=True,
     )
-    publish_rate: float = _param(1.0, 'Largest rate of live maps, and of maps seen while EM runs.', 'Hz', 0.01, 50.0)
+    online: bool = _param(
+        False,
+        'Keep the ML map and the uncertainty map up to date with every reading, and start EM from there.',
+        read_only=True,
+    )
+    publish_rate: float = _param(
+        1.0, 'Largest rate of live maps, of online maps, and of maps seen while EM runs.', 'Hz', 0.01, 50.0
+    )
     save_directory: str = _param('~/forward_grid_mapper', 'Folder in which save_maps makes a new folder at each call.')
 
 

@@ -1,7 +1,10 @@
 """The search for the maximum likelihood map: EM with flips in both directions, and moves.
 
-Sweeps go over the cells whose gain may have changed, most promising first, until no single flip gains anything; then
-occupied cells are moved to neighbours, and so on until neither gains. Ties keep the state. The objective
+First come rounds in which all cells flip at once that gain, and gain more than their neighbours. They begin with far
+too many occupied cells and thin them out, which leads to better maps than to add one cell at a time, and takes a few
+passes over the readings. When rounds no longer help, sweeps go over the cells that gain, most promising first, until
+no single flip gains anything; then occupied cells are moved to neighbours, and so on until neither gains. Ties keep
+the state. The objective
 
     J(m) = log p(Z | m) + logit(prior) · (number of occupied cells)
 
@@ -17,9 +20,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from .cone_index import ConeIndex, Floats, check
-from .flips import FlipState, compute_gains, flip_in_order, mark_cells, refresh_all, shift_in_order
-from .forward_model import Causes
+from .cones import Floats, check
+from .evidence import Evidence
+from .flips import State
+from .logs import QUANTUM
+from .moves import best_shifts, flip_in_order, highest, promising, see_any, shift_in_order, try_shifts, unsettle
 from .parameters import SearchParameters
 
 LEAST_GAIN = 1e-4
@@ -28,6 +33,15 @@ LEAST_GAIN = 1e-4
 ROUNDING = 1.2e-7
 """Nats that it must gain in addition for each of the cell's readings: what float32 ratios may be off, so that the
 search cannot go round, not even where ten thousand readings are off to the same side."""
+
+LEAST = (LEAST_GAIN, ROUNDING)
+
+FEW = 32
+"""Flips in a round below which sweeps are faster."""
+
+
+LITTLE = 0.005
+"""Share of all that was gained which a round must add for another one to follow."""
 
 
 @dataclass(frozen=True)
@@ -61,48 +75,33 @@ class SearchResult:
     converged: bool
 
 
-class Search:
-    """One search; its map so far is `state.occupied`, which another thread may read at any time."""
+Watch = Callable[[Progress], None]
 
-    def __init__(
-        self,
-        index: ConeIndex,
-        causes: Causes,
-        width: int,
-        parameters: SearchParameters,
-        stop: NDArray[np.uint8] | None = None,
-    ) -> None:
-        """Start from the empty map; `stop` (uint8, shape (1,)) is set to 1 from any thread to cancel."""
-        cells, readings = len(index.seen_start) - 1, len(index.free_start) - 1
-        self.index, self._causes, self._width, self._parameters = index, causes, width, parameters
+
+class Search:
+    """One search; its map so far is `evidence.state.maps.occupied`, which another thread may read at any time."""
+
+    def __init__(self, evidence: Evidence, parameters: SearchParameters) -> None:
+        """Start from the map that `evidence` has."""
+        self.evidence, self._parameters = evidence, parameters
         self._prior = math.log(parameters.prior / (1 - parameters.prior))
-        self.state = FlipState(
-            occupied=np.zeros(cells, np.uint8),
-            blocking=np.zeros(readings, np.int32),
-            band_ratio=np.empty(len(index.band_cell), np.float32),
-            occupy_ratio=np.empty(readings, np.float32),
-            free_ratio=np.empty(readings, np.float32),
-            changed=np.zeros(readings, np.uint8),
-            dirty=np.ones(cells, np.uint8),
-            settled=np.zeros(cells, np.uint8),
-            gain=np.zeros(cells),
-            stop=np.zeros(1, np.uint8) if stop is None else stop,
-        )
-        self.least = LEAST_GAIN + ROUNDING * (np.diff(index.seen_start) + np.diff(index.slot_start))
+        self._settled = np.zeros(evidence.grid.size, np.uint8)
+        self._tried_at = -1
         self.progress = Progress(0, 0, 0, 0.0)
 
-    def _gains(self) -> Floats:
-        mark_cells(self.index, self.state)
-        compute_gains(self.index, self.state, self._prior)
-        return self.state.gain
-
-    def _advance(self, sweeps: int, flips: int, shifts: int, gain: float, watch: Callable[[Progress], None]) -> None:
-        check(self.state.stop)
+    def _advance(self, flips: int, shifts: int, gain: float, watch: Watch) -> None:
+        check(self.evidence.state.stop)
         p = self.progress
-        self.progress = Progress(p.sweeps + sweeps, p.flips + flips, p.shifts + shifts, p.gain + gain)
+        self.progress = Progress(p.sweeps + 1, p.flips + flips, p.shifts + shifts, p.gain + gain)
         watch(self.progress)
 
-    def run(self, watch: Callable[[Progress], None] = lambda progress: None) -> SearchResult:
+    def _more(self) -> bool:
+        return self.progress.sweeps < self._parameters.max_sweeps
+
+    def _objective(self) -> float:
+        return self.evidence.log_likelihood + self._prior * int(self.evidence.state.maps.occupied.sum())
+
+    def run(self, watch: Watch = lambda progress: None) -> SearchResult:
         """Search until no flip and no move gains; `watch` hears of every sweep.
 
         Raises
@@ -110,29 +109,77 @@ class Search:
         Cancelled
             If `stop` was set.
         """
-        refresh_all(self.index, self._causes, self.state)
+        while self._more() and self._round(watch):
+            pass
         converged = False
-        while self.progress.sweeps < self._parameters.max_sweeps:
-            gains = self._gains()
-            cells = np.flatnonzero(gains > self.least)
-            if len(cells):
-                order = cells[np.argsort(-gains[cells], kind='stable')]
-                flips, gain = flip_in_order(self.index, self._causes, self.state, self._prior, self.least, order)
-                self._advance(1, flips, 0, gain, watch)
+        while self._more():
+            if self._sweep(watch):
                 continue
             if not self._parameters.shift_moves or not self._shift(watch):
                 converged = True
                 break
-        gains = self._gains()
-        touched = np.isfinite(gains)
-        sign = np.where(self.state.occupied == 1, -1.0, 1.0)
-        evidence = np.where(touched, sign * np.where(touched, gains, 0.0) - self._prior, 0.0)
-        return SearchResult(self.state.occupied, evidence, self.progress, converged)
+        maps = self.evidence.state.maps
+        sign = np.where(maps.occupied == 1, -QUANTUM, QUANTUM)
+        return SearchResult(maps.occupied, sign * maps.evidence, self.progress, converged)
 
-    def _shift(self, watch: Callable[[Progress], None]) -> int:
-        occupied = np.flatnonzero(self.state.occupied & ~self.state.settled)
-        # an order that a mirrored or turned map has too
-        cells = occupied[np.argsort(-self.state.gain[occupied], kind='stable')]
-        shifts, gain = shift_in_order(self.index, self._causes, self.state, self._prior, self.least, cells, self._width)
-        self._advance(1, 0, shifts, gain, watch)
+    def _promising(self) -> tuple[NDArray[np.int64], Floats]:
+        """Return the cells whose flip gains, the best first, and what they gain."""
+        cells, gains = np.empty(self.evidence.grid.size, np.int64), np.empty(self.evidence.grid.size)
+        height, width = self.evidence.grid.shape
+        n = promising(self.evidence.state, self._prior, LEAST, (0, height, 0, width), cells, gains)
+        order = np.argsort(-gains[:n], kind='stable')
+        return cells[order], gains[order]
+
+    def _round(self, watch: Watch) -> bool:
+        """Flip all that gain more than their neighbours at once; return whether that helped."""
+        maps = self.evidence.state.maps
+        cells, gains = self._promising()
+        cells = cells[highest(self.evidence.state, self._prior, cells, gains)]
+        if len(cells) < FEW:
+            return False
+        before = self._objective()
+        maps.occupied[cells] ^= 1
+        self.evidence.rebuild()
+        gain = self._objective() - before
+        if gain <= 0:
+            maps.occupied[cells] ^= 1
+            self.evidence.rebuild()
+            return False
+        self._advance(len(cells), 0, gain, watch)
+        return gain > LITTLE * self.progress.gain
+
+    def _sweep(self, watch: Watch) -> int:
+        cells, gains = self._promising()
+        if not len(cells):
+            return 0
+        flips, gain = flip_in_order(self.evidence.state, self._prior, LEAST, cells, gains)
+        self._advance(flips, 0, gain, watch)
+        return flips
+
+    def _shift(self, watch: Watch) -> int:
+        evidence, s = self.evidence, self.evidence.state
+        unsettle(s, self._tried_at, self._settled)
+        self._tried_at = int(s.clock[0])
+        cells = np.flatnonzero((s.maps.occupied == 1) & (self._settled == 0))
+        self._settled[cells] = 1
+        slot = np.full(evidence.grid.size, -1, np.int32)
+        slot[cells] = np.arange(len(cells), dtype=np.int32)
+        sees = np.ones(len(evidence), np.uint8)
+        if s.maps.seen[cells].sum() < len(evidence):
+            sees[:] = 0
+            see_any(s, cells, sees)
+        readings = np.flatnonzero(sees)
+        joints = []
+
+        def work(s: State, begin: int, end: int) -> None:
+            place, joint = np.full(len(slot), -1, np.int32), np.zeros((len(cells), 9), np.int64)
+            joints.append(joint)
+            try_shifts(s, readings[begin:end], slot, place, joint)
+
+        evidence.each(0, len(readings), work)
+        joint = np.sum(joints, axis=0)
+        targets, gains = best_shifts(s, self._prior, LEAST, cells, joint)
+        order = np.argsort(-gains, kind='stable')[: int((targets >= 0).sum())]
+        shifts, gain = shift_in_order(s, self._prior, LEAST, cells[order], targets[order])
+        self._advance(0, shifts, gain, watch)
         return shifts

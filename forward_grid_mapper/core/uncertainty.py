@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from .cone_index import Floats
+from .cones import Floats
 from .parameters import SearchParameters
 
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import numpy as np
 
 from .mapping import Mapper
 from .maps import MapSet
+from .online_map import OnlineMap
 from .parameters import Parameters
 from .readings import Readings
 
@@ -17,4 +19,8 @@ def warm_up() -> MapSet:
     yaw = np.linspace(-math.pi, math.pi, 24, endpoint=False)
     z = 1.0 / np.maximum(np.abs(np.cos(yaw)), np.abs(np.sin(yaw)))
     readings = Readings.from_columns(('',), x=0.0, y=0.0, yaw=yaw, z=np.minimum(z, 1.4), z_max=1.4, half_angle=0.1)
+    online = OnlineMap(Parameters())
+    # twice the same, then a place so far away that the grid grows
+    for moved in (0.0, 0.0, 40.0):
+        online.add(dataclasses.replace(readings, x=readings.x + moved))
     return Mapper(Parameters(), learn_rounds=1).run(readings)

@@ -8,7 +8,11 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from ..core.errors import Cancelled, MapperError
+from ..core.grid import Grid
 from ..core.mapping import Mapper
 from ..core.maps import MapSet
 from ..core.parameters import Parameters
@@ -26,10 +30,14 @@ class Outcome:
 
 @dataclass
 class Run:
-    """One run of EM. `stage` and `progress` tell where it stands; `finished` is set after `done` was called."""
+    """One run of EM, from map `start` or from the empty one.
+
+    `stage` and `progress` tell where it stands; `finished` is set after `done` was called.
+    """
 
     mapper: Mapper
     readings: Readings
+    start: tuple[Grid, NDArray[np.int8]] | None = None
     begin: float = field(default_factory=time.monotonic)
     stage: str = 'starting'
     progress: Progress | None = None
@@ -63,12 +71,18 @@ class EmWorker:
         run = self._run
         return run if run is not None and not run.finished.is_set() else None
 
-    def start(self, readings: Readings, parameters: Parameters, done: Callable[[Outcome], None]) -> Run | None:
+    def start(
+        self,
+        readings: Readings,
+        parameters: Parameters,
+        done: Callable[[Outcome], None],
+        start: tuple[Grid, NDArray[np.int8]] | None = None,
+    ) -> Run | None:
         """Begin a run; `done` is called in its thread. Return None if one goes on already."""
         with self._lock:
             if self.current is not None:
                 return None
-            run = Run(Mapper(parameters), readings)
+            run = Run(Mapper(parameters), readings, start)
             run.thread = threading.Thread(target=self._work, args=(run, done), name='em', daemon=True)
             self._run = run
         run.thread.start()
@@ -87,7 +101,7 @@ class EmWorker:
             self._watch(run)
 
         try:
-            outcome = Outcome(run.mapper.run(run.readings, watch), '')
+            outcome = Outcome(run.mapper.run(run.readings, watch, run.start), '')
         except Cancelled:
             outcome = Outcome(None, 'EM was cancelled')
         except MapperError as error:

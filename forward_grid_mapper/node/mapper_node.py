@@ -32,8 +32,12 @@ from .deferred import DeferredService, Reply
 from .em import EmWorker, Outcome, Run, summary
 from .frames import MapFrame, Mounts, Transforms
 from .grid_message import grid_message
+from .online import OnlineWorker
 
 NAME = 'forward_grid_mapper'
+ONLINE_PERIOD = 0.02
+"""Seconds between hand-overs of readings to the online map."""
+
 QUEUE = 2000
 """Messages that may wait for the node, so that a pause of a second loses none."""
 
@@ -73,6 +77,8 @@ class MapperNode(Node):
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._watched = 0.0
         self._em = EmWorker(self._watch, self.get_logger().error)
+        self._online: OnlineWorker | None = None
+        self._offered = 0
 
     def start(self) -> None:
         """Create topics and services; from here on messages are taken."""
@@ -97,6 +103,9 @@ class MapperNode(Node):
         for topic in dict.fromkeys(node.range_topics):
             self.create_subscription(Range, topic, self._on_range, quality)
         self.create_timer(1.0, self._report, clock=self._steady)
+        if node.online:
+            self._online = OnlineWorker(self.parameters, self._publish_online, self.get_logger().error)
+            self.create_timer(ONLINE_PERIOD, self._offer, clock=self._steady)
         self._live_timer = self.create_timer(1.0 / node.publish_rate, self._publish_live, clock=self._steady)
         topics = ', '.join(self.resolve_topic_name(topic) for topic in node.range_topics)
         self.get_logger().info(
@@ -108,6 +117,8 @@ class MapperNode(Node):
     def close(self) -> None:
         """Cancel what goes on in the background."""
         self._em.cancel(wait=2.0)
+        if self._online:
+            self._online.close()
 
     @staticmethod
     def _quality(reliability: str) -> QoSProfile:
@@ -132,10 +143,15 @@ class MapperNode(Node):
     # parameters
 
     def _accept(self, parameters: Parameters) -> None:
+        before = self.parameters
         rate_changed = parameters.node.publish_rate != self.parameters.node.publish_rate
         self.parameters = parameters
         if hasattr(self, '_placer'):
             self._placer.parameters = parameters.placing
+            if self._online:
+                self._online.parameters = parameters
+                if (parameters.model, parameters.search) != (before.model, before.search):
+                    self._restart_online()
             if rate_changed:
                 self._live_timer.timer_period_ns = round(NANOSECONDS / parameters.node.publish_rate)
 
@@ -170,6 +186,29 @@ class MapperNode(Node):
             self._published = self._live_count
             self._publish('live_map', self._live.grid, self._live.probability())
 
+    # the online map
+
+    def _offer(self) -> None:
+        """Hand the readings that came to the online map."""
+        count = len(self._placer.buffer)
+        if self._online and count > self._offered:
+            self._online.offer(self._placer.buffer.snapshot(self._offered))
+            self._offered = count
+
+    def _restart_online(self) -> None:
+        if self._online:
+            self._offered = len(self._placer.buffer)
+            self._online.restart(self.parameters, self._placer.buffer.snapshot(0) if self._offered else None)
+
+    def _publish_online(
+        self, generation: int, grid: Grid, ml: NDArray[np.int8], uncertainty: NDArray[np.float32]
+    ) -> None:
+        with self._lock:
+            # EM shows its own map while it runs
+            if self._online and generation == self._online.generation and self._em.current is None:
+                self._publish('ml_map', grid, ml)
+                self._publish('uncertainty_map', grid, uncertainty)
+
     # EM
 
     def _run_em(self, reply: Reply) -> None:
@@ -197,6 +236,8 @@ class MapperNode(Node):
                     self._maps = outcome.maps
                     self._publish('ml_map', outcome.maps.grid, outcome.maps.ml)
                     self._publish('uncertainty_map', outcome.maps.grid, outcome.maps.uncertainty)
+                    if self._online:
+                        self._online.adopt(outcome.maps)
             if outcome.maps is None:
                 self._last_run = outcome.message
                 self.get_logger().warning(f'EM: {outcome.message}')
@@ -206,7 +247,8 @@ class MapperNode(Node):
                 self.get_logger().info(f'EM: {self._last_run}')
             done(outcome)
 
-        if self._em.start(self._placer.readings, self.parameters, finish) is None:
+        start = self._online.so_far() if self._online else None
+        if self._em.start(self._placer.readings, self.parameters, finish, start) is None:
             return False
         self._run_generation = generation
         return True
@@ -239,6 +281,7 @@ class MapperNode(Node):
         with self._lock:
             self._generation += 1
             self._maps = None
+            self._restart_online()
             for name in MAPS:
                 self._publish(name, nothing, np.full(nothing.shape, -1, np.int8))
         response.success, response.message = True, f'{forgotten} readings and all maps were forgotten'

@@ -1,0 +1,167 @@
+"""The forward map kept up to date while the robot drives.
+
+New readings change the evidence of the cells of their cones. Only there, and as far around as flips reach, cells are
+flipped until nothing gains any more, which is what a search does everywhere.
+
+Readings that say the same, from the same place, are counted and not kept: the same sensor, its pose within a fraction
+of a cell and of its half angle, and the range within a fraction of σ. So a robot that stands still for hours adds
+weight to what is known, but no memory and no time.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .cones import effective_sigma, grid_of
+from .evidence import Evidence
+from .grid import Grid
+from .live_map import arc_depth
+from .logs import QUANTUM
+from .maps import UNKNOWN, part_of
+from .moves import flip_in_order, promising
+from .parameters import Parameters
+from .readings import Readings
+from .search import LEAST, Search
+from .threads import cores
+from .tiles import SHIFT
+from .uncertainty import marginals
+
+SAME_PLACE = 0.5
+"""Cells, and share of the half angle, by which poses may differ."""
+
+SAME_RANGE = 0.5
+"""Share of σ by which ranges may differ."""
+
+MARGIN = 64
+"""Cells by which the grid outgrows what is needed, and a quarter of its size more."""
+
+MOST_SWEEPS = 50
+"""Bound on the sweeps after one call; what is left then is done after the next."""
+
+MANY = 5000
+"""New readings for which a whole search is faster."""
+
+
+class OnlineMap:
+    """An ML map and its evidence that follow the readings."""
+
+    def __init__(self, parameters: Parameters) -> None:
+        self._parameters = parameters
+        self.clear()
+
+    def clear(self) -> None:
+        """Forget everything."""
+        self._evidence: Evidence | None = None
+        self._kept: dict[tuple[float, ...], int] = {}
+        self.grid = Grid(self._parameters.grid.resolution, 0, 0, 0, 0)
+
+    def __len__(self) -> int:
+        """Return the number of readings kept."""
+        return 0 if self._evidence is None else len(self._evidence)
+
+    def add(self, readings: Readings) -> None:
+        """Add placed readings and bring the map up to date.
+
+        Raises
+        ------
+        InputError
+            If the grid would exceed `max_cells`; nothing is changed.
+        """
+        if not len(readings):
+            return
+        p = self._parameters
+        self.grid = grid_of(readings, p.model, p.grid, within=self.grid, beyond=arc_depth(p))
+        evidence = self._with_room()
+        new, known = self._sort_out(readings)
+        if len(known):
+            evidence.weigh(known)
+        evidence.extend(readings.select(new))
+        if len(new) > MANY:
+            Search(evidence, p.search).run()
+        else:
+            self._settle(evidence, readings)
+
+    def adopt(self, grid: Grid, ml: NDArray[np.int8]) -> None:
+        """Go on from another map of the same readings, 1 where occupied; cells that it does not have are free."""
+        if self._evidence is not None:
+            self._evidence.state.maps.occupied[:] = (part_of(grid, ml, self._evidence.grid) == 1).ravel()
+            self._evidence.rebuild()
+
+    def _sort_out(self, readings: Readings) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Return which readings are new, and for the others which kept reading says the same."""
+        p = self._parameters
+        sigma = effective_sigma(readings, p.model, p.grid.resolution)
+        place = SAME_PLACE * p.grid.resolution
+        turn = SAME_PLACE * readings.half_angle
+        columns = (
+            readings.sensor,
+            np.floor(readings.x / place),
+            np.floor(readings.y / place),
+            np.floor(readings.yaw / turn),
+            np.floor(readings.z / (SAME_RANGE * sigma)),
+            readings.z_max,
+            readings.half_angle,
+            sigma,
+        )
+        new: list[int] = []
+        known: list[int] = []
+        for i, key in enumerate(zip(*(column.tolist() for column in columns), strict=True)):
+            kept = self._kept.setdefault(key, len(self._kept))
+            if kept == len(self) + len(new):
+                new.append(i)
+            else:
+                known.append(kept)
+        return np.array(new, np.int64), np.array(known, np.int64)
+
+    def _with_room(self) -> Evidence:
+        evidence, g = self._evidence, self.grid
+        if evidence is not None and evidence.grid.union(g) == evidence.grid:
+            return evidence
+        margin, tile = MARGIN + max(g.width, g.height) // 4, 1 << SHIFT
+        left, bottom = (math.floor((at - margin) / tile) * tile for at in (g.column, g.row))
+        width, height = (n + 2 * margin + tile for n in (g.width, g.height))
+        larger = Grid(g.resolution, left, bottom, width, height)
+        if evidence is None:
+            p = self._parameters
+            threads = p.search.threads or cores()
+            self._evidence = evidence = Evidence(larger, p.model, p.search.max_memory * 1e6, threads)
+        else:
+            evidence.grow(larger.union(evidence.grid))
+        return evidence
+
+    def _settle(self, evidence: Evidence, readings: Readings) -> None:
+        """Flip cells around the new readings until none gains any more."""
+        p, grid = self._parameters, evidence.grid
+        prior = math.log(p.search.prior / (1 - p.search.prior))
+        box = grid_of(readings, p.model, p.grid)
+        # flips change the readings that see a cell, and these reach that far
+        around = math.ceil(float(readings.z_max.max()) / grid.resolution)
+        row, column = box.row - grid.row, box.column - grid.column
+        window = (
+            max(row - around, 0),
+            min(row + box.height + around, grid.height),
+            max(column - around, 0),
+            min(column + box.width + around, grid.width),
+        )
+        room = (window[1] - window[0]) * (window[3] - window[2])
+        cells, gains = np.empty(room, np.int64), np.empty(room)
+        for _ in range(MOST_SWEEPS):
+            n = promising(evidence.state, prior, LEAST, window, cells, gains)
+            if not n:
+                break
+            order = np.argsort(-gains[:n], kind='stable')
+            flip_in_order(evidence.state, prior, LEAST, cells[order], gains[order])
+
+    def maps(self) -> tuple[Grid, NDArray[np.int8], NDArray[np.float32]]:
+        """Return the grid, the ML map (1 occupied, 0 free, -1 not observed) and the uncertainty map (NaN likewise)."""
+        if self._evidence is None:
+            return self.grid, np.zeros((0, 0), np.int8), np.zeros((0, 0), np.float32)
+        window = self._evidence.grid.window(self.grid)
+        ml = self._evidence.observed()[window]
+        evidence = self._evidence.state.maps.evidence.reshape(self._evidence.grid.shape)[window]
+        toward = np.where(ml == 1, -QUANTUM, QUANTUM) * evidence.astype(np.float64)
+        uncertainty = np.where(ml != UNKNOWN, marginals(toward, self._parameters.search), np.float32(np.nan))
+        return self.grid, ml, uncertainty

@@ -1,0 +1,33 @@
+"""Work shared out to the cores: kernels let go of the GIL, so plain threads do."""
+
+from __future__ import annotations
+
+import itertools
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+
+LEAST_PART = 20000
+"""Readings below which a thread is not worth its while."""
+
+
+def cores() -> int:
+    """Return the number of cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, 'sched_getaffinity') else os.cpu_count() or 1
+
+
+def parts(begin: int, end: int, threads: int) -> list[tuple[int, int]]:
+    """Cut a range of readings into at most `threads` parts of equal length, of LEAST_PART at least."""
+    n = max(min(threads, (end - begin) // LEAST_PART), 1)
+    edges = [begin + (end - begin) * k // n for k in range(n + 1)]
+    return list(itertools.pairwise(edges))
+
+
+def run_each(work: list[Callable[[], None]]) -> None:
+    """Run all of `work`, each in a thread of its own, and wait for it; raise what the first one raised."""
+    if len(work) == 1:
+        work[0]()
+        return
+    with ThreadPoolExecutor(len(work)) as pool:
+        for done in [pool.submit(job) for job in work]:
+            done.result()
