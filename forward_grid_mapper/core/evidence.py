@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .cone import row_runs, within
-from .cones import CONE, Cones, Floats, check, cone_of, cone_table
+from .cones import CONE, Floats, check, cone_of, cone_table
+from .facing import facing_of, gather, no_facing
 from .flips import SHARE, Maps, Model, State, enter_all, weigh
 from .grid import Grid
 from .jit import kernel
@@ -19,18 +20,20 @@ from .logs import QUANTUM, ratios_for
 from .maps import UNKNOWN
 from .pairs import WORD, WORDS_PER_BAND_PAIR, WORDS_PER_RUN, Lattice, bench_for, renumber, room_for_words
 from .parameters import ModelParameters
+from .prior import patterns
 from .readings import Readings
 from .threads import parts, run_each
-from .tiles import SHIFT, Tiles, enter, more_chunks, moved, no_tiles
+from .tiles import SHIFT, enter, more_chunks, moved, no_tiles
+
+STRAIGHT = 1.5707
+"""Radians off the normal from where on no reading grazes."""
 
 FREE, BAND, LARGEST, WORDS, UNSTORED = range(5)
 """Of the totals: pairs in free zones and in bands, cells of the largest cone, words stored, readings not stored."""
 
 
 @kernel
-def _index(
-    cones: Cones, lattice: Lattice, shares: Any, tiles: Tiles, limits: tuple[int, int, int], totals: Any, stop: Any
-) -> int:
+def _index(s: State, limits: tuple[int, int, int], totals: Any) -> int:
     """Count the pairs of readings and enter these in the tiles; return the reading at which chunks ran out, or the end.
 
     Parameters
@@ -41,13 +44,14 @@ def _index(
         Added to.
     """
     begin, end, words = limits
+    cones, lattice, tiles, seen, before = s.cones, s.lattice, s.tiles, s.maps.seen, s.facing.before
     for t in range(begin, end):
         reading = cones[t]
         cone = cone_of(reading, lattice.nearest)
         bottom, top = max(cone.bottom, 0), min(cone.top, lattice.height - 1)
         across = min(2 * int(cone.reach) + 3, lattice.width)
         most = (((top - bottom) >> SHIFT) + 2) * ((across >> SHIFT) + 2)
-        if stop[0] or tiles.used[0] + most > len(tiles.chunks):
+        if s.stop[0] or tiles.used[0] + most > len(tiles.chunks):
             return t
         runs, free, band = 0, 0, 0
         for row in range(bottom, top + 1):
@@ -59,10 +63,14 @@ def _index(
                 enter(tiles, row, left, right, t)
                 inside = max(min(right, last) - max(left, first) + 1, 0)
                 runs += inside > 0
+                if s.facing.slant > 0.0 and inside > 0:
+                    # a surface that is grazed may cut a run in two
+                    runs += before[row, min(right, last) + 1] - before[row, max(left, first)]
+                for c in range(np.uint64(row * lattice.width + left), np.uint64(row * lattice.width + right + 1)):
+                    seen[c] += 1
                 free += inside
                 band += right - left + 1 - inside
-        share = shares[t]
-        share.runs, share.bands = runs, band
+        share = s.shares[t]
         size = WORDS_PER_RUN * runs + WORDS_PER_BAND_PAIR * band
         share.at = totals[WORDS]
         share.stored = totals[WORDS] + size <= words
@@ -125,6 +133,7 @@ class Evidence:
         self._totals = np.zeros(5, np.int64)
         self._size = 0
         self.state = State(
+            facing=no_facing(),
             lattice=Lattice(grid.height, grid.width, model.cell_distance == 'nearest', model.cut, grid.resolution),
             model=Model(model.p_hit, 1.0 - model.p_rand - model.p_lost),
             cones=np.empty(0, CONE),
@@ -135,6 +144,7 @@ class Evidence:
                 np.zeros(grid.size, np.uint8) if start is None else np.array(start, np.uint8).ravel(),
                 np.zeros(grid.size, np.int64),
                 np.zeros(grid.size, np.int32),
+                np.zeros(grid.size, np.uint8) if start is None else patterns(np.array(start, np.uint8), grid.shape),
             ),
             bench=bench_for(0),
             ratios=ratios_for(0),
@@ -170,6 +180,12 @@ class Evidence:
         return float((shares['likelihood'].astype(np.int64) * shares['weight']).sum() * QUANTUM)
 
     @property
+    def z_max(self) -> Floats:
+        """The largest range of every reading in metres, shape (N,)."""
+        out: Floats = self.state.cones['z_max'][: self._size] * self.grid.resolution
+        return out
+
+    @property
     def likelihoods(self) -> Floats:
         """p(z | m) of every reading in 1/m, shape (N,)."""
         out: Floats = np.exp(self.state.shares['likelihood'][: self._size] * QUANTUM)
@@ -194,10 +210,12 @@ class Evidence:
         self._reserve(end)
         s = self.state
         s.cones[begin:end], s.shares[begin:end] = cones, shares
+        if not begin and self._model.grazing_angle < STRAIGHT:
+            self._face(end)
         done = begin
         while done < end:
             s = self.state
-            done = _index(s.cones, s.lattice, s.shares, s.tiles, (done, end, self._words), self._totals, s.stop)
+            done = _index(s, (done, end, self._words), self._totals)
             check(s.stop)
             if done < end:
                 self.state = s._replace(tiles=more_chunks(s.tiles))
@@ -239,7 +257,9 @@ class Evidence:
 
     def rebuild(self) -> None:
         """Explain all readings anew, after the map was changed in many places."""
-        self.state.maps.evidence[:] = 0
+        maps = self.state.maps
+        maps.evidence[:] = 0
+        maps.pattern[:] = patterns(maps.occupied, self.grid.shape)
         self._enter(0, self._size, new=False)
 
     def each(self, begin: int, end: int, work: Callable[[State, int, int], None]) -> None:
@@ -260,15 +280,25 @@ class Evidence:
 
         def work(s: State, first: int, last: int) -> None:
             if first > begin:
-                s = s._replace(maps=Maps(maps.occupied, np.zeros_like(maps.evidence), np.zeros_like(maps.seen)))
+                s = s._replace(maps=maps._replace(evidence=np.zeros_like(maps.evidence)))
                 own.append(s.maps)
             enter_all(s, first, last, new)
 
         self.each(begin, end, work)
         for other in own:
             np.add(maps.evidence, other.evidence, out=maps.evidence)
-            if new:
-                np.add(maps.seen, other.seen, out=maps.seen)
+
+    def _face(self, end: int) -> None:
+        """Learn from the first readings which way surfaces face."""
+        sums: list[NDArray[np.int64]] = []
+
+        def work(s: State, first: int, last: int) -> None:
+            sums.append(np.zeros((3, self.grid.size), np.int64))
+            gather(s.cones, self.grid.shape, s.lattice.nearest, (first, last), sums[-1], s.stop)
+
+        self.each(0, end, work)
+        facing = facing_of(np.sum(sums, axis=0), self.grid.shape, self._model.grazing_angle)
+        self.state = self.state._replace(facing=facing)
 
     def _reserve(self, size: int) -> None:
         """Make room for `size` readings; more than that where they come in small numbers."""

@@ -25,9 +25,11 @@ from numpy.typing import NDArray
 
 from .cone import row_runs, within
 from .cones import Cones, cone_of
+from .facing import Facing, grazes
 from .jit import kernel
 from .logs import QUANTUM, Ratios, quantise_logs
 from .pairs import WORDS_PER_RUN, Bench, Lattice, Pairs, make
+from .prior import Prior, note_flip, prior_gain
 from .tiles import CHUNK, SHIFT, Tiles
 
 EDGE = 1e-6
@@ -91,12 +93,15 @@ class Maps(NamedTuple):
     evidence : int64
         Log-likelihood gain of flipping the cell, in units of `logs.QUANTUM`.
     seen : int32
-        Number of readings that see the cell.
+        Number of readings in whose cone the cell is.
+    pattern : uint8
+        Which of its neighbours are occupied (`prior`).
     """
 
     occupied: NDArray[np.uint8]
     evidence: NDArray[np.int64]
     seen: NDArray[np.int32]
+    pattern: NDArray[np.uint8]
 
 
 class State(NamedTuple):
@@ -114,6 +119,7 @@ class State(NamedTuple):
     """
 
     lattice: Lattice
+    facing: Facing
     model: Model
     cones: Cones
     shares: NDArray[np.void]
@@ -214,21 +220,10 @@ def _enter(model: Model, share: Any, maps: Maps, pairs: Pairs, at: int, room: tu
 
 
 @kernel
-def _see(share: Any, pairs: Pairs, at: int, seen: Any) -> None:
-    """Count the reading in all of its cells."""
-    for k in range(at, at + WORDS_PER_RUN * share.runs, WORDS_PER_RUN):
-        for c in range(np.uint64(pairs.cell[k]), np.uint64(pairs.cell[k + 1]) + np.uint64(1)):
-            seen[c] += 1
-    cell = at + WORDS_PER_RUN * share.runs
-    for k in range(cell, cell + share.bands):
-        seen[pairs.cell[k]] += 1
-
-
-@kernel
 def enter_all(s: State, begin: int, end: int, new: bool) -> None:
     """Explain the readings `begin` to `end` by the map, and add all that they say to the evidence.
 
-    New readings are counted in `seen`, and their pairs are made first.
+    The pairs of new ones are made first.
     """
     room = (s.ratios, s.bench.new)
     for t in range(begin, end):
@@ -237,9 +232,7 @@ def enter_all(s: State, begin: int, end: int, new: bool) -> None:
         share = s.shares[t]
         pairs, at = (s.pairs, share.at) if share.stored else (s.bench.pairs, 0)
         if new or not share.stored:
-            make(s.cones, s.lattice, t, pairs, at, (share.runs, share.bands), s.bench)
-        if new:
-            _see(share, pairs, at, s.maps.seen)
+            share.runs, share.bands = make(s.cones, s.lattice, s.facing, t, pairs, at, s.bench)
         _enter(s.model, share, s.maps, pairs, at, room)
         share.changed = s.clock[0]
 
@@ -254,13 +247,16 @@ def weigh(s: State, readings: Any) -> None:
         share.changed = s.clock[0]
         pairs, at = (s.pairs, share.at) if share.stored else (bench.pairs, 0)
         if not share.stored:
-            make(s.cones, s.lattice, t, bench.pairs, 0, (share.runs, share.bands), bench)
+            make(s.cones, s.lattice, s.facing, t, bench.pairs, 0, bench)
         explain(s.model, share, maps.occupied, pairs, at, s.ratios, bench.new)
         _push_free(share, pairs, at, maps, (share.occupy, share.release))
         cell = np.uint64(at + WORDS_PER_RUN * share.runs)
         for k in range(np.uint64(share.bands)):
             maps.evidence[pairs.cell[cell + k]] += bench.new[k]
-        _see(share, pairs, at, maps.seen)
+            maps.seen[pairs.cell[cell + k]] += 1
+        for k in range(at, at + WORDS_PER_RUN * share.runs, WORDS_PER_RUN):
+            for c in range(np.uint64(pairs.cell[k]), np.uint64(pairs.cell[k + 1]) + np.uint64(1)):
+                maps.seen[c] += 1
 
 
 @kernel
@@ -299,7 +295,11 @@ def find_seers(s: State, c: int) -> int:
     while chunk >= 0:
         for k in range(end):
             t = s.tiles.chunks[chunk, k]
-            zone = _zone(s.cones[t], s.lattice, row, column)
+            reading = s.cones[t]
+            zone = _zone(reading, s.lattice, row, column)
+            if zone and s.facing.slant > 0.0 and s.facing.known[c]:
+                slanted = grazes(s.facing, reading, c, column + 0.5 - reading.x, row + 0.5 - reading.y)
+                zone = 0 if slanted else zone
             if zone:
                 s.seers[n, 0] = t
                 s.seers[n, 1] = zone - 1
@@ -336,6 +336,7 @@ def flip(s: State, c: int) -> None:
     # where the cell is in the free zone, its own share is that of an occupied cell from now on, or of a free one
     maps.evidence[c] += -own if maps.occupied[c] else own
     maps.occupied[c] ^= 1
+    note_flip(maps.pattern, c, s.lattice.height, s.lattice.width)
     step = 1 if maps.occupied[c] else -1
     s.clock[0] += 1
     room = (s.ratios, bench.new)
@@ -343,7 +344,7 @@ def flip(s: State, c: int) -> None:
         t = s.seers[i, 0]
         share = s.shares[t]
         if not share.stored:
-            make(s.cones, s.lattice, t, bench.pairs, 0, (share.runs, share.bands), bench)
+            make(s.cones, s.lattice, s.facing, t, bench.pairs, 0, bench)
             maps.occupied[c] ^= 1
             explain(s.model, share, maps.occupied, bench.pairs, 0, s.ratios, bench.new)
             maps.occupied[c] ^= 1
@@ -361,6 +362,7 @@ def flip(s: State, c: int) -> None:
 
 
 @kernel
-def gain_of(s: State, prior: float, c: int) -> float:
+def gain_of(s: State, prior: Prior, c: int) -> float:
     """Return what flipping cell c gains, prior included, in nats."""
-    return float(s.maps.evidence[c] * QUANTUM + (-prior if s.maps.occupied[c] else prior))
+    data = s.maps.evidence[c] * QUANTUM
+    return float(data + prior_gain(prior, s.maps.occupied, s.maps.pattern, c, s.lattice.width))

@@ -11,12 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .cones import check, grid_of
+from .driven import driven_cells
 from .evidence import Evidence
+from .finishing import finish
 from .grid import Grid
 from .learning import learn
 from .live_map import LiveMap, arc_depth
-from .maps import UNKNOWN, MapSet, part_of
-from .parameters import Parameters
+from .maps import MapSet, part_of
+from .parameters import Parameters, SearchParameters
 from .readings import Readings
 from .search import Progress, Search, SearchResult
 from .threads import cores
@@ -111,18 +113,21 @@ class Mapper:
             evidence = Evidence(grid, parameters.model, memory, threads, self._stop, occupied)
             evidence.extend(readings)
         with self._stage('search', watch):
-            self._search = Search(evidence, asked)
+            self._search = Search(evidence, asked, self._driven(readings, grid, asked).ravel())
             return evidence, self._search.run(lambda progress: watch('search', progress))
+
+    @staticmethod
+    def _driven(readings: Readings, grid: Grid, parameters: SearchParameters) -> NDArray[np.bool_]:
+        return driven_cells(readings, grid) if parameters.driven_cost > 0 else np.zeros(grid.shape, np.bool_)
 
     def _collect(
         self, readings: Readings, parameters: Parameters, evidence: Evidence, result: SearchResult, live_map: Any
     ) -> MapSet:
-        ml = evidence.observed()
-        uncertainty = np.where(
-            ml != UNKNOWN, marginals(result.evidence, parameters.search).reshape(ml.shape), np.float32(np.nan)
-        )
-        occupied = int((ml == 1).sum())
-        prior = parameters.search.prior
+        search, grid = parameters.search, evidence.grid
+        driven = self._driven(readings, grid, search)
+        ml = finish(evidence, search.extend, search.least_passed, parameters.model.p_rand, driven)
+        probability = marginals(result.evidence, result.neighbours, search)
+        uncertainty = np.where(evidence.state.maps.seen > 0, probability, np.float32(np.nan)).reshape(ml.shape)
         return MapSet(
             grid=evidence.grid,
             live=live_map,
@@ -131,13 +136,13 @@ class Mapper:
             readings=readings,
             unexplained=parameters.model.p_rand / readings.z_max > 0.5 * evidence.likelihoods,
             log_likelihood=evidence.log_likelihood,
-            objective=evidence.log_likelihood + occupied * float(np.log(prior / (1 - prior))),
+            objective=evidence.log_likelihood + result.log_prior,
             parameters=parameters,
             statistics={
                 'pairs': evidence.pairs,
                 'bytes_per_pair': evidence.nbytes / max(evidence.pairs, 1),
                 'readings_not_stored': evidence.unstored,
-                'occupied': occupied,
+                'occupied': int((ml == 1).sum()),
                 'flips': result.progress.flips,
                 'shifts': result.progress.shifts,
                 'sweeps': result.progress.sweeps,

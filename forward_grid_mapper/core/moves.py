@@ -24,6 +24,7 @@ from .flips import State, explain, find_seers, flip, gain_of
 from .jit import kernel
 from .logs import QUANTUM
 from .pairs import WORDS_PER_RUN, Pairs, make
+from .prior import Prior, note_flip, prior_gain
 
 LEAST_JOINT = 1e-9
 """Ratios of shifts are differences, and rounding may leave nothing of the smallest."""
@@ -41,25 +42,32 @@ def _least(s: State, least: Least, c: int) -> float:
 
 
 @kernel
-def promising(s: State, prior: float, least: Least, window: tuple[int, int, int, int], cells: Any, gains: Any) -> int:
+def promising(s: State, prior: Prior, least: Least, window: tuple[int, int, int, int], cells: Any, gains: Any) -> int:
     """List the cells whose flip gains more than `least`, and what they gain; return their number.
 
     `window` is where to look: first row, last one plus one, and columns likewise.
     """
+    maps, width = s.maps, s.lattice.width
+    occupied, evidence, seen, pattern = maps.occupied, maps.evidence, maps.seen, maps.pattern
     n = 0
     for row in range(window[0], window[1]):
-        for c in range(row * s.lattice.width + window[2], row * s.lattice.width + window[3]):
-            if s.maps.seen[c]:
-                gain = gain_of(s, prior, c)
-                if gain > _least(s, least, c):
-                    cells[n] = c
-                    gains[n] = gain
-                    n += 1
+        for c in range(np.uint64(row * width + window[2]), np.uint64(row * width + window[3])):
+            if not seen[c]:
+                continue
+            data = evidence[c] * QUANTUM
+            if occupied[c] or pattern[c]:
+                gain = data + prior_gain(prior, occupied, pattern, int(c), width)
+            else:
+                gain = data + prior.local[c] + prior.shape[0]
+            if gain > least[0] + least[1] * seen[c]:
+                cells[n] = c
+                gains[n] = gain
+                n += 1
     return n
 
 
 @kernel
-def highest(s: State, prior: float, cells: NDArray[np.int64], gains: Floats) -> Any:
+def highest(s: State, prior: Prior, cells: NDArray[np.int64], gains: Floats) -> Any:
     """Tell which of `cells` gain at least as much as each of their eight neighbours, and are not beside one like it."""
     height, width = s.lattice.height, s.lattice.width
     chosen = np.ones(len(cells), np.bool_)
@@ -76,7 +84,7 @@ def highest(s: State, prior: float, cells: NDArray[np.int64], gains: Floats) -> 
 
 
 @kernel
-def flip_in_order(s: State, prior: float, least: Least, cells: NDArray[np.int64], gains: Floats) -> tuple[int, float]:
+def flip_in_order(s: State, prior: Prior, least: Least, cells: NDArray[np.int64], gains: Floats) -> tuple[int, float]:
     """Flip those of `cells`, in order, that still gain enough; return their number and total gain.
 
     `gains` is what they gained when the sweep began. A cell that lost much of that since, to the flip of another one,
@@ -103,7 +111,7 @@ def unsettle(s: State, since: int, settled: Any) -> None:
         if share.changed > since:
             pairs, at = (s.pairs, share.at) if share.stored else (bench.pairs, 0)
             if not share.stored:
-                make(s.cones, s.lattice, t, bench.pairs, 0, (share.runs, share.bands), bench)
+                make(s.cones, s.lattice, s.facing, t, bench.pairs, 0, bench)
             begin = at + WORDS_PER_RUN * share.runs
             for k in range(at, begin, WORDS_PER_RUN):
                 settled[pairs.cell[k] : pairs.cell[k + 1] + 1] = 0
@@ -188,7 +196,7 @@ def try_shifts(s: State, readings: Any, slot: Any, place: Any, joint: Any) -> No
         share = s.shares[t]
         pairs, at = (s.pairs, share.at) if share.stored else (bench.pairs, 0)
         if not share.stored:
-            make(s.cones, s.lattice, t, bench.pairs, 0, (share.runs, share.bands), bench)
+            make(s.cones, s.lattice, s.facing, t, bench.pairs, 0, bench)
             explain(s.model, share, s.maps.occupied, bench.pairs, 0, s.ratios, bench.new)
             log = WORDS_PER_RUN * share.runs + 2 * share.bands
             for k in range(share.bands):
@@ -218,7 +226,7 @@ def try_shifts(s: State, readings: Any, slot: Any, place: Any, joint: Any) -> No
 
 @kernel
 def best_shifts(
-    s: State, prior: float, least: Least, cells: NDArray[np.int64], joint: Any
+    s: State, prior: Prior, least: Least, cells: NDArray[np.int64], joint: Any
 ) -> tuple[NDArray[np.int64], Floats]:
     """Return for each of `cells` the free neighbour to which a shift gains most, -1 if none does, and what it gains."""
     height, width = s.lattice.height, s.lattice.width
@@ -227,20 +235,25 @@ def best_shifts(
         c = cells[i]
         row, column = c // width, c % width
         loss = gain_of(s, prior, c)
+        # the prior of the neighbours depends on this cell
+        s.maps.occupied[c] ^= 1
+        note_flip(s.maps.pattern, c, height, width)
         for k in range(9):
             y, x = row + k // 3 - 1, column + k % 3 - 1
             o = y * width + x
-            if not (0 <= y < height and 0 <= x < width) or s.maps.occupied[o] or not s.maps.seen[o]:
+            if k == 4 or not (0 <= y < height and 0 <= x < width) or s.maps.occupied[o] or not s.maps.seen[o]:
                 continue
             gain = loss + gain_of(s, prior, o) + joint[i, k] * QUANTUM
             if gain > max(gains[i], _least(s, least, c) + _least(s, least, o)):
                 targets[i], gains[i] = o, gain
+        s.maps.occupied[c] ^= 1
+        note_flip(s.maps.pattern, c, height, width)
     return targets, gains
 
 
 @kernel
 def shift_in_order(
-    s: State, prior: float, least: Least, cells: NDArray[np.int64], targets: NDArray[np.int64]
+    s: State, prior: Prior, least: Least, cells: NDArray[np.int64], targets: NDArray[np.int64]
 ) -> tuple[int, float]:
     """Make those shifts, in order, that still gain; return their number and total gain."""
     moves, total = 0, 0.0

@@ -1,7 +1,8 @@
 """The forward map kept up to date while the robot drives.
 
 New readings change the evidence of the cells of their cones. Only there, and as far around as flips reach, cells are
-flipped until nothing gains any more, which is what a search does everywhere.
+flipped until nothing gains any more. From time to time the surroundings are searched in all ways that a batch has, at
+first as if cells were independent: lines would hold on to what few readings seemed to say.
 
 Readings that say the same, from the same place, are counted and not kept: the same sensor, its pose within a fraction
 of a cell and of its half angle, and the range within a fraction of σ. So a robot that stands still for hours adds
@@ -10,21 +11,25 @@ weight to what is known, but no memory and no time.
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .cones import effective_sigma, grid_of
+from .driven import mark_driven
 from .evidence import Evidence
+from .finishing import finish
 from .grid import Grid
 from .live_map import arc_depth
 from .logs import QUANTUM
-from .maps import UNKNOWN, part_of
+from .maps import part_of
 from .moves import flip_in_order, promising
 from .parameters import Parameters
+from .prior import Prior, local_prior, prior_gains, shapes
 from .readings import Readings
-from .search import LEAST, Search
+from .search import LEAST, Search, Window
 from .threads import cores
 from .tiles import SHIFT
 from .uncertainty import marginals
@@ -41,6 +46,9 @@ MARGIN = 64
 MOST_SWEEPS = 50
 """Bound on the sweeps after one call; what is left then is done after the next."""
 
+REFINE_EVERY = 1000
+"""Readings after which the surroundings of the robot are searched as a batch would."""
+
 MANY = 5000
 """New readings for which a whole search is faster."""
 
@@ -56,6 +64,11 @@ class OnlineMap:
         """Forget everything."""
         self._evidence: Evidence | None = None
         self._kept: dict[tuple[float, ...], int] = {}
+        self._driven = np.zeros((0, 0), np.bool_)
+        self._since: list[Window] = []
+        self._count = 0
+        self._prior = Prior(np.zeros(0), shapes(self._parameters.search))
+        self._last = np.zeros(0), np.zeros(0), np.zeros(0, np.int64)
         self.grid = Grid(self._parameters.grid.resolution, 0, 0, 0, 0)
 
     def __len__(self) -> int:
@@ -75,20 +88,48 @@ class OnlineMap:
         p = self._parameters
         self.grid = grid_of(readings, p.model, p.grid, within=self.grid, beyond=arc_depth(p))
         evidence = self._with_room()
+        if p.search.driven_cost > 0:
+            self._drive(readings, evidence.grid)
         new, known = self._sort_out(readings)
         if len(known):
             evidence.weigh(known)
         evidence.extend(readings.select(new))
         if len(new) > MANY:
-            Search(evidence, p.search).run()
+            Search(evidence, p.search, self._driven.ravel()).run()
         else:
-            self._settle(evidence, readings)
+            window = self._around(evidence.grid, readings)
+            self._settle(evidence, window)
+            self._since.append(window)
+            self._count += len(readings)
+            if self._count >= REFINE_EVERY:
+                self._refine(evidence)
+
+    def _refine(self, evidence: Evidence) -> None:
+        """Search around all readings since this was done last, in all ways that a search has."""
+        bottom, top, left, right = zip(*self._since, strict=True)
+        window = min(bottom), max(top), min(left), max(right)
+        Search(evidence, self._parameters.search, self._driven.ravel(), window).refine()
+        self._since.clear()
+        self._count = 0
 
     def adopt(self, grid: Grid, ml: NDArray[np.int8]) -> None:
         """Go on from another map of the same readings, 1 where occupied; cells that it does not have are free."""
         if self._evidence is not None:
             self._evidence.state.maps.occupied[:] = (part_of(grid, ml, self._evidence.grid) == 1).ravel()
             self._evidence.rebuild()
+
+    def _drive(self, readings: Readings, grid: Grid) -> None:
+        """Note the cells that sensors were moved over, from the last reading on."""
+        x, y, stamp = (
+            np.r_[old, new] for old, new in zip(self._last, (readings.x, readings.y, readings.stamp), strict=True)
+        )
+        mark_driven(x, y, stamp, grid, self._driven)
+        rows, columns = grid.cells_of(x, y)
+        # the last reading may be one of before a jump, off this grid
+        rows, columns = rows.clip(0, grid.height - 1), columns.clip(0, grid.width - 1)
+        near = (slice(rows.min(), rows.max() + 1), slice(columns.min(), columns.max() + 1))
+        self._prior.local.reshape(grid.shape)[near] = local_prior(self._parameters.search, self._driven[near])
+        self._last = x[-1:], y[-1:], stamp[-1:]
 
     def _sort_out(self, readings: Readings) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Return which readings are new, and for the others which kept reading says the same."""
@@ -124,28 +165,42 @@ class OnlineMap:
         left, bottom = (math.floor((at - margin) / tile) * tile for at in (g.column, g.row))
         width, height = (n + 2 * margin + tile for n in (g.width, g.height))
         larger = Grid(g.resolution, left, bottom, width, height)
+        p = self._parameters
         if evidence is None:
-            p = self._parameters
-            threads = p.search.threads or cores()
-            self._evidence = evidence = Evidence(larger, p.model, p.search.max_memory * 1e6, threads)
+            # surfaces would have to be faced anew as readings come
+            model = dataclasses.replace(p.model, grazing_angle=math.pi / 2)
+            memory, threads = p.search.max_memory * 1e6, p.search.threads or cores()
+            self._evidence = evidence = Evidence(larger, model, memory, threads)
+            self._driven = np.zeros(larger.shape, np.bool_)
         else:
-            evidence.grow(larger.union(evidence.grid))
+            larger = larger.union(evidence.grid)
+            inner = larger.window(evidence.grid)
+            driven = np.zeros(larger.shape, np.bool_)
+            driven[inner] = self._driven
+            self._driven = driven
+            up, right = inner[0].start, inner[1].start
+            self._since = [(a + up, b + up, c + right, d + right) for a, b, c, d in self._since]
+            evidence.grow(larger)
+        self._prior = self._prior._replace(local=local_prior(p.search, self._driven).ravel())
         return evidence
 
-    def _settle(self, evidence: Evidence, readings: Readings) -> None:
-        """Flip cells around the new readings until none gains any more."""
-        p, grid = self._parameters, evidence.grid
-        prior = math.log(p.search.prior / (1 - p.search.prior))
+    def _around(self, grid: Grid, readings: Readings) -> Window:
+        """Return the window of all cells that flips near new readings may change."""
+        p = self._parameters
         box = grid_of(readings, p.model, p.grid)
         # flips change the readings that see a cell, and these reach that far
         around = math.ceil(float(readings.z_max.max()) / grid.resolution)
         row, column = box.row - grid.row, box.column - grid.column
-        window = (
+        return (
             max(row - around, 0),
             min(row + box.height + around, grid.height),
             max(column - around, 0),
             min(column + box.width + around, grid.width),
         )
+
+    def _settle(self, evidence: Evidence, window: Window) -> None:
+        """Flip cells around the new readings until none gains any more."""
+        prior = self._prior
         room = (window[1] - window[0]) * (window[3] - window[2])
         cells, gains = np.empty(room, np.int64), np.empty(room)
         for _ in range(MOST_SWEEPS):
@@ -159,9 +214,12 @@ class OnlineMap:
         """Return the grid, the ML map (1 occupied, 0 free, -1 not observed) and the uncertainty map (NaN likewise)."""
         if self._evidence is None:
             return self.grid, np.zeros((0, 0), np.int8), np.zeros((0, 0), np.float32)
-        window = self._evidence.grid.window(self.grid)
-        ml = self._evidence.observed()[window]
-        evidence = self._evidence.state.maps.evidence.reshape(self._evidence.grid.shape)[window]
-        toward = np.where(ml == 1, -QUANTUM, QUANTUM) * evidence.astype(np.float64)
-        uncertainty = np.where(ml != UNKNOWN, marginals(toward, self._parameters.search), np.float32(np.nan))
-        return self.grid, ml, uncertainty
+        evidence, search = self._evidence, self._parameters.search
+        window = evidence.grid.window(self.grid)
+        ml = finish(evidence, search.extend, search.least_passed, self._parameters.model.p_rand, self._driven)
+        maps, shape = evidence.state.maps, evidence.grid.shape
+        gains = prior_gains(self._prior, maps.occupied, maps.pattern, maps.seen, shape[1])
+        sign = np.where(maps.occupied == 1, -1.0, 1.0)
+        probability = marginals(np.asarray(sign * maps.evidence * QUANTUM), sign * gains, search)
+        uncertainty = np.where(maps.seen > 0, probability, np.float32(np.nan))
+        return self.grid, ml[window], uncertainty.reshape(shape)[window]

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from .cone import distance, row_runs, within
 from .cones import Cones, cone_of
+from .facing import Facing, grazes
 from .jit import kernel
 
 WORD = 4
@@ -96,8 +97,13 @@ def bench_for(largest: int) -> Bench:
 
 
 @kernel
-def make(cones: Cones, lattice: Lattice, t: int, pairs: Pairs, at: int, sizes: tuple[int, int], bench: Bench) -> None:
-    """Write the runs, cells and densities of reading t into `pairs` from `at`; `sizes` are its runs and band pairs."""
+def make(
+    cones: Cones, lattice: Lattice, facing: Facing, t: int, pairs: Pairs, at: int, bench: Bench
+) -> tuple[int, int]:
+    """Write the runs, cells and densities of reading t into `pairs` from `at`; return its runs and band pairs.
+
+    Surfaces that the reading grazes are left out, which may cut a run in two.
+    """
     reading = cones[t]
     cone = cone_of(reading, lattice.nearest)
     n, m = at, 0
@@ -107,25 +113,39 @@ def make(cones: Cones, lattice: Lattice, t: int, pairs: Pairs, at: int, sizes: t
         first, last = within(cone.x, v, reading.free, lattice.nearest)
         start = row * lattice.width
         for begin, end in ((a, b), (c, d)):
+            if begin > end:
+                continue
+            slanted = facing.slant > 0.0 and facing.before[row, end + 1] > facing.before[row, begin]
             inner, outer = max(begin, first), min(end, last)
-            if inner <= outer:
+            if inner > outer:
+                inner, outer = end + 1, end
+            elif not slanted:
                 pairs.cell[n] = start + inner
                 pairs.cell[n + 1] = start + outer
                 n += 2
             else:
-                inner, outer = end + 1, end
+                left = inner
+                for column in range(inner, outer + 2):
+                    if column > outer or grazes(facing, reading, start + column, column + 0.5 - cone.x, v):
+                        if left < column:
+                            pairs.cell[n] = start + left
+                            pairs.cell[n + 1] = start + column - 1
+                            n += 2
+                        left = column + 1
             for side_first, side_last in ((begin, inner - 1), (outer + 1, end)):
                 for column in range(side_first, side_last + 1):
-                    bench.unsorted[m] = start + column
-                    bench.unsorted_key[m] = distance(column + 0.5 - cone.x, v, lattice.nearest)
-                    m += 1
+                    u = column + 0.5 - cone.x
+                    if not slanted or not grazes(facing, reading, start + column, u, v):
+                        bench.unsorted[m] = start + column
+                        bench.unsorted_key[m] = distance(u, v, lattice.nearest)
+                        m += 1
     _sort(bench, m)
     peak = 1.0 / (math.sqrt(2.0 * math.pi) * reading.sigma * lattice.resolution)
-    begin = at + WORDS_PER_RUN * sizes[0]
     for k in range(m):
         error = (reading.z - bench.key[k]) / reading.sigma
-        pairs.cell[begin + k] = bench.cell[k]
-        pairs.density[begin + m + k] = peak * math.exp(-0.5 * error * error) if abs(error) <= lattice.cut else 0.0
+        pairs.cell[n + k] = bench.cell[k]
+        pairs.density[n + m + k] = peak * math.exp(-0.5 * error * error) if abs(error) <= lattice.cut else 0.0
+    return (n - at) // WORDS_PER_RUN, m
 
 
 @kernel

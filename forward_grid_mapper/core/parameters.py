@@ -91,11 +91,11 @@ class ModelParameters:
     """
 
     p_hit: float = _param(
-        0.6, 'Probability that an occupied cell in the cone returns the echo.', 'probability', 0.01, 0.98
+        0.7, 'Probability that an occupied cell in the cone returns the echo.', 'probability', 0.01, 0.98
     )
     p_rand: float = _param(0.4, 'Probability that a reading is random, whatever the map.', 'probability', 1e-4, 0.95)
     p_lost: float = _param(
-        0.25,
+        0.4,
         "Probability that no echo is heard, whatever the map, as off smooth walls; 0 is the paper's model.",
         'probability',
         0.0,
@@ -108,7 +108,14 @@ class ModelParameters:
         0.001,
         5.0,
     )
-    cut: float = _param(5.0, 'The noise density is cut off at this many sigma.', 'sigma', 3.0, 40.0)
+    cut: float = _param(4.0, 'The noise density is cut off at this many sigma.', 'sigma', 3.0, 40.0)
+    grazing_angle: float = _param(
+        0.7,
+        'A reading that meets a surface this far off its normal does not contradict it; pi/2 has none of that.',
+        'rad',
+        0.1,
+        1.5708,
+    )
     cell_distance: str = _param(
         'center',
         'Distance from the sensor to a cell: to its center or to its nearest point.',
@@ -135,6 +142,33 @@ class SearchParameters:
         1e-6,
         0.5,
     )
+    driven_cost: float = _param(
+        20.0,
+        'How much less likely a cell is occupied over which a sensor was moved; 0 is the paper.',
+        'nats',
+        0.0,
+        1000.0,
+    )
+    line_bonus: float = _param(
+        0.3, 'What an occupied cell gains where a wall passes through it; 0 is the paper.', 'nats', 0.0, 10.0
+    )
+    end_cost: float = _param(1.0, 'What the end of a wall costs, or a corner; 0 is the paper.', 'nats', 0.0, 100.0)
+    isolated_cost: float = _param(
+        2.0, 'What an occupied cell without occupied neighbour costs; 0 is the paper.', 'nats', 0.0, 100.0
+    )
+    bridges: int = _param(
+        10, 'Longest gap between two ends of walls that is tried to be closed at once.', 'cells', 0, 50
+    )
+    extend: int = _param(
+        3, 'Cells by which walls are drawn out at their ends where no reading speaks against it.', 'cells', 0, 20
+    )
+    least_passed: float = _param(
+        0.9,
+        'Readings that are expected to have passed through a cell for it to be known as free; 0 takes all cells seen.',
+        'readings',
+        0.0,
+        100.0,
+    )
     shift_moves: bool = _param(True, 'Also try to move an occupied cell to a neighbouring one in a single step.')
     max_sweeps: int = _param(
         200, 'Bound on the sweeps over the map; the report says when it was reached.', 'sweeps', 1, 100_000
@@ -148,15 +182,25 @@ class SearchParameters:
         1_000_000,
     )
     alpha: float = _param(
-        0.8,
+        1.0,
         'Weight of the evidence in the uncertainty map (eq 45); 0 leaves only the prior, 1 trusts the one map found.',
         '',
         0.0,
         1.0,
     )
-    uncertainty_prior: float = _param(
-        0.3, 'Prior occupancy used in the uncertainty map.', 'probability', 1e-6, 0.999999
+    neighbour_weight: float = _param(
+        0.6, 'Weight of what the neighbours of a cell say in the uncertainty map; 0 is the paper.', '', 0.0, 1.0
     )
+    uncertainty_prior: float = _param(
+        0.38, 'Prior occupancy used in the uncertainty map.', 'probability', 1e-6, 0.999999
+    )
+
+    def __post_init__(self) -> None:
+        if self.line_bonus > 0 and math.log(self.prior / (1 - self.prior)) + self.line_bonus >= 0:
+            raise ParameterError(
+                f'prior = {self.prior:g} and line_bonus = {self.line_bonus:g} make walls likelier than none: they '
+                f'would grow where nothing was seen; log(prior / (1 - prior)) + line_bonus must be less than 0'
+            )
 
 
 @dataclass(frozen=True)

@@ -4,28 +4,32 @@ First come rounds in which all cells flip at once that gain, and gain more than 
 too many occupied cells and thin them out, which leads to better maps than to add one cell at a time, and takes a few
 passes over the readings. When rounds no longer help, sweeps go over the cells that gain, most promising first, until
 no single flip gains anything; then occupied cells are moved to neighbours, and so on until neither gains. Ties keep
-the state. The objective
+the state.
 
-    J(m) = log p(Z | m) + logit(prior) · (number of occupied cells)
+All this happens twice: at first as if the cells of a map were independent, then, from the map found so, with what the
+prior says of walls (`prior`), and with bridges (`bridges`) when nothing else gains. In either part the objective
+
+    J(m) = log p(Z | m) + log p(m)
 
 never falls, and at the end no single flip raises it by more than `LEAST_GAIN` and the cell's share of `ROUNDING`.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from .bridges import build_bridges
 from .cones import Floats, check
 from .evidence import Evidence
 from .flips import State
 from .logs import QUANTUM
 from .moves import best_shifts, flip_in_order, highest, promising, see_any, shift_in_order, try_shifts, unsettle
 from .parameters import SearchParameters
+from .prior import Prior, local_prior, log_prior, prior_gains, shapes
 
 LEAST_GAIN = 1e-4
 """Nats that a flip must gain."""
@@ -64,6 +68,10 @@ class SearchResult:
         1 occupied, 0 free; cells that no reading touches are 0.
     evidence : float64, shape (cells,)
         log p(Z | cell occupied, rest of the map) − log p(Z | cell free, rest of the map) in nats, 0 where untouched.
+    neighbours : float64, shape (cells,)
+        The prior log odds of each cell, given the rest of the map, in nats, 0 where untouched.
+    log_prior : float
+        That of the map, up to a constant.
     progress : Progress
     converged : bool
         False when `max_sweeps` ended the search.
@@ -71,20 +79,44 @@ class SearchResult:
 
     occupied: NDArray[np.uint8]
     evidence: Floats
+    neighbours: Floats
+    log_prior: float
     progress: Progress
     converged: bool
 
 
+Window = tuple[int, int, int, int]
 Watch = Callable[[Progress], None]
 
 
 class Search:
     """One search; its map so far is `evidence.state.maps.occupied`, which another thread may read at any time."""
 
-    def __init__(self, evidence: Evidence, parameters: SearchParameters) -> None:
-        """Start from the map that `evidence` has."""
+    def __init__(
+        self,
+        evidence: Evidence,
+        parameters: SearchParameters,
+        driven: NDArray[np.bool_] | None = None,
+        window: Window | None = None,
+    ) -> None:
+        """Start from the map that `evidence` has.
+
+        Parameters
+        ----------
+        evidence : Evidence
+        parameters : SearchParameters
+        driven : bool, shape (cells,), optional
+            Cells over which sensors were moved.
+        window : optional
+            First row, last one plus one, and columns likewise, of the cells that may change; by default all.
+        """
         self.evidence, self._parameters = evidence, parameters
-        self._prior = math.log(parameters.prior / (1 - parameters.prior))
+        height, width = evidence.grid.shape
+        self._window = window or (0, height, 0, width)
+        driven = np.zeros(evidence.grid.size, np.bool_) if driven is None else driven
+        self._whole = Prior(local_prior(parameters, driven), shapes(parameters))
+        # as if cells were independent
+        self._prior = self._whole._replace(shape=np.zeros(256))
         self._settled = np.zeros(evidence.grid.size, np.uint8)
         self._tried_at = -1
         self.progress = Progress(0, 0, 0, 0.0)
@@ -99,7 +131,8 @@ class Search:
         return self.progress.sweeps < self._parameters.max_sweeps
 
     def _objective(self) -> float:
-        return self.evidence.log_likelihood + self._prior * int(self.evidence.state.maps.occupied.sum())
+        maps = self.evidence.state.maps
+        return self.evidence.log_likelihood + log_prior(self._prior, maps.occupied, maps.pattern)
 
     def run(self, watch: Watch = lambda progress: None) -> SearchResult:
         """Search until no flip and no move gains; `watch` hears of every sweep.
@@ -111,22 +144,48 @@ class Search:
         """
         while self._more() and self._round(watch):
             pass
-        converged = False
+        return self.refine(watch)
+
+    def refine(self, watch: Watch = lambda progress: None) -> SearchResult:
+        """Do as `run` does, but without the rounds at the beginning."""
+        converged = self._climb(watch)
+        if self._whole.shape.any():
+            self._prior = self._whole
+            self._settled[:] = 0
+            converged = self._climb(watch)
+        maps, width = self.evidence.state.maps, self.evidence.grid.width
+        sign = np.where(maps.occupied == 1, -1.0, 1.0)
+        gains = prior_gains(self._prior, maps.occupied, maps.pattern, maps.seen, width)
+        return SearchResult(
+            maps.occupied,
+            np.asarray(sign * maps.evidence * QUANTUM),
+            np.asarray(sign * gains),
+            log_prior(self._prior, maps.occupied, maps.pattern),
+            self.progress,
+            converged,
+        )
+
+    def _climb(self, watch: Watch) -> bool:
+        """Flip, shift and bridge until nothing gains; return whether that was reached."""
+        p = self._parameters
         while self._more():
-            if self._sweep(watch):
+            if self._sweep(watch) or (p.shift_moves and self._shift(watch)) or (p.bridges > 1 and self._bridge(watch)):
                 continue
-            if not self._parameters.shift_moves or not self._shift(watch):
-                converged = True
-                break
-        maps = self.evidence.state.maps
-        sign = np.where(maps.occupied == 1, -QUANTUM, QUANTUM)
-        return SearchResult(maps.occupied, sign * maps.evidence, self.progress, converged)
+            return True
+        return False
+
+    def _occupied(self) -> NDArray[np.int64]:
+        """Return the occupied cells in the window."""
+        bottom, top, left, right = self._window
+        width = self.evidence.grid.width
+        rows, columns = np.nonzero(self.evidence.state.maps.occupied.reshape(-1, width)[bottom:top, left:right])
+        return np.asarray((rows + bottom) * width + columns + left)
 
     def _promising(self) -> tuple[NDArray[np.int64], Floats]:
         """Return the cells whose flip gains, the best first, and what they gain."""
-        cells, gains = np.empty(self.evidence.grid.size, np.int64), np.empty(self.evidence.grid.size)
-        height, width = self.evidence.grid.shape
-        n = promising(self.evidence.state, self._prior, LEAST, (0, height, 0, width), cells, gains)
+        bottom, top, left, right = self._window
+        cells, gains = np.empty((top - bottom) * (right - left), np.int64), np.empty((top - bottom) * (right - left))
+        n = promising(self.evidence.state, self._prior, LEAST, self._window, cells, gains)
         order = np.argsort(-gains[:n], kind='stable')
         return cells[order], gains[order]
 
@@ -158,9 +217,11 @@ class Search:
 
     def _shift(self, watch: Watch) -> int:
         evidence, s = self.evidence, self.evidence.state
-        unsettle(s, self._tried_at, self._settled)
+        if self._tried_at >= 0:
+            unsettle(s, self._tried_at, self._settled)
         self._tried_at = int(s.clock[0])
-        cells = np.flatnonzero((s.maps.occupied == 1) & (self._settled == 0))
+        cells = self._occupied()
+        cells = cells[self._settled[cells] == 0]
         self._settled[cells] = 1
         slot = np.full(evidence.grid.size, -1, np.int32)
         slot[cells] = np.arange(len(cells), dtype=np.int32)
@@ -183,3 +244,9 @@ class Search:
         shifts, gain = shift_in_order(s, self._prior, LEAST, cells[order], targets[order])
         self._advance(0, shifts, gain, watch)
         return shifts
+
+    def _bridge(self, watch: Watch) -> int:
+        s = self.evidence.state
+        flips, gain = build_bridges(s, self._prior, LEAST, self._occupied(), self._parameters.bridges)
+        self._advance(flips, 0, gain, watch)
+        return flips

@@ -11,19 +11,23 @@ from .cones import Floats
 from .parameters import SearchParameters
 
 
-def marginals(evidence: Floats, parameters: SearchParameters) -> NDArray[np.float32]:
+def marginals(evidence: Floats, neighbours: Floats, parameters: SearchParameters) -> NDArray[np.float32]:
     """Return the occupancy probability of cells from their evidence.
 
     With Δ = log p(Z | cell occupied, rest of m) − log p(Z | cell free, rest of m), eq 43 is logit q = Δ + h_p, and
-    eq 45 mixes it with the prior: logit q = α (Δ + h_p) + (1 − α) h_p = α Δ + h_p.
+    eq 45 mixes it with the prior: logit q = α (Δ + h_p) + (1 − α) h_p = α Δ + h_p. What the prior says of the cell
+    given its neighbours in m comes with a weight of its own, since it says too much: logit q = α Δ + β G + h_p.
 
     Parameters
     ----------
     evidence : float64
         Δ in nats, any shape.
+    neighbours : float64, same shape
+        G, the prior log odds of each cell given its neighbours, nats.
     parameters : SearchParameters
-        Of which `alpha` and `uncertainty_prior` count.
+        Of which `alpha`, `neighbour_weight` and `uncertainty_prior` count.
     """
-    prior = parameters.uncertainty_prior
-    logit = np.clip(parameters.alpha * evidence + math.log(prior / (1 - prior)), -500.0, 500.0)
+    p = parameters
+    base = math.log(p.uncertainty_prior / (1 - p.uncertainty_prior))
+    logit = np.clip(p.alpha * evidence + p.neighbour_weight * neighbours + base, -500.0, 500.0)
     return (1.0 / (1.0 + np.exp(-logit))).astype(np.float32)

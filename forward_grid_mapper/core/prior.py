@@ -1,0 +1,122 @@
+"""The prior of a map: how likely cells are occupied, given what is driven over and given their neighbours.
+
+    log p(m) = Σ over occupied cells c of [ local(c) + shape(the occupied ones of its eight neighbours) ]
+
+Walls are curves. A cell through which a curve passes, with two occupied neighbours on opposite sides of it, costs next
+to nothing; the end of a curve costs something, and a cell on its own more. With all three 0 this is the paper's
+prior, where cells are independent.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .cones import Floats
+from .jit import kernel
+from .parameters import SearchParameters
+
+EAST, NORTH_EAST, NORTH, NORTH_WEST, WEST, SOUTH_WEST, SOUTH, SOUTH_EAST = range(8)
+"""Bits of a pattern; rows count upward."""
+
+OPPOSITE_ENOUGH = 3
+"""Eighths of a turn between two neighbours that a curve can pass through."""
+
+
+class Prior(NamedTuple):
+    """Log prior odds.
+
+    Attributes
+    ----------
+    local : float64, shape (cells,)
+        Of each cell by itself.
+    shape : float64, shape (256,)
+        What the pattern of occupied neighbours adds; bit k stands for the neighbour k eighths of a turn from east.
+    """
+
+    local: Floats
+    shape: Floats
+
+
+def shapes(parameters: SearchParameters) -> Floats:
+    """Return what each of the 256 patterns adds to the log prior odds of an occupied cell."""
+    out = np.full(256, -parameters.end_cost)
+    out[0] = -parameters.isolated_cost
+    for pattern in range(1, 256):
+        bits = [k for k in range(8) if pattern >> k & 1]
+        if any(min((a - b) % 8, (b - a) % 8) >= OPPOSITE_ENOUGH for a in bits for b in bits):
+            out[pattern] = parameters.line_bonus
+    return out
+
+
+def local_prior(parameters: SearchParameters, driven: NDArray[np.bool_]) -> Floats:
+    """Return the log prior odds of each cell by itself, given which are `driven` over; the same shape."""
+    odds = math.log(parameters.prior / (1 - parameters.prior))
+    out: Floats = np.where(driven, odds - parameters.driven_cost, odds)
+    return out
+
+
+@kernel
+def neighbour(c: int, k: int, width: int) -> int:
+    """Return the neighbour of cell c that bit k of a pattern stands for; it must exist."""
+    if k < 3:
+        return c + (1 if k < 2 else 0) + (0 if k == 0 else width)
+    if k < 6:
+        return c + (-1) + (width if k == 3 else (0 if k == 4 else -width))
+    return c - width + (0 if k == 6 else 1)
+
+
+@kernel
+def prior_gain(prior: Prior, occupied: NDArray[np.uint8], pattern: NDArray[np.uint8], c: int, width: int) -> float:
+    """Return what flipping cell c adds to the log prior."""
+    own = pattern[c]
+    gain = prior.local[c] + prior.shape[own]
+    if own:
+        for k in range(8):
+            if own >> k & 1:
+                o = neighbour(c, k, width)
+                bit = 1 << ((k + 4) & 7)
+                gain += prior.shape[pattern[o] | bit] - prior.shape[pattern[o] & ~bit & 255]
+    return float(-gain if occupied[c] else gain)
+
+
+@kernel
+def prior_gains(
+    prior: Prior, occupied: NDArray[np.uint8], pattern: NDArray[np.uint8], seen: NDArray[np.int32], width: int
+) -> Floats:
+    """Return `prior_gain` of all cells that readings see, 0 of others, shape (cells,)."""
+    out = np.zeros(len(occupied))
+    for c in range(len(out)):
+        if seen[c]:
+            out[c] = prior_gain(prior, occupied, pattern, c, width)
+    return out
+
+
+@kernel
+def note_flip(pattern: NDArray[np.uint8], c: int, height: int, width: int) -> None:
+    """Bring the patterns of the neighbours of cell c, which was flipped, up to date."""
+    row, column = c // width, c % width
+    for k in range(8):
+        o = neighbour(c, k, width)
+        y, x = o // width, o % width
+        if 0 <= o < height * width and abs(y - row) <= 1 and abs(x - column) <= 1:
+            pattern[o] ^= 1 << ((k + 4) & 7)
+
+
+def patterns(occupied: NDArray[np.uint8], shape: tuple[int, int]) -> NDArray[np.uint8]:
+    """Return the pattern of occupied neighbours of every cell, shape (cells,)."""
+    wide = np.pad(occupied.reshape(shape), 1)
+    out = np.zeros(shape, np.uint8)
+    steps = ((0, 1), (1, 1), (1, 0), (1, -1), (0, -1), (-1, -1), (-1, 0), (-1, 1))
+    for k, (dy, dx) in enumerate(steps):
+        out |= (wide[1 + dy : 1 + dy + shape[0], 1 + dx : 1 + dx + shape[1]] << k).astype(np.uint8)
+    return out.ravel()
+
+
+def log_prior(prior: Prior, occupied: NDArray[np.uint8], pattern: NDArray[np.uint8]) -> float:
+    """Return the log prior of a map, up to a constant."""
+    cells = np.flatnonzero(occupied)
+    return float(prior.local[cells].sum() + prior.shape[pattern[cells]].sum())
