@@ -65,6 +65,22 @@ class PlacingParameters:
         0.0, "Full cone angle used instead of the messages'; 0 takes theirs.", 'rad', 0.0, 3.1
     )
     max_range: float = _param(0.0, "Largest range used instead of the messages'; 0 takes theirs.", 'm', 0.0, 1000.0)
+    max_jump: float = _param(
+        1000.0,
+        'A reading farther than this from all that was mapped before is rejected, lest a wild pose make the map huge.',
+        'm',
+        1.0,
+        1e7,
+    )
+    max_readings: int = _param(
+        500_000,
+        'Readings that are kept to map from; of more, the oldest go where a sensor looked most often from one place '
+        'in one direction. 0 keeps all.',
+        'readings',
+        0,
+        100_000_000,
+        read_only=True,
+    )
 
 
 @dataclass(frozen=True)

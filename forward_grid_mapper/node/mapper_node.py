@@ -83,6 +83,8 @@ class MapperNode(Node):
         if node.map_frame and not transforms.available:
             raise MapperError(f'map_frame is {node.map_frame}, but tf2_ros is not installed to look it up')
         self._placer = Placer(self._mounts, self.parameters)
+        # the live map has every reading, also those that max_readings drops
+        self._placer.buffer.before_thinning.append(self._update_live)
         self._maps_out = {name: self.create_publisher(OccupancyGrid, f'~/{name}', LATCHED) for name in MAPS}
         self._latest = {name: self._message(Grid(self.parameters.grid.resolution, 0, 0, 0, 0), None) for name in MAPS}
         self._diagnostics_out = self.create_publisher(DiagnosticArray, '/diagnostics', 10)
