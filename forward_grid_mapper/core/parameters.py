@@ -221,6 +221,12 @@ class NodeParameters:
         read_only=True,
     )
     publish_rate: float = _param(1.0, 'Largest rate of live maps, and of maps seen while EM runs.', 'Hz', 0.01, 50.0)
+    journal: str = _param(
+        '',
+        'Folder of the journal, which keeps every accepted reading on disk and gives them back after a restart; empty: '
+        'none.',
+        read_only=True,
+    )
     save_directory: str = _param('~/forward_grid_mapper', 'Folder in which save_maps makes a new folder at each call.')
 
 

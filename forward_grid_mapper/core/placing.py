@@ -283,7 +283,7 @@ class Placer:
         if (message.frame_id, message.child_frame_id) != (self.map_frame, self.base_frame):
             self.odometry_rejected['other_frame'] += 1
             return
-        self._extend_path(message.pose)
+        self.extend_path(message.pose[:2])
         stamps, poses = self._stamps, self._poses
         if stamps and message.stamp < stamps[-1] - JUMP:
             self._jump_back()
@@ -331,10 +331,11 @@ class Placer:
         )
         self.buffer.extend(readings)
 
-    def _extend_path(self, pose: Pose2) -> None:
-        if self.path and math.dist(self.path[-1], pose[:2]) <= self._path_step:
+    def extend_path(self, point: tuple[float, float]) -> None:
+        """Add a point to the robot's path, if it lies far enough from the last one."""
+        if self.path and math.dist(self.path[-1], point) <= self._path_step:
             return
-        self.path.append(pose[:2])
+        self.path.append(point)
         if len(self.path) > MOST_POINTS:
             del self.path[1::2]
             self._path_step *= 2

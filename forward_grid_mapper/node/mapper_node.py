@@ -32,6 +32,7 @@ from .deferred import DeferredService, Reply
 from .em import EmWorker, Outcome, Run, summary
 from .frames import MapFrame, Mounts, Transforms
 from .grid_message import grid_message
+from .journal_keeper import JournalKeeper
 
 NAME = 'forward_grid_mapper'
 QUEUE = 2000
@@ -85,6 +86,7 @@ class MapperNode(Node):
         self._placer = Placer(self._mounts, self.parameters)
         # the live map has every reading, also those that max_readings drops
         self._placer.buffer.before_thinning.append(self._update_live)
+        self._journal = JournalKeeper(self, node.journal, self._placer, self._steady)
         self._maps_out = {name: self.create_publisher(OccupancyGrid, f'~/{name}', LATCHED) for name in MAPS}
         self._latest = {name: self._message(Grid(self.parameters.grid.resolution, 0, 0, 0, 0), None) for name in MAPS}
         self._diagnostics_out = self.create_publisher(DiagnosticArray, '/diagnostics', 10)
@@ -110,6 +112,8 @@ class MapperNode(Node):
     def close(self) -> None:
         """Cancel what goes on in the background."""
         self._em.cancel(wait=2.0)
+        if hasattr(self, '_journal'):
+            self._journal.close()
 
     @staticmethod
     def _quality(reliability: str) -> QoSProfile:
@@ -232,7 +236,10 @@ class MapperNode(Node):
     def _reset(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         self._em.cancel()
         forgotten = len(self._placer.buffer)
+        # also what came since it last looked
+        self._journal.take()
         self._placer.clear()
+        kept = self._journal.reset()
         self._live = LiveMap(self.parameters)
         self._live_count = self._published = 0
         self._last_run = 'none since the reset'
@@ -243,7 +250,7 @@ class MapperNode(Node):
             self._maps = None
             for name in MAPS:
                 self._publish(name, nothing, np.full(nothing.shape, -1, np.int8))
-        response.success, response.message = True, f'{forgotten} readings and all maps were forgotten'
+        response.success, response.message = True, f'{forgotten} readings and all maps were forgotten{kept}'
         return response
 
     def _pause(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
@@ -356,4 +363,5 @@ class MapperNode(Node):
             self._paused,
             extra,
         )
+        statuses += self._journal.statuses(self.get_fully_qualified_name().lstrip('/'))
         self._diagnostics_out.publish(diagnostics.array(statuses, self.get_clock().now().to_msg()))

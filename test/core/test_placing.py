@@ -423,7 +423,7 @@ def test_what_strangers_can_make_grow_is_bounded() -> None:
 def test_a_long_path_is_told_by_fewer_points() -> None:
     p = placer()
     for k in range(3 * MOST_POINTS):
-        p._extend_path(Pose2(0.06 * k, 0.0, 0.0))
+        p.extend_path((0.06 * k, 0.0))
     assert len(p.path) <= MOST_POINTS
     assert p.path[-1][0] > 0.06 * 3 * MOST_POINTS - 1.0
     steps = np.diff(np.array(p.path)[:, 0])
