@@ -36,6 +36,7 @@ REASONS = {
     'bad_limits': 'min_range or max_range is negative, not finite, or max_range is not above min_range',
     'bad_field_of_view': 'the field of view is not between 0 and 180 degrees; parameter field_of_view overrides it',
     'empty_frame_id': 'the header has no frame_id, so the sensor is unknown',
+    'long_frame_id': 'the frame_id has more than 255 characters',
     'unknown_mount': 'nothing tells where this frame is on the robot: give --sensor, a YAML or a transform',
     'before_odometry': 'the stamp is before the first odometry, or the message came minutes late',
     'after_odometry': 'the recording ended before odometry reached the stamp',
@@ -54,6 +55,7 @@ REASONS = {
 
 ODOMETRY_REASONS = {
     'bad_pose': 'the pose is not finite, absurdly far away, or its quaternion is not normalised',
+    'long_frame_id': 'the frame_id or child_frame_id has more than 255 characters',
     'other_frame': 'the frame_id or child_frame_id differs from that of the first odometry message',
 }
 """Why an odometry message is rejected, in words."""
@@ -95,6 +97,9 @@ NEAREST = 0.001
 MOST_FRAMES = 1000
 """Sensor frames that are told apart in the counts; whatever comes after them is counted as `OTHERS`."""
 
+LONGEST_NAME = 255
+"""Characters of a frame's name."""
+
 OTHERS = '(other frames)'
 
 MOST_WAITING = 100_000
@@ -135,6 +140,8 @@ def measure(message: RangeMessage, parameters: PlacingParameters) -> _Measuremen
     """
     if not message.frame_id:
         return 'empty_frame_id'
+    if len(message.frame_id) > LONGEST_NAME:
+        return 'long_frame_id'
     angle = parameters.field_of_view or message.field_of_view
     if not 0.0 < angle < math.pi:
         return 'bad_field_of_view'
@@ -278,6 +285,9 @@ class Placer:
         if message.pose is None or not max(abs(message.pose.x), abs(message.pose.y)) < FARTHEST:
             self.odometry_rejected['bad_pose'] += 1
             return
+        if max(len(message.frame_id), len(message.child_frame_id)) > LONGEST_NAME:
+            self.odometry_rejected['long_frame_id'] += 1
+            return
         if not self.map_frame and not self.base_frame:
             self.map_frame, self.base_frame = message.frame_id, message.child_frame_id
         if (message.frame_id, message.child_frame_id) != (self.map_frame, self.base_frame):
@@ -342,7 +352,9 @@ class Placer:
 
     def _reject(self, frame_id: str, reason: str) -> None:
         self.rejected[reason] += 1
-        frame = frame_id if frame_id in self.rejected_by_frame or len(self.rejected_by_frame) < MOST_FRAMES else OTHERS
+        known = self.rejected_by_frame
+        room = len(known) < MOST_FRAMES and len(frame_id) <= LONGEST_NAME
+        frame = frame_id if frame_id in known or room else OTHERS
         self.rejected_by_frame.setdefault(frame, Counter())[reason] += 1
 
     def _reject_unknown(self, measured: _Measurement) -> None:
