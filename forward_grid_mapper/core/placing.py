@@ -56,7 +56,7 @@ REASONS = {
 ODOMETRY_REASONS = {
     'bad_pose': 'the pose is not finite, absurdly far away, or its quaternion is not normalised',
     'long_frame_id': 'the frame_id or child_frame_id has more than 255 characters',
-    'other_frame': 'the frame_id or child_frame_id differs from that of the first odometry message',
+    'other_frame': 'the frame_id or child_frame_id is not that of the first odometry message; reset takes the new',
 }
 """Why an odometry message is rejected, in words."""
 
@@ -114,6 +114,11 @@ def interpolate(before: Pose2, after: Pose2, fraction: float) -> Pose2:
         before.y + fraction * (after.y - before.y),
         before.yaw + fraction * turn,
     )
+
+
+def _possible(pose: Pose2) -> bool:
+    """Whether a pose is finite and on Earth; `max` and `min` would hide a NaN."""
+    return abs(pose.x) < FARTHEST and abs(pose.y) < FARTHEST and math.isfinite(pose.yaw)
 
 
 class _Measurement:
@@ -233,6 +238,7 @@ class Placer:
         self._newest_range: int | None = None
         self._held: list[tuple[_Measurement, Pose2]] = []
         self._next_try = self._next_look = 0
+        self._other_frame = False
 
     @property
     def waiting(self) -> int:
@@ -265,8 +271,16 @@ class Placer:
         self.received += 1
         self._reject(message.frame_id, reason)
 
-    def clear(self) -> None:
-        """Forget readings, counts and path; odometry is kept, so that the next reading can be placed."""
+    def clear(self, parameters: Parameters | None = None) -> None:
+        """Forget readings, counts and path; odometry is kept, so that the next reading can be placed.
+
+        `parameters` are those of the maps that begin now.
+        """
+        self._all = parameters or self._all
+        if self._other_frame:
+            self.map_frame = self.base_frame = ''
+            self._stamps.clear()
+            self._poses.clear()
         self.buffer.clear()
         self.rejected.clear()
         self.odometry_rejected.clear()
@@ -282,7 +296,7 @@ class Placer:
     def add_odometry(self, message: OdometryMessage) -> None:
         """Take one Odometry message."""
         self.odometry_received += 1
-        if message.pose is None or not max(abs(message.pose.x), abs(message.pose.y)) < FARTHEST:
+        if message.pose is None or not _possible(message.pose):
             self.odometry_rejected['bad_pose'] += 1
             return
         if max(len(message.frame_id), len(message.child_frame_id)) > LONGEST_NAME:
@@ -292,7 +306,9 @@ class Placer:
             self.map_frame, self.base_frame = message.frame_id, message.child_frame_id
         if (message.frame_id, message.child_frame_id) != (self.map_frame, self.base_frame):
             self.odometry_rejected['other_frame'] += 1
+            self._other_frame = True
             return
+        self._other_frame = False
         self.extend_path(message.pose[:2])
         stamps, poses = self._stamps, self._poses
         if stamps and message.stamp < stamps[-1] - JUMP:
@@ -480,7 +496,7 @@ class Placer:
         """Return why the map cannot grow to hold a reading; if it can, note that it does."""
         reach = self._reach(measured)
         cell = self._all.grid.resolution
-        if not max(abs(sensor.x), abs(sensor.y)) < FARTHEST:
+        if not _possible(sensor):
             return 'too_far_away'
         left, right, bottom, top = self._box
         if left <= right:

@@ -10,7 +10,7 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 
 from ..core.grid import Grid
-from ..core.placing import REASONS, Placer
+from ..core.placing import ODOMETRY_REASONS, REASONS, Placer
 from .em import Run
 
 SILENCE = 3.0
@@ -31,7 +31,7 @@ class Health:
         self._begin = time.monotonic()
         self._last: dict[str, tuple[int, float]] = {}
         self._rejected = 0
-        self._received = 0
+        self._received = self._refused = 0
         self._by_reason: Counter[str] = Counter()
         self._slowest = 0
 
@@ -73,10 +73,15 @@ class Health:
         received, rejected = placer.received, sum(placer.rejected.values())
         new, new_rejected = received - self._received, rejected - self._rejected
         self._received, self._rejected = received, rejected
-        silent_odometry = self._silence('odometry', placer.odometry_received)
+        refused = sum(placer.odometry_rejected.values())
+        silent_odometry = self._silence('odometry', placer.odometry_received - refused)
+        refused_now, self._refused = refused - self._refused, refused
         silent_ranges = self._silence('range', placer.received)
         if paused:
             return DiagnosticStatus.OK, 'paused'
+        if silent_odometry > SILENCE and refused_now > 0:
+            reason = max(placer.odometry_rejected, key=lambda key: placer.odometry_rejected[key])
+            return DiagnosticStatus.WARN, f'odometry is rejected as {reason}: {ODOMETRY_REASONS[reason]}'
         if silent_odometry > SILENCE:
             return DiagnosticStatus.WARN, f'no odometry for {silent_odometry:.0f} s'
         if silent_ranges > SILENCE:

@@ -18,6 +18,10 @@ PATIENCE = 0.2
 """Seconds before a frame that TF did not know is asked for again, so that a missing one costs next to nothing."""
 
 
+MOST_MISSING = 1000
+"""Frames whose absence is remembered, so that names that strangers make up cost no memory."""
+
+
 class Transforms:
     """Transforms at a stamp, from a tf2 buffer and without waiting for it; knows none without tf2_ros."""
 
@@ -46,8 +50,11 @@ class Transforms:
     def lookup(self, target: str, source: str, stamp: int) -> Any | None:
         """Return the `geometry_msgs/Transform` of `source` in `target` at `stamp` in nanoseconds, or None."""
         key = (target, source)
-        if self._buffer is None or time.monotonic() < self._missing.get(key, 0.0):
+        # rclpy's Time raises for what is before 1970, and TF has nothing then
+        if self._buffer is None or stamp < 0 or time.monotonic() < self._missing.get(key, 0.0):
             return None
+        if len(self._missing) > MOST_MISSING:
+            self._missing.clear()
         from rclpy.time import Time
 
         try:

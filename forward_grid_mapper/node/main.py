@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import sys
 import time
+import traceback
 from collections.abc import Sequence
+from typing import Any
 
 from ..core.errors import MapperError
 from .stopping import Stopper
@@ -16,12 +18,33 @@ Parameters: --ros-args -p NAME:=VALUE, or --params-file FILE (config/mapper.yaml
 and odom with -r sonar:=/my/sonar -r odom:=/my/odom."""
 
 
+TELL_EVERY = 10.0
+"""Seconds between two reports of callbacks that fail."""
+
+
 class _Stop(Exception):
     """Raised inside the executor to end its spinning."""
 
 
 def _raise_stop() -> None:
     raise _Stop
+
+
+def _spin(executor: Any, node: Any) -> None:
+    """Spin until `_Stop` or the end of ROS; a callback that fails is told, and must not take the map with it."""
+    told = 0.0
+    while executor.context.ok():
+        try:
+            executor.spin()
+        except _Stop:
+            raise
+        except Exception:
+            now = time.monotonic()
+            if now > told + TELL_EVERY:
+                told = now
+                node.get_logger().error(f'a callback failed, mapping goes on: {traceback.format_exc()}')
+            # one that fails all the time must not take all of the time
+            time.sleep(0.001)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -71,7 +94,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         executor.add_node(node)
         node.start()
         stopper.call(lambda: executor.create_task(_raise_stop))
-        executor.spin()
+        _spin(executor, node)
     except _Stop:
         pass
     except (MapperError, NameValidationException, ValueError) as error:

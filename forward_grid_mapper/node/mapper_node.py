@@ -24,7 +24,7 @@ from ..core.live_map import LiveMap
 from ..core.maps import MapSet
 from ..core.messages import NANOSECONDS, odometry_message, range_message
 from ..core.parameters import Parameters
-from ..core.placing import Placer
+from ..core.placing import MOST_FRAMES, Placer
 from ..files.output_folder import free_name
 from ..files.results import write_results
 from . import diagnostics, ros_parameters
@@ -238,7 +238,7 @@ class MapperNode(Node):
         forgotten = len(self._placer.buffer)
         # also what came since it last looked
         self._journal.take()
-        self._placer.clear()
+        self._placer.clear(self.parameters)
         kept = self._journal.reset()
         self._live = LiveMap(self.parameters)
         self._live_count = self._published = 0
@@ -344,7 +344,9 @@ class MapperNode(Node):
 
     def _report(self) -> None:
         placer = self._placer
-        for frame in sorted(placer.unknown_frames - self._told):
+        for frame in sorted(placer.unknown_frames - self._told)[: diagnostics.SHOWN]:
+            if len(self._told) >= MOST_FRAMES:
+                break
             self._told.add(frame)
             why = 'its axis leaves the plane by more than 60°' if frame in self._mounts.steep else 'neither is known'
             self.get_logger().warning(

@@ -429,3 +429,21 @@ def test_a_long_path_is_told_by_fewer_points() -> None:
     assert p.path[-1][0] > 0.06 * 3 * MOST_POINTS - 1.0
     steps = np.diff(np.array(p.path)[:, 0])
     assert steps.max() < 2.5 * np.median(steps)
+
+
+def test_a_reset_begins_with_the_odometry_that_comes() -> None:
+    p = placer()
+    p.add_odometry(odometry(0.0)._replace(frame_id='garbage'))
+    for second in (1.0, 1.5):
+        p.add_odometry(odometry(second))
+    p.add_range(sonar(1.2))
+    assert p.odometry_rejected == {'other_frame': 2}
+    p.clear()
+    for second in (2.0, 2.5):
+        p.add_odometry(odometry(second))
+    p.add_range(sonar(2.2))
+    assert (p.map_frame, len(p.buffer), p.odometry_rejected) == ('odom', 1, {})
+    # otherwise it is kept, so that the next reading can be placed
+    p.clear()
+    p.add_range(sonar(2.3))
+    assert (p.map_frame, len(p.buffer)) == ('odom', 1)

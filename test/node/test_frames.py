@@ -149,3 +149,15 @@ def test_odometry_without_a_transform_is_dropped_after_the_timeout(buffer: Buffe
 def test_without_another_map_frame_odometry_passes(transforms: Transforms, name: str) -> None:
     message = OdometryMessage(0, 'odom', 'base', Pose2(0, 0, 0))
     assert MapFrame(name, transforms, 1.0).convert(message) == [message]
+
+
+def test_a_stamp_before_1970_is_no_error(buffer: Buffer, transforms: Transforms) -> None:
+    buffer.known['base_link', 'sonar'] = transform(0.1, 0.2)
+    assert transforms.lookup('base_link', 'sonar', 5) is not None
+    assert transforms.lookup('base_link', 'sonar', -5) is None
+
+
+def test_names_that_nobody_knows_are_not_remembered_for_ever(transforms: Transforms) -> None:
+    for k in range(2 * frames.MOST_MISSING):
+        assert transforms.lookup('base_link', f'frame {k}', 5) is None
+    assert len(transforms._missing) <= frames.MOST_MISSING + 1
