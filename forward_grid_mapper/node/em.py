@@ -8,7 +8,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
-from ..core.errors import Cancelled, MapperError
+from ..core.errors import Cancelled, InputError, MapperError
+from ..core.footprint import shortage
 from ..core.mapping import Mapper
 from ..core.maps import MapSet
 from ..core.parameters import Parameters
@@ -69,7 +70,7 @@ class EmWorker:
             if self.current is not None:
                 return None
             run = Run(Mapper(parameters), readings)
-            run.thread = threading.Thread(target=self._work, args=(run, done), name='em', daemon=True)
+            run.thread = threading.Thread(target=self._work, args=(run, parameters, done), name='em', daemon=True)
             self._run = run
         run.thread.start()
         return run
@@ -81,12 +82,14 @@ class EmWorker:
             run.mapper.cancel()
             run.finished.wait(wait)
 
-    def _work(self, run: Run, done: Callable[[Outcome], None]) -> None:
+    def _work(self, run: Run, parameters: Parameters, done: Callable[[Outcome], None]) -> None:
         def watch(stage: str, progress: Progress | None) -> None:
             run.stage, run.progress = stage, progress
             self._watch(run)
 
         try:
+            if lack := shortage(run.readings, parameters):
+                raise InputError(lack)
             outcome = Outcome(run.mapper.run(run.readings, watch), '')
         except Cancelled:
             outcome = Outcome(None, 'EM was cancelled')

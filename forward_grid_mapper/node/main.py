@@ -2,7 +2,14 @@
 
 from __future__ import annotations
 
+import signal
+
+if __name__ == '__main__':
+    # Ctrl-C while this is imported ends it at once and without a traceback; see `Stopper` for what comes then
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
 import sys
+import threading
 import time
 import traceback
 from collections.abc import Sequence
@@ -49,6 +56,8 @@ def _spin(executor: Any, node: Any) -> None:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the node until it is told to stop; return the exit code."""
+    if threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     if '-h' in arguments or '--help' in arguments:
         print(USAGE)
