@@ -115,6 +115,14 @@ class Health:
         return now - since
 
 
+def add_faults(made: DiagnosticStatus, faults: list[str]) -> None:
+    """Turn a status into a warning if something around the node is wrong."""
+    if faults:
+        well = made.level == DiagnosticStatus.OK
+        made.level = max(made.level, DiagnosticStatus.WARN)
+        made.message = '; '.join(faults if well else [made.message, *faults])
+
+
 def _listed(frames: Collection[str]) -> str:
     more = f' and {len(frames) - SHOWN} more' if len(frames) > SHOWN else ''
     return ', '.join(sorted(frames)[:SHOWN]) + more

@@ -15,6 +15,7 @@ from ..core.maps import MapSet
 from ..core.parameters import Parameters
 from ..core.readings import Readings
 from ..core.search import Progress
+from ..files.doubt import doubt
 
 
 @dataclass
@@ -117,5 +118,7 @@ def summary(maps: MapSet, seconds: float) -> str:
     return (
         f'{len(maps.readings)} readings, {s["sweeps"]} iterations, log-likelihood {maps.log_likelihood:.1f}, '
         f'objective {maps.objective:.1f}, {s["flips"]} flips, {s["shifts"]} shifts, {s["occupied"]} occupied cells, '
-        f'{seconds:.2f} seconds' + ('' if s['converged'] else ', NOT converged: raise max_sweeps')
+        f'{seconds:.2f} seconds'
+        + ('' if s['converged'] else ', NOT converged: raise max_sweeps')
+        + (f'; BUT {told}' if (told := doubt(maps)) else '')
     )

@@ -25,6 +25,7 @@ from ..core.maps import MapSet
 from ..core.messages import NANOSECONDS, odometry_message, range_message
 from ..core.parameters import Parameters
 from ..core.placing import MOST_FRAMES, Placer
+from ..files.doubt import doubt
 from ..files.output_folder import free_name
 from ..files.results import write_results
 from . import diagnostics, ros_parameters
@@ -33,6 +34,7 @@ from .em import EmWorker, Outcome, Run, summary
 from .frames import MapFrame, Mounts, Transforms
 from .grid_message import grid_message
 from .journal_keeper import JournalKeeper
+from .surroundings import Surroundings
 
 NAME = 'forward_grid_mapper'
 QUEUE = 2000
@@ -100,6 +102,9 @@ class MapperNode(Node):
         quality = self._quality(node.range_reliability)
         for topic in dict.fromkeys(node.range_topics):
             self.create_subscription(Range, topic, self._on_range, quality)
+        heard = {self.resolve_topic_name(topic): quality for topic in node.range_topics}
+        heard[self.resolve_topic_name(node.odom_topic)] = self._quality(node.odom_reliability)
+        self._surroundings = Surroundings(self, heard)
         self.create_timer(1.0, self._report, clock=self._steady)
         self._live_timer = self.create_timer(1.0 / node.publish_rate, self._publish_live, clock=self._steady)
         topics = ', '.join(self.resolve_topic_name(topic) for topic in node.range_topics)
@@ -208,6 +213,8 @@ class MapperNode(Node):
                 self.get_logger().warning(f'EM: {outcome.message}')
             else:
                 maps = outcome.maps
+                if told := doubt(maps):
+                    self.get_logger().warning(f'EM: {told}')
                 self._last_run = summary(maps, sum(maps.statistics['seconds'].values()))
                 self.get_logger().info(f'EM: {self._last_run}')
             done(outcome)
@@ -365,5 +372,6 @@ class MapperNode(Node):
             self._paused,
             extra,
         )
+        diagnostics.add_faults(statuses[0], self._surroundings.faults())
         statuses += self._journal.statuses(self.get_fully_qualified_name().lstrip('/'))
         self._diagnostics_out.publish(diagnostics.array(statuses, self.get_clock().now().to_msg()))
