@@ -2,7 +2,7 @@
 
 The folder holds `drive_0001.journal`, `drive_0002.journal` and so on, a new one after every reset, and `lock`, by which
 one node at a time writes. Nothing is ever deleted. A thread writes at once what it is given, which no kill of the
-process undoes, and asks the disk once a second to keep it (fdatasync), so that a power cut loses about a second too.
+process undoes; another asks the disk once a second to keep it (fdatasync), so that a power cut loses little more.
 """
 
 from __future__ import annotations
@@ -11,7 +11,6 @@ import fcntl
 import os
 import re
 import threading
-import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
@@ -21,14 +20,12 @@ from ..core.errors import BagError, OutputError
 from ..core.readings import Readings
 from .journal_format import MAGIC, Contents, frames_block, name_block, path_block, read, readings_block
 from .output_folder import output_errors
+from .syncing import Syncer
 
 _DRIVE = re.compile(r'drive_(\d{4,9})\.journal')
 
 MOST_PENDING = 32 << 20
 """Bytes that wait for a disk that is full or slow; half a million readings. What comes then is not in the journal."""
-
-SYNC_EVERY = 1.0
-"""Seconds after which the disk is asked to keep what was written."""
 
 RETRY = 1.0
 """Seconds after which a write that failed is tried again."""
@@ -98,8 +95,8 @@ class Journal:
         self._pending: deque[_Item] = deque()
         self._bytes = self._unwritten = 0
         self._wake = threading.Condition()
-        self._closing = self._dirty = False
-        self._synced = 0.0
+        self._closing = False
+        self._syncer: Syncer | None = None
         self._thread: threading.Thread | None = None
         with output_errors(self.folder):
             self.folder.mkdir(parents=True, exist_ok=True)
@@ -139,6 +136,7 @@ class Journal:
         self._frames = (self.contents.map_frame, self.contents.base_frame)
         with output_errors(self.path):
             os.ftruncate(self._file, self._end)
+        self._syncer = Syncer(self._warn)
         self._thread = threading.Thread(target=self._work, name='journal', daemon=True)
         self._thread.start()
 
@@ -188,6 +186,8 @@ class Journal:
             if self._thread.is_alive():
                 # the lock goes with the process
                 return
+        if self._syncer is not None:
+            self._syncer.close(seconds)
         os.close(self._file)
         os.close(self._lock)
 
@@ -201,21 +201,16 @@ class Journal:
     def _work(self) -> None:
         while True:
             with self._wake:
-                self._wake.wait_for(lambda: self._pending or self._closing, SYNC_EVERY if self._dirty else None)
-                item = self._pending[0] if self._pending else None
-                last = item is None and self._closing
+                self._wake.wait_for(lambda: self._pending or self._closing)
+                if not self._pending:
+                    return
+                item = self._pending[0]
             try:
-                if item is not None:
-                    self._do(item)
-                    self._done(item)
-                if self._dirty and (item is None or time.monotonic() > self._synced + SYNC_EVERY):
-                    self._dirty = False
-                    os.fdatasync(self._file)
-                    self._synced = time.monotonic()
+                self._do(item)
+                self._done(item)
             except OSError as error:
-                last = self._failed(error)
-            if last:
-                return
+                if self._failed(error):
+                    return
 
     def _done(self, item: _Item) -> None:
         with self._wake:
@@ -239,7 +234,8 @@ class Journal:
     def _do(self, item: _Item) -> None:
         if item.begin is not None:
             opened = _open(item.begin)
-            os.fdatasync(self._file)
+            if self._syncer is not None:
+                self._syncer.closed(self._file)
             os.close(self._file)
             self._file, self._end = opened, 0
             return
@@ -253,7 +249,8 @@ class Journal:
             os.ftruncate(self._file, self._end)
             raise
         self._end += len(data)
-        self._dirty = True
+        if self._syncer is not None:
+            self._syncer.changed(self._file)
 
 
 def _open(path: Path) -> int:

@@ -8,6 +8,7 @@ import random
 import signal
 import subprocess
 import sys
+import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -18,6 +19,7 @@ import pytest
 from forward_grid_mapper.core.errors import BagError, OutputError
 from forward_grid_mapper.core.readings import Readings
 from forward_grid_mapper.files import journal as journal_module
+from forward_grid_mapper.files import syncing
 from forward_grid_mapper.files.journal import Journal, drive_file, drives
 from forward_grid_mapper.files.journal_format import MAGIC, ROW, Contents, read
 
@@ -232,6 +234,33 @@ def test_what_waits_for_a_disk_is_bounded(tmp_path: Path, monkeypatch: pytest.Mo
     (back,) = read(journal.path, contents)
     assert back.sensor_names[back.sensor[-1]] == 'sonar 49'
     assert len(back) == 510 - journal.lost
+
+
+def test_a_slow_disk_holds_up_no_writing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(syncing, 'PERIOD', 0.01)
+    began, go_on = threading.Event(), threading.Event()
+    sync = os.fdatasync
+    synced: list[int] = []
+
+    def fdatasync(file: int) -> None:
+        began.set()
+        assert go_on.wait(10.0)
+        synced.append(os.fstat(file).st_size)
+        sync(file)
+
+    monkeypatch.setattr(os, 'fdatasync', fdatasync)
+    journal, _ = opened(tmp_path)
+    written(journal, made(0, 10))
+    assert began.wait(5.0)
+    written(journal, made(10, 10))
+    journal.begin_drive()
+    written(journal, made(20, 10))
+    assert numbers(drives(tmp_path)[0])[0] == list(range(20))
+    assert not synced
+    go_on.set()
+    journal.close()
+    assert len(synced) == 3
+    assert numbers(drives(tmp_path)[1])[0] == list(range(20, 30))
 
 
 def test_a_limit_on_the_size_of_files_is_a_full_disk(tmp_path: Path) -> None:
