@@ -38,7 +38,7 @@ def main(folder: str) -> None:
             )
         os.write(accepted, struct.pack('<qq', len(buffer), time.time_ns()))
         time.sleep(0.01)
-        if len(buffer) - taken > 200:
+        if len(buffer) - taken > 50:
             journal.put(buffer.snapshot(taken), ('odom', 'base_link'), [(float(taken), 0.0)])
             taken = len(buffer)
 
