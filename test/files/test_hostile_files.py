@@ -56,7 +56,7 @@ def survives(read: Callable[[Path], object], path: Path) -> bool:
         assert str(path.parent) in str(error) or str(path) in str(error)
         return False
     finally:
-        assert time.monotonic() - begin < 2.0
+        assert time.monotonic() - begin < 10.0
 
 
 @pytest.mark.parametrize(
@@ -97,7 +97,7 @@ def test_parameter_files_that_cannot_be(tmp_path: Path, text: str) -> None:
     begin = time.monotonic()
     with pytest.raises(ParameterError, match=r'p\.yaml'):
         load_parameters(path)
-    assert time.monotonic() - begin < 2.0
+    assert time.monotonic() - begin < 10.0
 
 
 def test_garbled_parameter_files(tmp_path: Path) -> None:
