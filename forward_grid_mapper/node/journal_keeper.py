@@ -14,7 +14,7 @@ from ..core.placing import Placer
 from ..files.journal import Journal
 from .diagnostics import status
 
-PERIOD = 0.25
+PERIOD = 0.1
 """Seconds between two looks for new readings."""
 
 FULL = (errno.ENOSPC, errno.EDQUOT)
