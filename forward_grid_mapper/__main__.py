@@ -2,8 +2,15 @@
 
 from __future__ import annotations
 
-import importlib
 import sys
+
+if sys.argv[1:2] == ['mapper']:
+    # as in `node.main`: Ctrl-C gives no traceback, however early
+    import signal
+
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+import importlib
 
 from . import __version__
 

@@ -4,12 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
-
-import numpy as np
-from numpy.typing import NDArray
 
 from ..bags.reader import Bag
 from ..bags.static_transforms import StaticTransforms
@@ -17,28 +12,12 @@ from ..core.errors import BagError, InputError
 from ..core.messages import NANOSECONDS, Pose2, RangeMessage
 from ..core.parameters import Parameters
 from ..core.placing import ODOMETRY_REASONS, REASONS, Placer
+from ..files.journal import drive_file
 from .console import readable
+from .drive import Drive, LiveOfAll, thinning_note
+from .journal_drive import read_journal
 
-
-@dataclass(frozen=True)
-class Drive:
-    """What a bag holds for mapping.
-
-    Attributes
-    ----------
-    placer : Placer
-        With all readings placed.
-    source : dict
-        What was read and rejected, for the report.
-    """
-
-    placer: Placer
-    source: dict[str, Any]
-
-    @property
-    def path_xy(self) -> NDArray[np.float64]:
-        """Where the robot drove, shape (P, 2), metres."""
-        return np.array(self.placer.path, np.float64).reshape(-1, 2)
+__all__ = ['Drive', 'Mounts', 'read_drive']
 
 
 class Mounts:
@@ -96,7 +75,7 @@ def read_drive(
     odom_topic: str | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Drive:
-    """Read a bag and place its readings.
+    """Read a bag and place its readings, or take those of a journal.
 
     Parameters
     ----------
@@ -116,10 +95,14 @@ def read_drive(
     InputError
         If not a single reading could be placed; says why.
     """
+    journal = drive_file(Path(path))
+    if journal is not None:
+        return read_journal(journal, parameters, mounts, range_topics, odom_topic)
     with Bag(path) as bag:
         topics = bag.choose_topics(range_topics, odom_topic)
         lookup = Mounts(mounts, bag.static_transforms())
         placer = Placer(lookup, parameters, patient=True)
+        live = LiveOfAll(placer, parameters)
         spans: dict[str, list[int]] = {'ranges': [], 'odometry': []}
         for message in bag.messages(topics, progress):
             ranged = isinstance(message, RangeMessage)
@@ -157,9 +140,9 @@ def read_drive(
             'undecodable': undecodable,
         },
         'rejected_by_frame': {frame: dict(counts) for frame, counts in placer.rejected_by_frame.items()},
-        'warnings': warnings,
+        'warnings': warnings + thinning_note(placer),
     }
-    return Drive(placer, source)
+    return Drive(placer, source, live)
 
 
 def _warnings(bag: Bag, placer: Placer, lookup: Mounts) -> list[str]:

@@ -30,7 +30,7 @@ def parser() -> argparse.ArgumentParser:
         description='Map a recorded drive: reads sonar Range and Odometry from a ROS 1 or ROS 2 bag and writes the '
         'live log-odds map, the maximum likelihood map and the uncertainty map.',
     )
-    made.add_argument('bag', help='ROS 2 bag folder, single .mcap or .db3 file, or ROS 1 .bag')
+    made.add_argument('bag', help='ROS 2 bag folder, single .mcap or .db3 file, ROS 1 .bag, or a journal of the node')
     made.add_argument('-o', '--output', metavar='DIR', help='new folder for the results (default: BAG_maps)')
     made.add_argument('--range-topics', nargs='+', metavar='TOPIC', help='Range topics (default: all in the bag)')
     made.add_argument('--odom-topic', metavar='TOPIC', help='Odometry topic (needed if the bag has several)')
@@ -75,6 +75,7 @@ def process(options: argparse.Namespace) -> int:
         )
         read = time.perf_counter() - begin
         maps = Mapper(parameters, options.learn).run(drive.placer.readings, ticker.mapping)
+        maps = drive.live.on(maps)
         maps.statistics['seconds'] = {'reading the bag': read, **maps.statistics['seconds']}
         ticker.say('writing')
         if options.learn:

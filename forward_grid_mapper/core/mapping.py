@@ -14,6 +14,7 @@ from .cones import check, grid_of
 from .driven import driven_cells
 from .evidence import Evidence
 from .finishing import finish
+from .footprint import memory_for_pairs
 from .grid import Grid
 from .learning import learn
 from .live_map import LiveMap, arc_depth
@@ -108,7 +109,7 @@ class Mapper:
         grid = grid_of(readings, parameters.model, parameters.grid, beyond=arc_depth(parameters))
         asked = parameters.search
         with self._stage('index', watch):
-            memory, threads = asked.max_memory * 1e6, asked.threads or cores()
+            memory, threads = memory_for_pairs(parameters), asked.threads or cores()
             occupied = None if start is None else (part_of(*start, grid) == 1).astype(np.uint8)
             evidence = Evidence(grid, parameters.model, memory, threads, self._stop, occupied)
             evidence.extend(readings)

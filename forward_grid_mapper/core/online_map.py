@@ -21,6 +21,7 @@ from .cones import effective_sigma, grid_of
 from .driven import mark_driven
 from .evidence import Evidence
 from .finishing import finish
+from .footprint import memory_for_pairs
 from .grid import Grid
 from .live_map import arc_depth
 from .logs import QUANTUM
@@ -169,8 +170,8 @@ class OnlineMap:
         if evidence is None:
             # surfaces would have to be faced anew as readings come
             model = dataclasses.replace(p.model, grazing_angle=math.pi / 2)
-            memory, threads = p.search.max_memory * 1e6, p.search.threads or cores()
-            self._evidence = evidence = Evidence(larger, model, memory, threads)
+            threads = p.search.threads or cores()
+            self._evidence = evidence = Evidence(larger, model, memory_for_pairs(p), threads)
             self._driven = np.zeros(larger.shape, np.bool_)
         else:
             larger = larger.union(evidence.grid)

@@ -65,6 +65,22 @@ class PlacingParameters:
         0.0, "Full cone angle used instead of the messages'; 0 takes theirs.", 'rad', 0.0, 3.1
     )
     max_range: float = _param(0.0, "Largest range used instead of the messages'; 0 takes theirs.", 'm', 0.0, 1000.0)
+    max_jump: float = _param(
+        1000.0,
+        'A reading farther than this from all that was mapped before is rejected, lest a wild pose make the map huge.',
+        'm',
+        1.0,
+        1e7,
+    )
+    max_readings: int = _param(
+        500_000,
+        'Readings that are kept to map from; of more, the oldest go where a sensor looked most often from one place '
+        'in one direction. 0 keeps all.',
+        'readings',
+        0,
+        100_000_000,
+        read_only=True,
+    )
 
 
 @dataclass(frozen=True)
@@ -263,6 +279,12 @@ class NodeParameters:
     )
     publish_rate: float = _param(
         1.0, 'Largest rate of live maps, of online maps, and of maps seen while EM runs.', 'Hz', 0.01, 50.0
+    )
+    journal: str = _param(
+        '',
+        'Folder of the journal, which keeps every accepted reading on disk and gives them back after a restart; empty: '
+        'none.',
+        read_only=True,
     )
     save_directory: str = _param('~/forward_grid_mapper', 'Folder in which save_maps makes a new folder at each call.')
 

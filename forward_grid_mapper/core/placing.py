@@ -15,7 +15,8 @@ from collections.abc import Callable
 
 from .messages import NANOSECONDS, OdometryMessage, Pose2, RangeMessage
 from .parameters import Parameters, PlacingParameters
-from .readings import ReadingBuffer, Readings
+from .reading_buffer import ReadingBuffer
+from .readings import Readings
 
 
 class Later:
@@ -29,27 +30,33 @@ MountLookup = Callable[[str, str, int], 'Pose2 | Later | None']
 
 REASONS = {
     'nan_range': 'the range is not a number',
-    'too_near': 'the range is -inf: something too near to measure',
+    'too_near': 'the range is -inf, or less than a millimetre: something too near to measure, or a dead sensor',
     'below_min_range': 'the range is below min_range',
     'over_range': 'no echo, and over_range is "discard"',
     'bad_limits': 'min_range or max_range is negative, not finite, or max_range is not above min_range',
     'bad_field_of_view': 'the field of view is not between 0 and 180 degrees; parameter field_of_view overrides it',
     'empty_frame_id': 'the header has no frame_id, so the sensor is unknown',
+    'long_frame_id': 'the frame_id has more than 255 characters',
     'unknown_mount': 'nothing tells where this frame is on the robot: give --sensor, a YAML or a transform',
     'before_odometry': 'the stamp is before the first odometry, or the message came minutes late',
     'after_odometry': 'the recording ended before odometry reached the stamp',
     'no_odometry': 'odometry did not reach the stamp within pose_timeout',
     'pose_gap': 'odometry has a gap longer than max_pose_gap here',
+    'pose_jump': 'odometry jumps here, faster than anything drives',
+    'from_the_future': 'odometry went on for pose_timeout and is still before the stamp; is the sensor ahead?',
     'time_jump': 'the clock jumped back while the reading waited for its pose',
     'too_many_waiting': 'too many readings waited for odometry at once',
     'too_far_away': 'the map would have more than max_cells cells; are pose and max_range right?',
+    'far_from_map': 'the reading is farther than max_jump from all that is mapped; if the pose is right, reset',
+    'large_cone': 'the cone has millions of cells; are range, field of view and resolution right?',
     'paused': 'the mapper was paused',
 }
 """Why a reading is rejected, in words."""
 
 ODOMETRY_REASONS = {
     'bad_pose': 'the pose is not finite, absurdly far away, or its quaternion is not normalised',
-    'other_frame': 'the frame_id or child_frame_id differs from that of the first odometry message',
+    'long_frame_id': 'the frame_id or child_frame_id has more than 255 characters',
+    'other_frame': 'the frame_id or child_frame_id is not that of the first odometry message; reset takes the new',
 }
 """Why an odometry message is rejected, in words."""
 
@@ -70,7 +77,30 @@ FARTHEST = 2e7
 """Metres from the origin beyond which no pose can be right: half the way round the Earth."""
 
 PATH_STEP = 0.05
-"""Metres between points of the robot's path."""
+"""Metres between points of the robot's path, as long as it is short."""
+
+MOST_POINTS = 100_000
+"""Points of the path; when there are more, every other one goes."""
+
+FASTEST = 100.0
+"""Metres a second between two odometry messages, beyond which the pose jumped: no robot was ever in between."""
+
+STRIDE = 1.0
+"""Metres that the pose may jump in no time, as a localisation does that corrects itself."""
+
+LARGEST_CONE = 2_000_000
+"""Cells that one reading may touch, so that none keeps the node busy for longer than a moment."""
+
+NEAREST = 0.001
+"""Metres below which a range is none: what drivers send of a sensor that is dead."""
+
+MOST_FRAMES = 1000
+"""Sensor frames that are told apart in the counts; whatever comes after them is counted as `OTHERS`."""
+
+LONGEST_NAME = 255
+"""Characters of a frame's name."""
+
+OTHERS = '(other frames)'
 
 MOST_WAITING = 100_000
 """Readings that may wait for odometry at once, so that memory stays bounded without any."""
@@ -86,15 +116,21 @@ def interpolate(before: Pose2, after: Pose2, fraction: float) -> Pose2:
     )
 
 
+def _possible(pose: Pose2) -> bool:
+    """Whether a pose is finite and on Earth; `max` and `min` would hide a NaN."""
+    return abs(pose.x) < FARTHEST and abs(pose.y) < FARTHEST and math.isfinite(pose.yaw)
+
+
 class _Measurement:
     """A Range that passed REP 117: what it says, before it is placed. Order is that of stamps, then of arrival."""
 
-    __slots__ = ('arrival', 'frame_id', 'half_angle', 'number', 'sigma', 'stamp', 'z', 'z_max')
+    __slots__ = ('arrival', 'frame_id', 'half_angle', 'newest', 'number', 'sigma', 'stamp', 'z', 'z_max')
 
     def __init__(self, message: RangeMessage, z: float, z_max: float, half_angle: float, sigma: float) -> None:
         self.stamp, self.frame_id = message.stamp, message.frame_id
         self.z, self.z_max, self.half_angle, self.sigma = z, z_max, half_angle, sigma
         self.number, self.arrival = 0, 0.0
+        self.newest: int | None = None
 
     def __lt__(self, other: _Measurement) -> bool:
         return (self.stamp, self.number) < (other.stamp, other.number)
@@ -109,6 +145,8 @@ def measure(message: RangeMessage, parameters: PlacingParameters) -> _Measuremen
     """
     if not message.frame_id:
         return 'empty_frame_id'
+    if len(message.frame_id) > LONGEST_NAME:
+        return 'long_frame_id'
     angle = parameters.field_of_view or message.field_of_view
     if not 0.0 < angle < math.pi:
         return 'bad_field_of_view'
@@ -127,6 +165,8 @@ def measure(message: RangeMessage, parameters: PlacingParameters) -> _Measuremen
         z, sigma = z_max / 2, z_max / 12
     elif z < (0.0 if fixed else message.min_range):
         return 'below_min_range'
+    elif z < NEAREST:
+        return 'too_near'
     if z >= z_max:
         if parameters.over_range == 'discard':
             return 'over_range'
@@ -150,7 +190,7 @@ class Placer:
     map_frame, base_frame : str
         The frames of the first odometry message; empty before it.
     path : list of (x, y)
-        Where the robot drove, in metres, a point every `PATH_STEP`.
+        Where the robot drove, in metres: a point every `PATH_STEP`, or the double, and so on, of a long drive.
     time_jumps : int
         How often odometry's clock jumped back.
     """
@@ -182,7 +222,7 @@ class Placer:
         self._all = parameters or Parameters()
         self._box = (math.inf, -math.inf, math.inf, -math.inf)
         self._patient = patient
-        self.buffer = ReadingBuffer()
+        self.buffer = ReadingBuffer(self.parameters.max_readings)
         self.received = self.odometry_received = 0
         self.rejected: Counter[str] = Counter()
         self.odometry_rejected: Counter[str] = Counter()
@@ -192,11 +232,13 @@ class Placer:
         self.time_jumps = 0
         self._waiting: list[_Measurement] = []
         self.path: list[tuple[float, float]] = []
+        self._path_step = PATH_STEP
         self._stamps: list[int] = []
         self._poses: list[Pose2] = []
         self._newest_range: int | None = None
         self._held: list[tuple[_Measurement, Pose2]] = []
-        self._next_try = 0
+        self._next_try = self._next_look = 0
+        self._other_frame = False
 
     @property
     def waiting(self) -> int:
@@ -205,8 +247,8 @@ class Placer:
 
     @property
     def readings(self) -> Readings:
-        """All placed readings."""
-        return self.buffer.snapshot()
+        """The readings to map from: all that were placed, or `max_readings` of them."""
+        return self.buffer.bounded()
 
     def add_range(self, message: RangeMessage) -> None:
         """Take one Range message."""
@@ -215,6 +257,7 @@ class Placer:
         if isinstance(measured, str):
             self._reject(message.frame_id, measured)
             return
+        measured.newest = self._stamps[-1] if self._stamps else None
         if self.waiting >= MOST_WAITING and not self._patient:
             self._reject(message.frame_id, 'too_many_waiting')
             return
@@ -228,8 +271,16 @@ class Placer:
         self.received += 1
         self._reject(message.frame_id, reason)
 
-    def clear(self) -> None:
-        """Forget readings, counts and path; odometry is kept, so that the next reading can be placed."""
+    def clear(self, parameters: Parameters | None = None) -> None:
+        """Forget readings, counts and path; odometry is kept, so that the next reading can be placed.
+
+        `parameters` are those of the maps that begin now.
+        """
+        self._all = parameters or self._all
+        if self._other_frame:
+            self.map_frame = self.base_frame = ''
+            self._stamps.clear()
+            self._poses.clear()
         self.buffer.clear()
         self.rejected.clear()
         self.odometry_rejected.clear()
@@ -238,22 +289,27 @@ class Placer:
         self._waiting.clear()
         self._held.clear()
         self.path.clear()
+        self._path_step = PATH_STEP
         self.received = self.odometry_received = self.time_jumps = 0
         self._box = (math.inf, -math.inf, math.inf, -math.inf)
 
     def add_odometry(self, message: OdometryMessage) -> None:
         """Take one Odometry message."""
         self.odometry_received += 1
-        if message.pose is None or not max(abs(message.pose.x), abs(message.pose.y)) < FARTHEST:
+        if message.pose is None or not _possible(message.pose):
             self.odometry_rejected['bad_pose'] += 1
+            return
+        if max(len(message.frame_id), len(message.child_frame_id)) > LONGEST_NAME:
+            self.odometry_rejected['long_frame_id'] += 1
             return
         if not self.map_frame and not self.base_frame:
             self.map_frame, self.base_frame = message.frame_id, message.child_frame_id
         if (message.frame_id, message.child_frame_id) != (self.map_frame, self.base_frame):
             self.odometry_rejected['other_frame'] += 1
+            self._other_frame = True
             return
-        if not self.path or math.dist(self.path[-1], message.pose[:2]) > PATH_STEP:
-            self.path.append(message.pose[:2])
+        self._other_frame = False
+        self.extend_path(message.pose[:2])
         stamps, poses = self._stamps, self._poses
         if stamps and message.stamp < stamps[-1] - JUMP:
             self._jump_back()
@@ -286,12 +342,40 @@ class Placer:
             self._reject_unknown(measured)
         self._held.clear()
 
+    def restore(self, readings: Readings) -> None:
+        """Take readings that were placed by an earlier run, as received and accepted."""
+        if not len(readings):
+            return
+        self.received += len(readings)
+        left, right, bottom, top = self._box
+        reach = float(readings.z.max())
+        self._box = (
+            min(left, float(readings.x.min()) - reach),
+            max(right, float(readings.x.max()) + reach),
+            min(bottom, float(readings.y.min()) - reach),
+            max(top, float(readings.y.max()) + reach),
+        )
+        self.buffer.extend(readings)
+
+    def extend_path(self, point: tuple[float, float]) -> None:
+        """Add a point to the robot's path, if it lies far enough from the last one."""
+        if self.path and math.dist(self.path[-1], point) <= self._path_step:
+            return
+        self.path.append(point)
+        if len(self.path) > MOST_POINTS:
+            del self.path[1::2]
+            self._path_step *= 2
+
     def _reject(self, frame_id: str, reason: str) -> None:
         self.rejected[reason] += 1
-        self.rejected_by_frame.setdefault(frame_id, Counter())[reason] += 1
+        known = self.rejected_by_frame
+        room = len(known) < MOST_FRAMES and len(frame_id) <= LONGEST_NAME
+        frame = frame_id if frame_id in known or room else OTHERS
+        self.rejected_by_frame.setdefault(frame, Counter())[reason] += 1
 
     def _reject_unknown(self, measured: _Measurement) -> None:
-        self.unknown_frames.add(measured.frame_id)
+        if len(self.unknown_frames) < MOST_FRAMES:
+            self.unknown_frames.add(measured.frame_id)
         self._reject(measured.frame_id, 'unknown_mount')
 
     def _jump_back(self) -> None:
@@ -301,7 +385,7 @@ class Placer:
             self._reject(measured.frame_id, 'time_jump')
         self._waiting.clear()
         self._held.clear()
-        self._next_try = 0
+        self._next_try = self._next_look = 0
         self._stamps.clear()
         self._poses.clear()
         self._newest_range = None
@@ -318,6 +402,9 @@ class Placer:
         # a gap that would be bridged must not time out first
         patience = max(self.parameters.pose_timeout, self.parameters.max_pose_gap)
         limit = now - round(patience * NANOSECONDS)
+        if newest is not None and self._waiting and newest >= self._next_look:
+            self._next_look = newest + NANOSECONDS
+            self._drop_the_future(newest, patience)
         if not ((self._waiting and self._waiting[0].stamp < limit) or self._held):
             return
         oldest = self._clock() - patience
@@ -331,6 +418,21 @@ class Placer:
                     self._reject_unknown(measured)
                 else:
                     self._mount(measured, pose)
+
+    def _drop_the_future(self, newest: int, patience: float) -> None:
+        """Reject what odometry should have reached by now, by its own stamps and by the clock."""
+        oldest = self._clock() - patience
+        stay = []
+        for measured in self._waiting:
+            if measured.newest is None:
+                measured.newest = newest
+            if measured.arrival < oldest and newest - measured.newest > patience * NANOSECONDS:
+                self._reject(measured.frame_id, 'from_the_future')
+            else:
+                stay.append(measured)
+        if len(stay) < len(self._waiting):
+            self._waiting = stay
+            heapq.heapify(self._waiting)
 
     def _settle_up_to(self, stamp: int) -> None:
         while self._waiting and self._waiting[0].stamp <= stamp:
@@ -349,6 +451,10 @@ class Placer:
             if gap > self.parameters.max_pose_gap * NANOSECONDS:
                 self._reject(measured.frame_id, 'pose_gap')
                 return
+            apart = math.dist(self._poses[after - 1][:2], self._poses[after][:2])
+            if apart > STRIDE + FASTEST * gap / NANOSECONDS:
+                self._reject(measured.frame_id, 'pose_jump')
+                return
             fraction = (measured.stamp - stamps[after - 1]) / gap
             pose = interpolate(self._poses[after - 1], self._poses[after], fraction)
         self._mount(measured, pose)
@@ -363,8 +469,9 @@ class Placer:
             self._reject_unknown(measured)
             return
         sensor = pose.compose(mount)
-        if not self._fits(sensor, self._reach(measured)):
-            self._reject(measured.frame_id, 'too_far_away')
+        reason = self._misfit(sensor, measured)
+        if reason:
+            self._reject(measured.frame_id, reason)
             return
         self.buffer.append(
             measured.frame_id,
@@ -385,19 +492,26 @@ class Placer:
         explained = measured.z + p.model.cut * max(measured.sigma or p.model.sigma, cell / 2)
         return max(min(explained, measured.z_max), measured.z + max(p.live.live_depth, cell / 2)) + 2 * cell
 
-    def _fits(self, sensor: Pose2, reach: float) -> bool:
-        """Whether the map can grow to hold the reading; if so, it does."""
-        if not max(abs(sensor.x), abs(sensor.y)) < FARTHEST:
-            return False
+    def _misfit(self, sensor: Pose2, measured: _Measurement) -> str:
+        """Return why the map cannot grow to hold a reading; if it can, note that it does."""
+        reach = self._reach(measured)
+        cell = self._all.grid.resolution
+        if not _possible(sensor):
+            return 'too_far_away'
         left, right, bottom, top = self._box
+        if left <= right:
+            away = max(left - sensor.x, sensor.x - right, bottom - sensor.y, sensor.y - top)
+            if away > self.parameters.max_jump:
+                return 'far_from_map'
         box = (
             min(left, sensor.x - reach),
             max(right, sensor.x + reach),
             min(bottom, sensor.y - reach),
             max(top, sensor.y + reach),
         )
-        cell = self._all.grid.resolution
         if not ((box[1] - box[0]) / cell + 1) * ((box[3] - box[2]) / cell + 1) <= self._all.grid.max_cells:
-            return False
+            return 'too_far_away'
+        if measured.half_angle * (reach / cell) ** 2 > LARGEST_CONE:
+            return 'large_cone'
         self._box = box
-        return True
+        return ''

@@ -124,7 +124,7 @@ def read_map(path: Path | str) -> tuple[Grid, NDArray[np.float32]]:
         raise InputError(f'{path} cannot be read: {error.strerror}') from error
     except KeyError as error:
         raise InputError(f'{path} is not the YAML of a map: {error.args[0]} is missing') from error
-    except (yaml.YAMLError, ValueError, TypeError, AttributeError) as error:
+    except (yaml.YAMLError, ValueError, TypeError, AttributeError, RecursionError, OverflowError) as error:
         raise InputError(f'{path} is not the YAML of a map: {error}') from error
     shade = read_pgm(image)[::-1]
     height, width = shade.shape

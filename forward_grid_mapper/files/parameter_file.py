@@ -59,10 +59,12 @@ def load_parameters(path: Path | str) -> ParameterFile:
         return _sort_out(flat)
     except OSError as error:
         raise ParameterError(f'{path} cannot be read: {error.strerror}') from error
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ParameterError(f'{path} is not valid YAML: {error}') from error
     except ParameterError as error:
         raise ParameterError(f'{path}: {error}') from error
+    except RecursionError as error:
+        raise ParameterError(f'{path} is not valid YAML: it is nested too deeply') from error
+    except Exception as error:  # besides its own, yaml lets errors of int(), date() and others through
+        raise ParameterError(f'{path} is not valid YAML: {error}') from error
 
 
 def parse_setting(text: str) -> tuple[str, Any]:
@@ -104,7 +106,15 @@ def parse_sensor(text: str) -> tuple[str, Pose2]:
 
 
 class _Loader(yaml.SafeLoader):
-    """A safe loader that refuses repeated keys and reads `1e-4` as a number, as ROS does."""
+    """A safe loader that refuses repeated keys and reads `1e-4` as a number, as ROS does.
+
+    It refuses aliases too, as ROS does: a few lines of them can stand for more values than memory holds.
+    """
+
+    def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
+        if self.check_event(yaml.AliasEvent):
+            raise ParameterError(f'aliases (*) are not supported (line {self.line + 1})')
+        return super().compose_node(parent, index)
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Any]:
         seen = set()

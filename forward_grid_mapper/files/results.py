@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from ..core.errors import OutputError
 from ..core.grid import Grid
 from ..core.maps import MapSet
+from .doubt import doubt
 from .map_archive import write_npz
 from .map_files import write_raw, write_trinary
 from .output_folder import output_errors, output_folder
@@ -60,7 +61,7 @@ def write_results(
         write_trinary(folder / 'ml_map', maps.grid, maps.ml)
         write_raw(folder / 'uncertainty_map', maps.grid, maps.uncertainty)
         write_npz(folder / 'maps.npz', maps)
-        warnings = list(source.get('warnings') or [])
+        warnings = [*(source.get('warnings') or []), *filter(None, [doubt(maps)])]
         try:
             from .picture import write_picture
 

@@ -7,7 +7,11 @@ from collections.abc import Callable
 from typing import Any
 
 from rclpy.node import Node
+from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.service import Service
+
+CALLS = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
+"""Calls and answers that may wait at once; of more than ROS's own 10 some would never be answered."""
 
 
 class Reply:
@@ -45,7 +49,7 @@ class DeferredService:
     def __init__(self, node: Node, kind: Any, name: str, handler: Callable[[Reply], None]) -> None:
         self.kind = kind
         self._handler = handler
-        self._service: Service = node.create_service(kind, name, self._accept)
+        self._service: Service = node.create_service(kind, name, self._accept, qos_profile=CALLS)
         self._transmit = self._service.send_response
         self._service.send_response = self._send
 

@@ -3,16 +3,25 @@
 from __future__ import annotations
 
 import time
+from collections import Counter
+from collections.abc import Collection
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 
 from ..core.grid import Grid
-from ..core.placing import Placer
+from ..core.placing import ODOMETRY_REASONS, REASONS, Placer
 from .em import Run
 
 SILENCE = 3.0
 """Seconds without odometry, or without ranges, that are worth a warning."""
+
+
+NEARLY = 0.9
+"""Share of `max_readings` from which on a warning tells that readings will go."""
+
+SHOWN = 20
+"""Names of frames that a message lists."""
 
 
 class Health:
@@ -22,7 +31,8 @@ class Health:
         self._begin = time.monotonic()
         self._last: dict[str, tuple[int, float]] = {}
         self._rejected = 0
-        self._received = 0
+        self._received = self._refused = 0
+        self._by_reason: Counter[str] = Counter()
         self._slowest = 0
 
     def taken(self, sent: int) -> None:
@@ -34,9 +44,12 @@ class Health:
     ) -> list[DiagnosticStatus]:
         """Return the statuses of input and of EM."""
         level, message = self._judge(placer, paused)
+        bound = placer.parameters.max_readings
+        held = min(placer.buffer.held, bound or placer.buffer.held)
         values = {
             'readings received': placer.received,
             'readings accepted': len(placer.buffer),
+            'readings kept to map from': f'{held} of at most {bound}' if bound else held,
             'readings waiting for a pose': placer.waiting,
             'readings rejected': sum(placer.rejected.values()),
             **{f'rejected: {reason}': count for reason, count in sorted(placer.rejected.items())},
@@ -44,7 +57,7 @@ class Health:
             'odometry received': placer.odometry_received,
             **{f'odometry rejected: {reason}': count for reason, count in sorted(placer.odometry_rejected.items())},
             'clock jumps back': placer.time_jumps,
-            'frames without a pose': ', '.join(sorted(placer.unknown_frames)),
+            'frames without a pose': _listed(placer.unknown_frames),
             'map frame': placer.map_frame,
             'map size': f'{grid.width} x {grid.height} cells of {grid.resolution} m',
             **extra,
@@ -52,27 +65,46 @@ class Health:
         self._slowest = 0
         em = {'state': str(run) if run else 'idle', 'last run': last_run}
         return [
-            _status(f'{name}: readings', level, message, name, values),
-            _status(f'{name}: EM', DiagnosticStatus.OK, em['state'], name, em),
+            status(f'{name}: readings', level, message, name, values),
+            status(f'{name}: EM', DiagnosticStatus.OK, em['state'], name, em),
         ]
 
     def _judge(self, placer: Placer, paused: bool) -> tuple[bytes, str]:
         received, rejected = placer.received, sum(placer.rejected.values())
         new, new_rejected = received - self._received, rejected - self._rejected
         self._received, self._rejected = received, rejected
-        silent_odometry = self._silence('odometry', placer.odometry_received)
+        refused = sum(placer.odometry_rejected.values())
+        silent_odometry = self._silence('odometry', placer.odometry_received - refused)
+        refused_now, self._refused = refused - self._refused, refused
         silent_ranges = self._silence('range', placer.received)
         if paused:
             return DiagnosticStatus.OK, 'paused'
+        if silent_odometry > SILENCE and refused_now > 0:
+            reason = max(placer.odometry_rejected, key=lambda key: placer.odometry_rejected[key])
+            return DiagnosticStatus.WARN, f'odometry is rejected as {reason}: {ODOMETRY_REASONS[reason]}'
         if silent_odometry > SILENCE:
             return DiagnosticStatus.WARN, f'no odometry for {silent_odometry:.0f} s'
         if silent_ranges > SILENCE:
             return DiagnosticStatus.WARN, f'no Range for {silent_ranges:.0f} s'
         if placer.unknown_frames and new_rejected:
-            return DiagnosticStatus.WARN, f'no pose on the robot for {", ".join(sorted(placer.unknown_frames))}'
+            return DiagnosticStatus.WARN, f'no pose on the robot for {_listed(placer.unknown_frames)}'
         if new and new_rejected > 0.2 * new:
-            return DiagnosticStatus.WARN, f'{new_rejected} of {new} readings were rejected in the last second'
+            return DiagnosticStatus.WARN, (
+                f'{new_rejected} of {new} readings were rejected in the last second{self._main_reason(placer)}'
+            )
+        bound = placer.parameters.max_readings
+        if bound and NEARLY * bound < len(placer.buffer) <= bound:
+            return DiagnosticStatus.WARN, (
+                f'{len(placer.buffer)} readings, and max_readings is {bound}: the oldest will go where there are many'
+            )
         return DiagnosticStatus.OK, 'mapping'
+
+    def _main_reason(self, placer: Placer) -> str:
+        """Return what most readings were rejected for since the last look."""
+        new = placer.rejected - self._by_reason
+        self._by_reason = placer.rejected.copy()
+        reason = max(new, key=lambda key: new[key], default='')
+        return f', most of them as {reason}: {REASONS[reason]}' if reason else ''
 
     def _silence(self, stream: str, count: int) -> float:
         now = time.monotonic()
@@ -83,6 +115,19 @@ class Health:
         return now - since
 
 
+def add_faults(made: DiagnosticStatus, faults: list[str]) -> None:
+    """Turn a status into a warning if something around the node is wrong."""
+    if faults:
+        well = made.level == DiagnosticStatus.OK
+        made.level = max(made.level, DiagnosticStatus.WARN)
+        made.message = '; '.join(faults if well else [made.message, *faults])
+
+
+def _listed(frames: Collection[str]) -> str:
+    more = f' and {len(frames) - SHOWN} more' if len(frames) > SHOWN else ''
+    return ', '.join(sorted(frames)[:SHOWN]) + more
+
+
 def array(statuses: list[DiagnosticStatus], stamp: Any) -> DiagnosticArray:
     """Return the message that `/diagnostics` carries."""
     message = DiagnosticArray(status=statuses)
@@ -90,6 +135,7 @@ def array(statuses: list[DiagnosticStatus], stamp: Any) -> DiagnosticArray:
     return message
 
 
-def _status(name: str, level: bytes, message: str, hardware: str, values: dict[str, Any]) -> DiagnosticStatus:
+def status(name: str, level: bytes, message: str, hardware: str, values: dict[str, Any]) -> DiagnosticStatus:
+    """Return a status with its values as text."""
     pairs = [KeyValue(key=key, value=str(value)) for key, value in values.items()]
     return DiagnosticStatus(name=name, level=level, message=message, hardware_id=hardware, values=pairs)

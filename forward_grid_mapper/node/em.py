@@ -11,13 +11,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.errors import Cancelled, MapperError
+from ..core.errors import Cancelled, InputError, MapperError
+from ..core.footprint import shortage
 from ..core.grid import Grid
 from ..core.mapping import Mapper
 from ..core.maps import MapSet
 from ..core.parameters import Parameters
 from ..core.readings import Readings
 from ..core.search import Progress
+from ..files.doubt import doubt
 
 
 @dataclass
@@ -83,7 +85,7 @@ class EmWorker:
             if self.current is not None:
                 return None
             run = Run(Mapper(parameters), readings, start)
-            run.thread = threading.Thread(target=self._work, args=(run, done), name='em', daemon=True)
+            run.thread = threading.Thread(target=self._work, args=(run, parameters, done), name='em', daemon=True)
             self._run = run
         run.thread.start()
         return run
@@ -95,12 +97,14 @@ class EmWorker:
             run.mapper.cancel()
             run.finished.wait(wait)
 
-    def _work(self, run: Run, done: Callable[[Outcome], None]) -> None:
+    def _work(self, run: Run, parameters: Parameters, done: Callable[[Outcome], None]) -> None:
         def watch(stage: str, progress: Progress | None) -> None:
             run.stage, run.progress = stage, progress
             self._watch(run)
 
         try:
+            if lack := shortage(run.readings, parameters):
+                raise InputError(lack)
             outcome = Outcome(run.mapper.run(run.readings, watch, run.start), '')
         except Cancelled:
             outcome = Outcome(None, 'EM was cancelled')
@@ -128,5 +132,7 @@ def summary(maps: MapSet, seconds: float) -> str:
     return (
         f'{len(maps.readings)} readings, {s["sweeps"]} iterations, log-likelihood {maps.log_likelihood:.1f}, '
         f'objective {maps.objective:.1f}, {s["flips"]} flips, {s["shifts"]} shifts, {s["occupied"]} occupied cells, '
-        f'{seconds:.2f} seconds' + ('' if s['converged'] else ', NOT converged: raise max_sweeps')
+        f'{seconds:.2f} seconds'
+        + ('' if s['converged'] else ', NOT converged: raise max_sweeps')
+        + (f'; BUT {told}' if (told := doubt(maps)) else '')
     )

@@ -9,13 +9,20 @@ from collections.abc import Mapping
 from typing import Any
 
 from ..core.messages import NANOSECONDS, OdometryMessage, Pose2, yaw_of
-from ..core.placing import LATER, Later
+from ..core.placing import JUMP, LATER, Later
 
 STEEPEST = math.sin(math.radians(60.0))
 """A sensor whose axis leaves the plane by more cannot be mapped in it."""
 
 PATIENCE = 0.2
 """Seconds before a frame that TF did not know is asked for again, so that a missing one costs next to nothing."""
+
+
+MOST_HELD = 10_000
+"""Odometry messages that wait for a transform at the most."""
+
+MOST_MISSING = 1000
+"""Frames whose absence is remembered, so that names that strangers make up cost no memory."""
 
 
 class Transforms:
@@ -46,8 +53,11 @@ class Transforms:
     def lookup(self, target: str, source: str, stamp: int) -> Any | None:
         """Return the `geometry_msgs/Transform` of `source` in `target` at `stamp` in nanoseconds, or None."""
         key = (target, source)
-        if self._buffer is None or time.monotonic() < self._missing.get(key, 0.0):
+        # rclpy's Time raises for what is before 1970, and TF has nothing then
+        if self._buffer is None or stamp < 0 or time.monotonic() < self._missing.get(key, 0.0):
             return None
+        if len(self._missing) > MOST_MISSING:
+            self._missing.clear()
         from rclpy.time import Time
 
         try:
@@ -106,10 +116,15 @@ class MapFrame:
         """Take an odometry message; return those whose pose in the map frame is known now, in order."""
         if not self._map_frame or message.frame_id.lstrip('/') == self._map_frame.lstrip('/'):
             return [message]
-        if self._held and message.stamp < self._held[-1].stamp:
+        # the placer sorts in what only overtook
+        if self._held and message.stamp < self._held[-1].stamp - JUMP:
             self.dropped += len(self._held)
             self._held.clear()
         self._held.append(message)
+        if len(self._held) > MOST_HELD:
+            # stamps that stand still never time out
+            self._held.popleft()
+            self.dropped += 1
         ready = []
         while self._held:
             first = self._held[0]

@@ -2,9 +2,18 @@
 
 from __future__ import annotations
 
+import signal
+
+if __name__ == '__main__':
+    # Ctrl-C while this is imported ends it at once and without a traceback; see `Stopper` for what comes then
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
 import sys
+import threading
 import time
+import traceback
 from collections.abc import Sequence
+from typing import Any
 
 from ..core.errors import MapperError
 from .stopping import Stopper
@@ -16,6 +25,10 @@ Parameters: --ros-args -p NAME:=VALUE, or --params-file FILE (config/mapper.yaml
 and odom with -r sonar:=/my/sonar -r odom:=/my/odom."""
 
 
+TELL_EVERY = 10.0
+"""Seconds between two reports of callbacks that fail."""
+
+
 class _Stop(Exception):
     """Raised inside the executor to end its spinning."""
 
@@ -24,8 +37,27 @@ def _raise_stop() -> None:
     raise _Stop
 
 
+def _spin(executor: Any, node: Any) -> None:
+    """Spin until `_Stop` or the end of ROS; a callback that fails is told, and must not take the map with it."""
+    told = 0.0
+    while executor.context.ok():
+        try:
+            executor.spin()
+        except _Stop:
+            raise
+        except Exception:
+            now = time.monotonic()
+            if now > told + TELL_EVERY:
+                told = now
+                node.get_logger().error(f'a callback failed, mapping goes on: {traceback.format_exc()}')
+            # one that fails all the time must not take all of the time
+            time.sleep(0.001)
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the node until it is told to stop; return the exit code."""
+    if threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     if '-h' in arguments or '--help' in arguments:
         print(USAGE)
@@ -71,7 +103,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         executor.add_node(node)
         node.start()
         stopper.call(lambda: executor.create_task(_raise_stop))
-        executor.spin()
+        _spin(executor, node)
     except _Stop:
         pass
     except (MapperError, NameValidationException, ValueError) as error:

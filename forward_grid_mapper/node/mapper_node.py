@@ -24,7 +24,8 @@ from ..core.live_map import LiveMap
 from ..core.maps import MapSet
 from ..core.messages import NANOSECONDS, odometry_message, range_message
 from ..core.parameters import Parameters
-from ..core.placing import Placer
+from ..core.placing import MOST_FRAMES, Placer
+from ..files.doubt import doubt
 from ..files.output_folder import free_name
 from ..files.results import write_results
 from . import diagnostics, ros_parameters
@@ -32,7 +33,9 @@ from .deferred import DeferredService, Reply
 from .em import EmWorker, Outcome, Run, summary
 from .frames import MapFrame, Mounts, Transforms
 from .grid_message import grid_message
+from .journal_keeper import JournalKeeper
 from .online import OnlineWorker
+from .surroundings import Surroundings
 
 NAME = 'forward_grid_mapper'
 ONLINE_PERIOD = 0.02
@@ -89,6 +92,9 @@ class MapperNode(Node):
         if node.map_frame and not transforms.available:
             raise MapperError(f'map_frame is {node.map_frame}, but tf2_ros is not installed to look it up')
         self._placer = Placer(self._mounts, self.parameters)
+        # the live map has every reading, also those that max_readings drops
+        self._placer.buffer.before_thinning.append(self._update_live)
+        self._journal = JournalKeeper(self, node.journal, self._placer, self._steady)
         self._maps_out = {name: self.create_publisher(OccupancyGrid, f'~/{name}', LATCHED) for name in MAPS}
         self._latest = {name: self._message(Grid(self.parameters.grid.resolution, 0, 0, 0, 0), None) for name in MAPS}
         self._diagnostics_out = self.create_publisher(DiagnosticArray, '/diagnostics', 10)
@@ -102,10 +108,14 @@ class MapperNode(Node):
         quality = self._quality(node.range_reliability)
         for topic in dict.fromkeys(node.range_topics):
             self.create_subscription(Range, topic, self._on_range, quality)
+        heard = {self.resolve_topic_name(topic): quality for topic in node.range_topics}
+        heard[self.resolve_topic_name(node.odom_topic)] = self._quality(node.odom_reliability)
+        self._surroundings = Surroundings(self, heard)
         self.create_timer(1.0, self._report, clock=self._steady)
         if node.online:
             self._online = OnlineWorker(self.parameters, self._publish_online, self.get_logger().error)
             self.create_timer(ONLINE_PERIOD, self._offer, clock=self._steady)
+            self._placer.buffer.before_thinning.append(self._offer)
         self._live_timer = self.create_timer(1.0 / node.publish_rate, self._publish_live, clock=self._steady)
         topics = ', '.join(self.resolve_topic_name(topic) for topic in node.range_topics)
         self.get_logger().info(
@@ -119,6 +129,8 @@ class MapperNode(Node):
         self._em.cancel(wait=2.0)
         if self._online:
             self._online.close()
+        if hasattr(self, '_journal'):
+            self._journal.close()
 
     @staticmethod
     def _quality(reliability: str) -> QoSProfile:
@@ -190,15 +202,20 @@ class MapperNode(Node):
 
     def _offer(self) -> None:
         """Hand the readings that came to the online map."""
-        count = len(self._placer.buffer)
-        if self._online and count > self._offered:
-            self._online.offer(self._placer.buffer.snapshot(self._offered))
-            self._offered = count
+        buffer = self._placer.buffer
+        if not self._online or len(buffer) <= self._offered:
+            return
+        if buffer.bound and self._online.kept > buffer.bound + buffer.bound // 4:
+            self._restart_online()
+        else:
+            self._online.offer(buffer.snapshot(self._offered))
+            self._offered = len(buffer)
 
     def _restart_online(self) -> None:
+        """Begin the online map anew, from the readings that are kept."""
         if self._online:
             self._offered = len(self._placer.buffer)
-            self._online.restart(self.parameters, self._placer.buffer.snapshot(0) if self._offered else None)
+            self._online.restart(self.parameters, self._placer.buffer.bounded() if self._offered else None)
 
     def _publish_online(
         self, generation: int, grid: Grid, ml: NDArray[np.int8], uncertainty: NDArray[np.float32]
@@ -243,6 +260,8 @@ class MapperNode(Node):
                 self.get_logger().warning(f'EM: {outcome.message}')
             else:
                 maps = outcome.maps
+                if told := doubt(maps):
+                    self.get_logger().warning(f'EM: {told}')
                 self._last_run = summary(maps, sum(maps.statistics['seconds'].values()))
                 self.get_logger().info(f'EM: {self._last_run}')
             done(outcome)
@@ -272,7 +291,10 @@ class MapperNode(Node):
     def _reset(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         self._em.cancel()
         forgotten = len(self._placer.buffer)
-        self._placer.clear()
+        # also what came since it last looked
+        self._journal.take()
+        self._placer.clear(self.parameters)
+        kept = self._journal.reset()
         self._live = LiveMap(self.parameters)
         self._live_count = self._published = 0
         self._last_run = 'none since the reset'
@@ -284,7 +306,7 @@ class MapperNode(Node):
             self._restart_online()
             for name in MAPS:
                 self._publish(name, nothing, np.full(nothing.shape, -1, np.int8))
-        response.success, response.message = True, f'{forgotten} readings and all maps were forgotten'
+        response.success, response.message = True, f'{forgotten} readings and all maps were forgotten{kept}'
         return response
 
     def _pause(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
@@ -378,7 +400,9 @@ class MapperNode(Node):
 
     def _report(self) -> None:
         placer = self._placer
-        for frame in sorted(placer.unknown_frames - self._told):
+        for frame in sorted(placer.unknown_frames - self._told)[: diagnostics.SHOWN]:
+            if len(self._told) >= MOST_FRAMES:
+                break
             self._told.add(frame)
             why = 'its axis leaves the plane by more than 60°' if frame in self._mounts.steep else 'neither is known'
             self.get_logger().warning(
@@ -397,4 +421,6 @@ class MapperNode(Node):
             self._paused,
             extra,
         )
+        diagnostics.add_faults(statuses[0], self._surroundings.faults())
+        statuses += self._journal.statuses(self.get_fully_qualified_name().lstrip('/'))
         self._diagnostics_out.publish(diagnostics.array(statuses, self.get_clock().now().to_msg()))

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from forward_grid_mapper.core.messages import NANOSECONDS, OdometryMessage, Pose2, RangeMessage
 from forward_grid_mapper.core.parameters import Parameters
-from forward_grid_mapper.core.placing import HISTORY, LATER, REASONS, Placer, measure
+from forward_grid_mapper.core.placing import HISTORY, LATER, MOST_FRAMES, MOST_POINTS, REASONS, Placer, measure
 
 INF, NAN = math.inf, math.nan
 MOUNT = Pose2(0.2, 0.1, math.pi / 2)
@@ -54,6 +54,9 @@ def accounted(p: Placer) -> bool:
     [
         ({'range': NAN}, 'nan_range'),
         ({'range': -INF}, 'too_near'),
+        ({'range': 0.0, 'min_range': 0.0}, 'too_near'),
+        ({'range': 1e-30, 'min_range': 0.0}, 'too_near'),
+        ({'range': 0.0, 'min_range': 4.0}, 'too_near'),
         ({'range': 0.05}, 'below_min_range'),
         ({'range': -1.0}, 'below_min_range'),
         ({'field_of_view': 0.0}, 'bad_field_of_view'),
@@ -67,6 +70,7 @@ def accounted(p: Placer) -> bool:
         ({'min_range': NAN}, 'bad_limits'),
         ({'min_range': -0.1}, 'bad_limits'),
         ({'frame_id': ''}, 'empty_frame_id'),
+        ({'frame_id': 'x' * 300}, 'long_frame_id'),
     ],
 )
 def test_rejections_of_rep_117(changes: dict[str, object], reason: str) -> None:
@@ -227,8 +231,8 @@ def test_an_absurd_pose_is_refused() -> None:
     for second, x in ((0.0, 0.0), (0.1, 1e6), (0.2, 1e9), (0.3, 0.0)):
         p.add_odometry(odometry(second, x))
         p.add_range(sonar(second))
-    # half way back from 1e6 m the pose is as absurd
-    assert p.rejected == {'too_far_away': 2}
+    # nothing was ever half way back from 1e6 m
+    assert p.rejected == {'far_from_map': 1, 'pose_jump': 1}
     assert p.odometry_rejected == {'bad_pose': 1}
     assert len(p.buffer) == 2
 
@@ -314,3 +318,132 @@ def test_any_messages_are_accounted_for(messages: list[RangeMessage | OdometryMe
     assert accounted(p)
     for column in ('x', 'y', 'yaw', 'z', 'z_max', 'half_angle', 'sigma'):
         assert np.isfinite(getattr(p.readings, column)).all()
+
+
+def test_a_dead_sensor_does_not_wall_in_the_robot() -> None:
+    p = placer()
+    for second in range(5):
+        p.add_odometry(odometry(second))
+        p.add_range(sonar(second, range=0.0, min_range=0.0))
+    assert p.rejected == {'too_near': 5}
+
+
+def test_a_jump_of_ten_kilometres_costs_what_comes_after_it_and_no_memory() -> None:
+    p = placer()
+    for second in range(20):
+        p.add_odometry(odometry(second, 0.1 * second + (10_000.0 if second >= 10 else 0.0)))
+        p.add_range(sonar(second + 0.5))
+    p.finish()
+    assert p.rejected == {'pose_jump': 1, 'far_from_map': 9, 'after_odometry': 1}
+    assert len(p.buffer) == 9
+    assert accounted(p)
+    p.clear()
+    p.add_odometry(odometry(20.0, 10_002.0))
+    p.add_range(sonar(20.0))
+    assert len(p.buffer) == 1
+
+
+def test_a_cone_of_millions_of_cells_is_refused() -> None:
+    p = placer()
+    p.add_odometry(odometry(0.0))
+    p.add_range(sonar(0.0, range=300.0, max_range=1000.0, field_of_view=2.0))
+    p.add_range(sonar(0.0, range=6.0, max_range=1000.0, field_of_view=2.0))
+    assert (p.rejected, len(p.buffer)) == ({'large_cone': 1}, 1)
+
+
+def test_a_sensor_whose_clock_is_ahead_does_not_pile_up() -> None:
+    clock = Clock()
+    p = placer(clock=clock)
+    for tenth in range(200):
+        clock.now = tenth / 10
+        p.add_odometry(odometry(tenth / 10))
+        p.add_range(sonar(tenth / 10 + 3600.0))
+        p.add_range(sonar(tenth / 10))
+    assert p.waiting < 60
+    assert set(p.rejected) <= {'from_the_future', 'no_odometry'}
+    assert len(p.buffer) == 200
+    assert accounted(p)
+
+
+def test_odometry_that_stands_still_lets_readings_wait() -> None:
+    clock = Clock()
+    p = placer(clock=clock)
+    p.add_odometry(odometry(1.0))
+    p.add_range(sonar(1.1))
+    clock.now = 1000.0
+    p.add_odometry(odometry(1.0))
+    p.add_range(sonar(1.2))
+    p.add_odometry(odometry(1.2))
+    assert (len(p.buffer), p.waiting) == (2, 0)
+
+
+@pytest.mark.parametrize('rate', [1, 1000])
+def test_rates_of_odometry(rate: int) -> None:
+    p = placer()
+    for k in range(5 * rate + 1):
+        p.add_odometry(odometry(k / rate, k / rate))
+        for tenth in range(10 // min(rate, 10)):
+            p.add_range(sonar(k / rate + tenth / 10))
+    p.finish()
+    assert set(p.rejected) <= {'after_odometry'}
+    assert p.readings.x == pytest.approx(p.readings.stamp / NANOSECONDS + 0.2)
+
+
+def test_a_gap_of_an_hour_is_not_bridged() -> None:
+    p = placer()
+    for second in (0.0, 0.5, 3600.0, 3600.5):
+        p.add_odometry(odometry(second))
+    for second in (0.25, 1.0, 1800.0, 3599.0, 3600.25):
+        p.add_range(sonar(second))
+    # 0.25 s is so far back that its odometry is forgotten, unless little of it came
+    assert p.rejected == {'pose_gap': 3}
+    assert len(p.buffer) == 2
+
+
+def test_one_stamp_from_the_future_costs_only_what_waits() -> None:
+    p = placer()
+    for second in range(10):
+        p.add_odometry(odometry(1e9 if second == 5 else second))
+        p.add_range(sonar(second - 0.5))
+    assert (p.time_jumps, len(p.buffer)) == (1, 7)
+    assert p.rejected == {'before_odometry': 2, 'pose_gap': 1} or sum(p.rejected.values()) == 3
+    assert accounted(p)
+
+
+def test_what_strangers_can_make_grow_is_bounded() -> None:
+    p = placer()
+    for k in range(2 * MOST_FRAMES):
+        p.reject(sonar(0.0, frame_id=f'frame {k}'), 'paused')
+        p.add_odometry(odometry(k))
+        p.add_range(sonar(k, frame_id=f'unknown {k}'))
+    assert len(p.rejected_by_frame) <= MOST_FRAMES + 1
+    assert len(p.unknown_frames) <= MOST_FRAMES
+    assert sum(sum(counts.values()) for counts in p.rejected_by_frame.values()) == sum(p.rejected.values())
+
+
+def test_a_long_path_is_told_by_fewer_points() -> None:
+    p = placer()
+    for k in range(3 * MOST_POINTS):
+        p.extend_path((0.06 * k, 0.0))
+    assert len(p.path) <= MOST_POINTS
+    assert p.path[-1][0] > 0.06 * 3 * MOST_POINTS - 1.0
+    steps = np.diff(np.array(p.path)[:, 0])
+    assert steps.max() < 2.5 * np.median(steps)
+
+
+def test_a_reset_begins_with_the_odometry_that_comes() -> None:
+    p = placer()
+    p.add_odometry(odometry(0.0)._replace(frame_id='garbage'))
+    for second in (1.0, 1.5):
+        p.add_odometry(odometry(second))
+    p.add_range(sonar(1.2))
+    assert p.odometry_rejected == {'other_frame': 2}
+    p.clear()
+    for second in (2.0, 2.5):
+        p.add_odometry(odometry(second))
+    p.add_range(sonar(2.2))
+    assert (p.map_frame, len(p.buffer), p.odometry_rejected) == ('odom', 1, {})
+    # otherwise it is kept, so that the next reading can be placed
+    p.clear()
+    p.add_range(sonar(2.3))
+    assert (p.map_frame, len(p.buffer)) == ('odom', 1)

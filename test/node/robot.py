@@ -169,7 +169,8 @@ class Robot:
         return self.until(self.ask(service, kind, **fields).result, seconds, f'{service} answers')
 
     def ask(self, service: str, kind: Any = Trigger, **fields: Any) -> Any:
-        client = self.node.create_client(kind, f'{self.name}/{service}')
+        # every client hears the answers to all of them, and keeps the last 10 unless told otherwise
+        client = self.node.create_client(kind, f'{self.name}/{service}', qos_profile=QoSProfile(depth=100))
         self.until(client.service_is_ready, 20.0, f'{service} is there')
         return client.call_async(kind.Request(**fields))
 

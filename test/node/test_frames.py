@@ -149,3 +149,36 @@ def test_odometry_without_a_transform_is_dropped_after_the_timeout(buffer: Buffe
 def test_without_another_map_frame_odometry_passes(transforms: Transforms, name: str) -> None:
     message = OdometryMessage(0, 'odom', 'base', Pose2(0, 0, 0))
     assert MapFrame(name, transforms, 1.0).convert(message) == [message]
+
+
+def test_a_stamp_before_1970_is_no_error(buffer: Buffer, transforms: Transforms) -> None:
+    buffer.known['base_link', 'sonar'] = transform(0.1, 0.2)
+    assert transforms.lookup('base_link', 'sonar', 5) is not None
+    assert transforms.lookup('base_link', 'sonar', -5) is None
+
+
+def test_names_that_nobody_knows_are_not_remembered_for_ever(transforms: Transforms) -> None:
+    for k in range(2 * frames.MOST_MISSING):
+        assert transforms.lookup('base_link', f'frame {k}', 5) is None
+    assert len(transforms._missing) <= frames.MOST_MISSING + 1
+
+
+def test_odometry_that_overtakes_by_a_nanosecond_loses_nothing(buffer: Buffer, transforms: Transforms) -> None:
+    frame = MapFrame('map', transforms, 2.0)
+
+    def at(stamp: int) -> OdometryMessage:
+        return OdometryMessage(stamp, 'odom', 'base_link', Pose2(1.0, 0.0, 0.0))
+
+    assert frame.convert(at(NANOSECONDS)) == []
+    assert frame.convert(at(NANOSECONDS - 1)) == []
+    buffer.known['map', 'odom'] = transform(5.0, 0.0)
+    transforms._missing.clear()
+    assert [m.stamp for m in frame.convert(at(NANOSECONDS + 1))] == [NANOSECONDS, NANOSECONDS - 1, NANOSECONDS + 1]
+    assert frame.dropped == 0
+
+
+def test_odometry_whose_clock_stands_still_does_not_pile_up(transforms: Transforms) -> None:
+    frame = MapFrame('map', transforms, 2.0)
+    for _ in range(frames.MOST_HELD + 500):
+        frame.convert(OdometryMessage(5, 'odom', 'base_link', Pose2(0.0, 0.0, 0.0)))
+    assert frame.dropped == 500

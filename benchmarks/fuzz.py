@@ -1,0 +1,277 @@
+#!/usr/bin/env python3
+"""Feeds the node with hostile messages, transforms and parameters, and checks that it keeps its word.
+
+usage: fuzz.py [--messages 100000] [--seed 1] [--dds 5000]
+
+Range and Odometry go through the node's own callbacks, EM, services and files; every fifth message is wrong in some
+way. Checked all the while: nothing raises, accepted + waiting + rejected = received, no number in a map is out of
+place, memory stays bounded. With --dds, a node in a process of its own gets serialized messages of which half are
+garbled. Needs rclpy.
+"""
+
+from __future__ import annotations
+
+import argparse
+import gc
+import os
+import sys
+import tempfile
+import time
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
+os.environ.setdefault('ROS_DOMAIN_ID', str(1 + os.getpid() % 100))
+sys.path.insert(0, str(Path(__file__).parent))
+
+import numpy as np
+import rclpy
+from hostile import FRAMES, Hostile, TransformFailed
+from rclpy.exceptions import ParameterNotDeclaredException
+from rclpy.parameter import Parameter
+from std_srvs.srv import SetBool, Trigger
+
+from forward_grid_mapper.core.errors import MapperError
+from forward_grid_mapper.core.mapping import Mapper
+from forward_grid_mapper.core.parameters import TABLE
+from forward_grid_mapper.node import frames
+from forward_grid_mapper.node.mapper_node import MAPS, MapperNode
+
+OVERRIDES: dict[str, Any] = {
+    'sensors.sonar_left.pose': [0.1, 0.1, 1.5],
+    'sensors.sonar_right.pose': [0.1, -0.1, -1.5],
+    'max_cells': 1_000_000,
+    'max_readings': 2000,
+    'max_sweeps': 5,
+}
+
+
+class Broken(Exception):
+    """The node did not keep its word."""
+
+
+def resident() -> float:
+    """Return the memory that this process uses, in MB."""
+    pages = int(Path('/proc/self/statm').read_text().split()[1])
+    return pages * os.sysconf('SC_PAGE_SIZE') / 1e6
+
+
+def require(condition: bool, what: str) -> None:
+    """Raise if a promise is broken."""
+    if not condition:
+        raise Broken(what)
+
+
+class Fuzz:
+    """A node in this process, whose callbacks are called as the executor would."""
+
+    def __init__(self, seed: int, folder: Path) -> None:
+        self.hostile = Hostile(seed)
+        self.rejected: Counter[str] = Counter()
+        self.sent = self.total = self.accepted = self.parameters_refused = self.parameters_set = 0
+        frames.Transforms.of = classmethod(  # type: ignore[method-assign]
+            lambda cls, node: cls(self.hostile, TransformFailed)
+        )
+        overrides = {**OVERRIDES, 'save_directory': str(folder / 'maps'), 'journal': str(folder / 'journal')}
+        self.node = MapperNode(parameter_overrides=[Parameter(k, value=v) for k, v in overrides.items()])
+        self.node.start()
+
+    @property
+    def placer(self) -> Any:
+        """The node's account."""
+        return self.node._placer
+
+    def step(self) -> None:
+        """Send one message."""
+        self.total += 1
+        if self.hostile.random.random() < 0.4:
+            self.node._on_odometry(self.hostile.odometry())
+        else:
+            self.sent += 1
+            self.node._on_range(self.hostile.range(), {'source_timestamp': time.time_ns()})
+
+    def check(self) -> None:
+        """Do what the node's timers do, and look at its account and its live map."""
+        self.node._publish_live()
+        self.node._journal.take()
+        self.node._report()
+        placer = self.placer
+        require(placer.received == self.sent, f'{self.sent} ranges were sent and {placer.received} received')
+        accounted = len(placer.buffer) + placer.waiting + sum(placer.rejected.values())
+        require(accounted == placer.received, f'{placer.received} ranges were received and {accounted} accounted for')
+        log_odds = self.node._live.log_odds()
+        require(not np.isinf(log_odds).any(), 'the live map has an infinite value')
+        self._check_messages()
+        x = placer.readings
+        for name in ('x', 'y', 'yaw', 'z', 'z_max', 'half_angle', 'sigma'):
+            require(bool(np.isfinite(getattr(x, name)).all()), f'a reading has a {name} that is not finite')
+
+    def _check_messages(self) -> None:
+        for name in MAPS:
+            message = self.node._latest[name]
+            values = np.frombuffer(message.data, np.int8)
+            require(bool(((values >= -1) & (values <= 100)).all()), f'{name} has a value that is none of a map')
+            require(len(values) == message.info.width * message.info.height, f'{name} has another size than it says')
+
+    def change_parameter(self) -> None:
+        """Set a parameter to anything."""
+        self.parameters_set += 1
+        try:
+            refused = not self.node.set_parameters([self.hostile.parameter()])[0].successful
+        except ParameterNotDeclaredException:
+            # the service turns it into a refusal
+            refused = True
+        self.parameters_refused += refused
+
+    def restore_parameters(self) -> None:
+        """Set every parameter that may change back to its default."""
+        values = {row.name: row.default for row in TABLE if not row.read_only and row.group != 'node'}
+        # readings of any variance, in a model of any sigma, make EM slow; it is not what is tried here
+        values['max_sweeps'] = OVERRIDES['max_sweeps']
+        defaults = [Parameter(name, value=value) for name, value in values.items()]
+        result = self.node.set_parameters_atomically(defaults)
+        require(result.successful, f'the defaults were refused: {result.reason}')
+
+    def run_em(self) -> None:
+        """Map from what there is."""
+        try:
+            maps = Mapper(self.node.parameters).run(self.placer.readings)
+        except MapperError as error:
+            # readings were placed when sigma and cut may have been less
+            expected = not len(self.placer.readings) or 'more than max_cells' in str(error)
+            require(expected, f'EM failed: {error}')
+            return
+        require(bool(np.isin(maps.ml, (-1, 0, 1)).all()), 'the ML map has another value')
+        require(bool(np.isfinite(maps.log_likelihood) and np.isfinite(maps.objective)), 'the likelihood is not finite')
+        seen = maps.ml >= 0
+        require(bool(np.isfinite(maps.uncertainty[seen]).all()), 'the uncertainty map is not finite where observed')
+        require(bool(np.isnan(maps.uncertainty[~seen]).all()), 'the uncertainty map tells more than was observed')
+        known = maps.live[~np.isnan(maps.live)]
+        require(bool(((known >= 0) & (known <= 1)).all()), 'the live map has a value that is no probability')
+
+    def reset(self) -> None:
+        """Forget everything, after an account of it."""
+        self.rejected += self.placer.rejected
+        self.accepted += len(self.placer.buffer)
+        self.rejected['(waited at a reset)'] += self.placer.waiting
+        self.node._reset(Trigger.Request(), Trigger.Response())
+        self.sent = 0
+        require(self.placer.received == self.placer.waiting == 0, 'a reset left something')
+
+    def pause(self, value: bool) -> None:
+        """Call the service."""
+        self.node._pause(SetBool.Request(data=value), SetBool.Response())
+
+    def run(self, messages: int) -> float:
+        """Send so many messages; return by how many MB memory grew after the first third."""
+        begun = 0.0
+        while self.total < messages:
+            for _ in range(min(500, messages - self.total)):
+                self.step()
+            self.check()
+            if self.hostile.random.random() < 0.5:
+                self.restore_parameters()
+            for _ in range(10):
+                self.change_parameter()
+            dice = self.hostile.random.random()
+            if dice < 0.1:
+                self.run_em()
+            elif dice < 0.12:
+                self.reset()
+            self.pause(dice > 0.97)
+            if not begun and self.total >= messages / 3:
+                gc.collect()
+                begun = resident()
+        self.run_em()
+        self.check()
+        gc.collect()
+        grown = resident() - begun
+        self.reset()
+        return grown
+
+
+def over_dds(messages: int, seed: int) -> str:
+    """Send serialized messages, half of them garbled, to a node in a process of its own; return its account."""
+    import subprocess
+
+    from diagnostic_msgs.msg import DiagnosticArray
+    from nav_msgs.msg import Odometry
+    from rclpy.qos import QoSProfile
+    from sensor_msgs.msg import Range
+
+    command = [sys.executable, '-m', 'forward_grid_mapper.node.main', '--ros-args']
+    for name in ('range_reliability', 'odom_reliability'):
+        command += ['-p', f'{name}:=reliable']
+    for frame in FRAMES:
+        command += ['-p', f'sensors.{frame}.pose:=[0.0, 0.0, 0.0]']
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    account: dict[str, str] = {}
+
+    def on_diagnostics(array: DiagnosticArray) -> None:
+        for status in array.status:
+            if status.name.endswith('readings'):
+                account.update({pair.key: pair.value for pair in status.values})
+
+    robot = rclpy.create_node('hostile_robot')
+    try:
+        robot.create_subscription(DiagnosticArray, '/diagnostics', on_diagnostics, 10)
+        publishers = {
+            Range: robot.create_publisher(Range, 'sonar', QoSProfile(depth=5000)),
+            Odometry: robot.create_publisher(Odometry, 'odom', QoSProfile(depth=5000)),
+        }
+        while not all(publisher.get_subscription_count() for publisher in publishers.values()):
+            rclpy.spin_once(robot, timeout_sec=0.1)
+            require(process.poll() is None, 'the node did not start')
+        hostile = Hostile(seed)
+        # whatever comes first tells the frames
+        publishers[Odometry].publish(Hostile(seed, madness=0.0).odometry())
+        time.sleep(0.1)
+        for k in range(messages):
+            message = hostile.odometry() if k % 3 == 0 else hostile.range()
+            garbled = hostile.random.random() < 0.5
+            publishers[type(message)].publish(hostile.garbled_bytes(message) if garbled else message)
+            if k % 20 == 0:
+                rclpy.spin_once(robot, timeout_sec=0.001)
+        end = time.monotonic() + 3.0
+        while time.monotonic() < end:
+            rclpy.spin_once(robot, timeout_sec=0.1)
+        require(process.poll() is None, 'the node ended')
+        counts = [int(account[f'readings {k}']) for k in ('accepted', 'waiting for a pose', 'rejected', 'received')]
+        require(sum(counts[:3]) == counts[3] > 0, f'the account is wrong: {counts}')
+        return f'{counts[3]} ranges received, {counts[0]} accepted, {counts[1]} waiting, {counts[2]} rejected'
+    finally:
+        process.kill()
+        process.wait()
+        robot.destroy_node()
+
+
+def main() -> None:
+    """Run the fuzzer."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument('--messages', type=int, default=100_000)
+    parser.add_argument('--seed', type=int, default=1)
+    parser.add_argument('--dds', type=int, default=0, metavar='MESSAGES', help='over DDS as well')
+    options = parser.parse_args()
+    # what cannot be interpreted is not worth a line each
+    rclpy.init(args=['fuzz', '--ros-args', '--log-level', 'FATAL'])
+    with tempfile.TemporaryDirectory() as folder:
+        fuzz = Fuzz(options.seed, Path(folder))
+        begin = time.monotonic()
+        grown = fuzz.run(options.messages)
+        seconds = time.monotonic() - begin
+        fuzz.node.close()
+        written = sorted({path.relative_to(folder).parts[0] for path in Path(folder).rglob('*')})
+        fuzz.node.destroy_node()
+    print(f'{fuzz.total} messages in {seconds:.0f} s, seed {options.seed}; no exception, every message accounted for')
+    print(f'accepted {fuzz.accepted}; rejected ' + ', '.join(f'{k} {n}' for k, n in sorted(fuzz.rejected.items())))
+    print(f'{fuzz.parameters_set} changes of a parameter, {fuzz.parameters_refused} refused')
+    print(f'memory grew by {grown:.0f} MB over the last two thirds; written to: {", ".join(written)}')
+    if options.dds:
+        print(f'{options.dds} messages over DDS, half of them garbled: {over_dds(options.dds, options.seed)}')
+    rclpy.shutdown()
+    require(grown < 100, 'memory grows')
+
+
+if __name__ == '__main__':
+    main()

@@ -1,0 +1,180 @@
+#!/usr/bin/env python3
+"""A drive of hours, compressed in time: whether memory and delays stay flat, and the maps right.
+
+usage: soak.py [--readings 1000000] [--max-readings 200000] [--journal]
+
+A robot with 24 sonars goes to and fro in the simulated corridor, each round with noise of its own: 24 000 readings in
+four minutes. Its messages go through the callbacks of the node, in this process, as fast as they are taken; after every
+simulated second the node's timers get their turn. At the end EM runs, and the maps are scored against the world beside
+those of the first round alone. Needs rclpy.
+"""
+
+from __future__ import annotations
+
+import argparse
+import gc
+import heapq
+import os
+import platform
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
+os.environ.setdefault('ROS_DOMAIN_ID', str(1 + os.getpid() % 100))
+
+import numpy as np
+import rclpy
+from nav_msgs.msg import Odometry
+from rclpy.parameter import Parameter
+from sensor_msgs.msg import Range
+
+from forward_grid_mapper.core.mapping import Mapper
+from forward_grid_mapper.core.messages import NANOSECONDS, OdometryMessage, RangeMessage
+from forward_grid_mapper.core.warm_up import warm_up
+from forward_grid_mapper.node.mapper_node import MapperNode
+from forward_grid_mapper.simulation.drive import corridor_drive
+from forward_grid_mapper.simulation.score import score_map, threshold, visible_surface
+
+ROUND = 24_000
+TICK = NANOSECONDS
+"""Simulated time between two turns of the timers."""
+
+
+def resident() -> float:
+    """Return the memory that this process uses, in MB."""
+    return int(Path('/proc/self/statm').read_text().split()[1]) * os.sysconf('SC_PAGE_SIZE') / 1e6
+
+
+def ros(message: RangeMessage | OdometryMessage) -> Range | Odometry:
+    """Return the message as it comes from a subscription."""
+    if isinstance(message, RangeMessage):
+        made = Range(
+            range=message.range,
+            min_range=message.min_range,
+            max_range=message.max_range,
+            field_of_view=message.field_of_view,
+        )
+    else:
+        made = Odometry(child_frame_id=message.child_frame_id)
+        assert message.pose is not None
+        made.pose.pose.position.x, made.pose.pose.position.y = message.pose.x, message.pose.y
+        turn = made.pose.pose.orientation
+        turn.z, turn.w = float(np.sin(message.pose.yaw / 2)), float(np.cos(message.pose.yaw / 2))
+    made.header.frame_id = message.frame_id
+    made.header.stamp.sec, made.header.stamp.nanosec = divmod(message.stamp, NANOSECONDS)
+    return made
+
+
+def messages(rounds: int) -> Iterator[RangeMessage | OdometryMessage]:
+    """Yield the messages of so many rounds by stamp, one round after the other."""
+    shift = 0
+    for seed in range(rounds):
+        drive = corridor_drive(seed, passes=2)
+        last = 0
+        for message in heapq.merge(drive.odometry, drive.ranges, key=lambda m: m.stamp):
+            last = message.stamp
+            yield message._replace(stamp=last + shift)
+        shift += last - drive.odometry[0].stamp + NANOSECONDS // 50
+
+
+class Soak:
+    """The node in this process, and what is measured of it."""
+
+    def __init__(self, max_readings: int, folder: Path, journal: bool) -> None:
+        mounts = corridor_drive(0, passes=1).mounts
+        values: dict[str, Any] = {f'sensors.{frame}.pose': [*map(float, pose)] for frame, pose in mounts}
+        values |= {'max_readings': max_readings, 'save_directory': str(folder)}
+        if journal:
+            values['journal'] = str(folder / 'journal')
+        self.node = MapperNode(parameter_overrides=[Parameter(k, value=v) for k, v in values.items()])
+        self.node.start()
+        self.message: list[float] = []
+        self.update: list[float] = []
+        self.live: list[float] = []
+
+    def take(self, message: Range | Odometry) -> None:
+        """Let the node take a message."""
+        begin = time.perf_counter()
+        if isinstance(message, Range):
+            self.node._on_range(message, {'source_timestamp': time.time_ns()})
+        else:
+            self.node._on_odometry(message)
+        self.message.append(time.perf_counter() - begin)
+
+    def tick(self) -> None:
+        """Let the node's timers have their turn."""
+        begin = time.perf_counter()
+        self.node._update_live()
+        self.update.append(time.perf_counter() - begin)
+        self.node._publish_live()
+        self.node._journal.take()
+        self.node._report()
+        self.live.append(time.perf_counter() - begin)
+
+    def row(self, seconds: float) -> str:
+        """Return what was measured since the last row."""
+        buffer = self.node._placer.buffer
+        worst, typical = 1e3 * max(self.message), 1e6 * float(np.median(self.message))
+        update, live = (1e3 * np.percentile(x, 99) for x in (self.update, self.live))
+        for measured in (self.message, self.update, self.live):
+            measured.clear()
+        gc.collect()
+        return (
+            f'{len(buffer):10d}{buffer.held:9d}{seconds / 3600:8.2f}{resident():9.0f}{typical:10.1f}{worst:10.1f}'
+            f'{update:10.2f}{live:10.2f}'
+        )
+
+
+def main() -> None:
+    """Run the soak."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument('--readings', type=int, default=1_000_000)
+    parser.add_argument('--max-readings', type=int, default=200_000)
+    parser.add_argument('--journal', action='store_true', help='keep a journal as well')
+    options = parser.parse_args()
+    rclpy.init(args=['soak', '--ros-args', '--log-level', 'ERROR'])
+    print(f'{platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}, numpy {np.__version__}')
+    warm_up()
+    with tempfile.TemporaryDirectory() as folder:
+        soak = Soak(options.max_readings, Path(folder), options.journal)
+        begin = time.monotonic()
+        print('  readings     held   hours    RSS MB    us/msg  worst ms update ms  timers ms', flush=True)
+        start = due = shown = 0
+        rounds = -(-options.readings // ROUND)
+        for message in messages(rounds):
+            start = start or message.stamp
+            soak.take(ros(message))
+            if message.stamp >= due:
+                due = message.stamp + TICK
+                soak.tick()
+            if len(soak.node._placer.buffer) >= shown + options.readings // 20:
+                shown = len(soak.node._placer.buffer)
+                print(soak.row((message.stamp - start) / NANOSECONDS), flush=True)
+        soak.tick()
+        placer = soak.node._placer
+        print(f'{placer.received} received, {len(placer.buffer)} accepted, {placer.waiting} waiting, ', end='')
+        print(f'rejected: {dict(placer.rejected)}; {time.monotonic() - begin:.0f} s in all')
+        soak.node.close()
+        if options.journal:
+            size = sum(path.stat().st_size for path in (Path(folder) / 'journal').iterdir())
+            print(f'the journal has {size / 1e6:.1f} MB')
+        first = corridor_drive(0, passes=2)
+        visible = visible_surface(first.world, first.readings.select(slice(None, None, 20)))
+        live = soak.node._live
+        for name, readings in (('first round', first.readings), ('all of it', placer.readings)):
+            maps = Mapper(soak.node.parameters).run(readings)
+            scores = score_map(maps.ml, maps.grid, first.world, visible)
+            told = f'ML F1 {scores.f1:.3f}, {scores.doors_open} of 6 doors, {scores.false_dots} false dots'
+            if name == 'all of it':
+                scores = score_map(threshold(live.probability()), live.grid, first.world, visible)
+                told += f'; live map F1 {scores.f1:.3f}'
+            print(f'{name}: {len(maps.readings)} readings, {told}, {sum(maps.statistics["seconds"].values()):.1f} s')
+        soak.node.destroy_node()
+    rclpy.shutdown()
+
+
+if __name__ == '__main__':
+    main()

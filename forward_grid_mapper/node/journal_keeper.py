@@ -1,0 +1,113 @@
+"""What links the placer to its journal: readings go to disk as they come, and come back after a restart."""
+
+from __future__ import annotations
+
+import errno
+from collections.abc import Callable
+from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticStatus
+from rclpy.node import Node
+
+from ..core.errors import OutputError
+from ..core.placing import Placer
+from ..files.journal import Journal
+from .diagnostics import status
+
+PERIOD = 0.1
+"""Seconds between two looks for new readings."""
+
+FULL = (errno.ENOSPC, errno.EDQUOT)
+
+
+class JournalKeeper:
+    """Keeps a node's journal; does nothing where the folder is empty text."""
+
+    def __init__(self, node: Node, folder: str, placer: Placer, clock: Any) -> None:
+        """Open the journal and give its readings to the placer.
+
+        Raises
+        ------
+        OutputError
+            If the journal is another node's, or cannot be opened for another reason than a full disk.
+        """
+        self._placer = placer
+        self._journal: Journal | None = None
+        self._folder = folder
+        self._trouble = ''
+        self._restored = self._taken = 0
+        self._last_point: tuple[float, float] | None = None
+        if not folder:
+            return
+        warn: Callable[[str], Any] = node.get_logger().warning
+        try:
+            self._journal = Journal(folder, warn)
+        except OutputError as error:
+            cause = error.__cause__
+            if not (isinstance(cause, OSError) and cause.errno in FULL):
+                raise
+            self._trouble = str(error)
+            warn(f'there is no journal: {error}')
+            return
+        self._restore(node, self._journal)
+        # both before readings go and as they come
+        placer.buffer.before_thinning.append(self.take)
+        node.create_timer(PERIOD, self.take, clock=clock)
+
+    def _restore(self, node: Node, journal: Journal) -> None:
+        placer = self._placer
+        for readings in journal.restore():
+            placer.restore(readings)
+        placer.map_frame, placer.base_frame = journal.contents.map_frame, journal.contents.base_frame
+        for point in journal.contents.path:
+            placer.extend_path(point)
+        self._restored = self._taken = len(placer.buffer)
+        node.get_logger().info(
+            f'journal {journal.path}: {self._restored} readings of an earlier run are back, in frame '
+            f'{placer.map_frame or "(none yet)"}'
+        )
+
+    def take(self) -> None:
+        """Hand what is new to the journal."""
+        journal, placer = self._journal, self._placer
+        if journal is None or len(placer.buffer) == self._taken:
+            return
+        new = placer.buffer.snapshot(self._taken)
+        self._taken = len(placer.buffer)
+        point = placer.path[-1] if placer.path else None
+        points = [point] if point is not None and point != self._last_point else []
+        self._last_point = point
+        journal.put(new, (placer.map_frame, placer.base_frame), points)
+
+    def reset(self) -> str:
+        """Begin a new drive, since readings were forgotten; return where the old ones are."""
+        self._restored = self._taken = 0
+        if self._journal is None:
+            return ''
+        old = self._journal.path
+        self._journal.begin_drive()
+        return f'; the journal keeps them in {old.name}' if old != self._journal.path else ''
+
+    def close(self) -> None:
+        """Write what is left."""
+        if self._journal is not None:
+            self.take()
+            self._journal.close()
+
+    def statuses(self, name: str) -> list[DiagnosticStatus]:
+        """Return the status of the journal, if there is to be one."""
+        if not self._folder:
+            return []
+        journal = self._journal
+        trouble = self._trouble if journal is None else journal.trouble
+        values: dict[str, Any] = {'folder': self._folder, 'readings restored': self._restored}
+        if journal is not None:
+            if journal.lost:
+                trouble = trouble or f'{journal.lost} readings came while nothing could be written'
+            values |= {
+                'file': journal.path.name,
+                'readings to be written': journal.unwritten,
+                'readings lost': journal.lost,
+            }
+        level = DiagnosticStatus.WARN if trouble else DiagnosticStatus.OK
+        return [status(f'{name}: journal', level, trouble or 'writing', name, values)]

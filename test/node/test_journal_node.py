@@ -1,0 +1,130 @@
+"""The node with a journal: killed, started again, and mapped offline from what it kept."""
+
+from __future__ import annotations
+
+import json
+import random
+import signal
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip('rclpy', reason='the tests of the node need rclpy')
+
+from robot import Robot
+
+from forward_grid_mapper.commands.process_bag import main as process_bag
+from forward_grid_mapper.core.messages import NANOSECONDS, OdometryMessage, Pose2, RangeMessage
+from forward_grid_mapper.files.map_archive import read_npz
+
+OPTIONS = (
+    *('-p', 'range_reliability:=reliable', '-p', 'odom_reliability:=reliable', '-p', 'publish_rate:=10.0'),
+    *('-p', 'sensors.sonar/left.pose:=[0.1, 0.0, 0.4]'),
+)
+
+
+def drive(first: int, count: int) -> list[Any]:
+    """Readings of a robot in a round room, an odometry message with each."""
+    out: list[Any] = []
+    for k in range(first, first + count):
+        stamp = k * NANOSECONDS // 20
+        out.append(OdometryMessage(stamp, 'odom', 'base_link', Pose2(0.001 * k, 0.0, 0.05 * k)))
+        out.append(RangeMessage(stamp, 'sonar/left', 2.0 + 0.3 * (k % 7 == 0), 0.1, 5.0, 0.3))
+    return out
+
+
+def accepted(robot: Robot) -> int:
+    return int(robot.diagnostics.get('readings', {}).get('readings accepted', -1))
+
+
+def until_accepted(robot: Robot, count: int) -> None:
+    robot.until(lambda: accepted(robot) == count, what=f'{count} are accepted')
+    robot.until(lambda: robot.diagnostics['journal']['readings to be written'] == '0')
+
+
+def test_a_node_that_is_killed_goes_on_where_it_was(start: Any, domain: int, tmp_path: Path) -> None:
+    folder = tmp_path / 'the journal'
+    options = (*OPTIONS, '-p', f'journal:={folder}', '-p', f'save_directory:={tmp_path}/maps')
+    sent = 0
+    rng = random.Random(4)
+    for run in range(2):
+        node = start(*options)
+        assert f'{sent} readings of an earlier run are back' in node.output
+        robot = Robot(domain)
+        try:
+            robot.meet()
+            robot.sent = sent
+            count = rng.randrange(100, 400)
+            robot.play(drive(sent, count))
+            sent += count
+            until_accepted(robot, sent)
+            live = np.array(robot.get_map('live_map').data)
+            robot.spin(0.3)
+            if run == 0:
+                other = start(*OPTIONS, '-p', f'journal:={folder}', '-r', '__node:=other', ready=False)
+                assert other.process.wait(60) == 1
+                assert 'another node' in other.output
+                assert 'Traceback' not in other.output
+        finally:
+            robot.close()
+        if run == 0:
+            node.stop(signal.SIGKILL)
+    robot = Robot(domain)
+    try:
+        robot.meet()
+        assert np.array_equal(np.array(robot.get_map('live_map').data), live)
+        assert robot.call('run_em').message.startswith(f'{sent} readings')
+        saved = Path(robot.call('save_maps').message.split(', ')[0]).parent
+        assert process_bag([str(folder), '-o', str(tmp_path / 'offline'), '-q']) == 0
+        ours, offline = read_npz(saved / 'maps.npz'), read_npz(tmp_path / 'offline' / 'maps.npz')
+        assert ours.grid == offline.grid
+        for name in ('live', 'ml', 'uncertainty'):
+            assert np.array_equal(getattr(ours, name), getattr(offline, name), equal_nan=True)
+        report = json.loads((tmp_path / 'offline' / 'report.json').read_text())
+        assert report['sensors']['sonar/left']['accepted'] == sent
+        assert report['input']['map_frame'] == 'odom'
+        # a reset begins a new drive and keeps the old one
+        told = robot.call('reset').message
+        assert 'the journal keeps them in drive_0001.journal' in told
+        robot.until(lambda: accepted(robot) == 0)
+        robot.sent = 0
+        robot.play(drive(5000, 50))
+        robot.until(lambda: accepted(robot) == 50)
+    finally:
+        robot.close()
+    assert node.stop() == 0
+    node = start(*options)
+    assert '50 readings of an earlier run are back' in node.output
+    assert sorted(path.name for path in folder.iterdir()) == ['drive_0001.journal', 'drive_0002.journal', 'lock']
+    assert process_bag([str(folder / 'drive_0001.journal'), '-o', str(tmp_path / 'old'), '-q']) == 0
+    # a node stopped in order writes everything
+    first = folder / 'drive_0001.journal'
+    first.write_bytes(first.read_bytes()[:-10])
+    assert process_bag([str(first), '-o', str(tmp_path / 'torn'), '-q']) == 0
+
+
+def test_node_and_offline_keep_the_same_readings(start: Any, robot: Robot, tmp_path: Path) -> None:
+    folder = tmp_path / 'journal'
+    start(*OPTIONS, '-p', f'journal:={folder}', '-p', f'save_directory:={tmp_path}/maps', '-p', 'max_readings:=300')
+    robot.meet()
+    robot.play(drive(0, 1500))
+    robot.until(lambda: accepted(robot) == 1500)
+    assert robot.diagnostics['readings']['readings kept to map from'] == '300 of at most 300'
+    assert robot.call('run_em').message.startswith('300 readings')
+    saved = Path(robot.call('save_maps').message.split(', ')[0]).parent
+    out = tmp_path / 'offline'
+    assert process_bag([str(folder), '-o', str(out), '-q', '--set', 'max_readings=300']) == 0
+    ours, offline = read_npz(saved / 'maps.npz'), read_npz(out / 'maps.npz')
+    assert ours.grid == offline.grid
+    for name in ('live', 'ml', 'uncertainty'):
+        assert np.array_equal(getattr(ours, name), getattr(offline, name), equal_nan=True)
+
+
+def test_a_journal_that_cannot_be(start: Any, tmp_path: Path) -> None:
+    (tmp_path / 'file').write_text('')
+    node = start('-p', f'journal:={tmp_path}/file/journal', ready=False)
+    assert node.process.wait(60) == 1
+    assert 'is a file' in node.output
+    assert 'Traceback' not in node.output

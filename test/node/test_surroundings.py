@@ -1,0 +1,32 @@
+"""Faults around the node that it tells of: publishers that it cannot hear, and nodes of the same name."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+pytest.importorskip('rclpy', reason='the tests of the node need rclpy')
+
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from robot import Robot
+from sensor_msgs.msg import Range
+
+
+def test_a_publisher_that_cannot_be_heard_and_a_namesake(start: Any, robot: Robot) -> None:
+    options = ('-p', 'range_reliability:=reliable', '-p', 'odom_reliability:=reliable')
+    node = start(*options)
+    robot.meet()
+    robot.until(lambda: 'readings' in robot.diagnostics)
+    assert 'hears nothing' not in node.output
+    best_effort = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
+    publisher = robot.node.create_publisher(Range, 'sonar', best_effort)
+    said = 'robot publishes /sonar as best_effort, and this node asks for reliable'
+    robot.until(lambda: said in robot.diagnostics['readings']['message'], what='a warning')
+    assert robot.diagnostics['readings']['level'] == b'\x01'
+    robot.node.destroy_publisher(publisher)
+    robot.until(lambda: said not in robot.diagnostics['readings']['message'], what='it passes')
+    assert node.output.count(said) == 1
+    other = start(*options)
+    node.wait_for('2 nodes are called /forward_grid_mapper', 20.0)
+    other.wait_for('2 nodes are called /forward_grid_mapper', 20.0)
