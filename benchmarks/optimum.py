@@ -14,8 +14,8 @@ import math
 
 import numpy as np
 
-from forward_grid_mapper.core.cone_index import build_cone_index, effective_sigma
-from forward_grid_mapper.core.forward_model import causes_of, log_likelihood
+from forward_grid_mapper.core.evidence import Evidence
+from forward_grid_mapper.core.forward_model import log_likelihood
 from forward_grid_mapper.core.grid import Grid
 from forward_grid_mapper.core.parameters import ModelParameters, SearchParameters
 from forward_grid_mapper.core.readings import Readings
@@ -56,9 +56,9 @@ def main() -> None:
             short = []
             for seed in range(cases):
                 readings = random_readings(np.random.default_rng(seed), grid, options.readings)
-                index = build_cone_index(readings, grid, model)
-                causes = causes_of(readings, effective_sigma(readings, model, grid.resolution), model)
-                cells = Search(index, causes, grid.width, SearchParameters(prior=prior)).run().occupied
+                evidence = Evidence(grid, model)
+                evidence.extend(readings)
+                cells = Search(evidence, SearchParameters(prior=prior)).run().occupied
                 ours = log_likelihood(readings, grid, cells.reshape(grid.shape), model) + logit * int(cells.sum())
                 short.append(best_of_all(readings, grid, model, logit) - ours)
             reached = np.mean(np.array(short) < 1e-3)

@@ -7,9 +7,11 @@ import math
 
 import numpy as np
 
+from forward_grid_mapper.core.flips import State
 from forward_grid_mapper.core.grid import Grid
 from forward_grid_mapper.core.parameters import ModelParameters
 from forward_grid_mapper.core.readings import Readings
+from forward_grid_mapper.core.tiles import Tiles
 
 
 def axis_crosses(x: float, y: float, yaw: float, length: float, left: float, bottom: float, size: float) -> bool:
@@ -42,6 +44,8 @@ def cone_cells(
 ) -> dict[int, float]:
     """Cells of a cone and their distances in metres; `slack` widens it, to tell rounding from error."""
     x, y, yaw = pose
+    # cells may be within reach whose nearest point is not where the axis crosses them
+    axis = reach + (0.7072 * grid.resolution if nearest else 0.0)
     cells = {}
     xs, ys = grid.centers()
     for row, cy in enumerate(ys):
@@ -51,7 +55,7 @@ def cone_cells(
                 continue
             off_axis = abs(math.remainder(math.atan2(cy - y, cx - x) - yaw, 2 * math.pi))
             size = grid.resolution
-            crossed = axis_crosses(x, y, yaw, reach, cx - size / 2 - slack, cy - size / 2 - slack, size + 2 * slack)
+            crossed = axis_crosses(x, y, yaw, axis, cx - size / 2 - slack, cy - size / 2 - slack, size + 2 * slack)
             if off_axis <= half_angle + slack or crossed:
                 cells[row * grid.width + column] = d
     return cells
@@ -87,12 +91,17 @@ def sigma_of(readings: Readings, t: int, grid: Grid, model: ModelParameters) -> 
 
 def obstacles(readings: Readings, t: int, grid: Grid, occupied: np.ndarray, model: ModelParameters) -> list[float]:
     """Distances of the occupied cells that reading t can meet."""
-    sigma = sigma_of(readings, t, grid, model)
-    reach = readings.z[t] + model.cut * sigma
-    reach = reach if reach < readings.z_max[t] else readings.z_max[t]
-    pose = (readings.x[t], readings.y[t], readings.yaw[t])
-    cells = cone_cells(pose, readings.half_angle[t], reach, grid, model.cell_distance == 'nearest')
-    return [d for c, d in cells.items() if occupied.ravel()[c] == 1]
+    return [d for c, d in cells_of(readings, t, grid, model).items() if occupied.ravel()[c] == 1]
+
+
+def likelihood(z: float, z_max: float, sigma: float, distances: list[float], model: ModelParameters) -> float:
+    """The density of a reading as the sum over its causes, from near to far."""
+    share = 1 - model.p_rand - model.p_lost
+    total = model.p_rand / z_max + model.p_lost * normal(z, z_max, sigma, model.cut)
+    for d in sorted(distances):
+        total += share * model.p_hit * normal(z, d, sigma, model.cut)
+        share *= 1 - model.p_hit
+    return total + share * normal(z, z_max, sigma, model.cut)
 
 
 def log_likelihood(readings: Readings, grid: Grid, occupied: np.ndarray, model: ModelParameters) -> float:
@@ -103,20 +112,88 @@ def log_likelihood(readings: Readings, grid: Grid, occupied: np.ndarray, model: 
     return total
 
 
-def live_log_odds(readings: Readings, grid: Grid, depth: float, logits: tuple[float, float, float]) -> np.ndarray:
+def free_end(readings: Readings, t: int, grid: Grid, model: ModelParameters) -> float:
+    """Where the free zone of reading t ends and its band begins, in metres."""
+    return readings.z[t] - model.cut * sigma_of(readings, t, grid, model)
+
+
+def reach(readings: Readings, t: int, grid: Grid, model: ModelParameters) -> float:
+    """The distance in metres beyond which no cell matters to reading t."""
+    end = readings.z[t] + model.cut * sigma_of(readings, t, grid, model)
+    return end if end < readings.z_max[t] else readings.z_max[t]
+
+
+def cells_of(readings: Readings, t: int, grid: Grid, model: ModelParameters, slack: float = 0.0) -> dict[int, float]:
+    """The cells that reading t sees, and their distances in metres."""
+    pose = (readings.x[t], readings.y[t], readings.yaw[t])
+    nearest = model.cell_distance == 'nearest'
+    return cone_cells(pose, readings.half_angle[t], reach(readings, t, grid, model), grid, nearest, slack)
+
+
+def live_log_odds(
+    readings: Readings, grid: Grid, depth: float, logits: tuple[float, float, float], nearest: bool = False
+) -> np.ndarray:
     """The standard map; `logits` of occupied, free, and free without echo."""
     out = np.full(grid.size, np.nan)
     xs, ys = grid.centers()
     for t in range(len(readings)):
         x, y, yaw, z = readings.x[t], readings.y[t], readings.yaw[t], readings.z[t]
         echo = z < readings.z_max[t]
-        for c, d in cone_cells((x, y, yaw), readings.half_angle[t], z + depth, grid).items():
-            bearing = math.atan2(ys[c // grid.width] - y, xs[c % grid.width] - x)
-            wide = 0.75 * grid.resolution
-            half_angle = max(readings.half_angle[t], wide / max(d, wide))
-            weight = max(0.0, 1 - (math.remainder(bearing - yaw, 2 * math.pi) / half_angle) ** 2)
+        for c, d in cone_cells((x, y, yaw), readings.half_angle[t], z + depth, grid, nearest).items():
+            dx, dy = xs[c % grid.width] - x, ys[c // grid.width] - y
+            off_axis = math.sin(math.atan2(dy, dx) - yaw)
+            # half the cone is at least three quarters of a cell wide where the cell's centre is
+            edge = max(math.sin(readings.half_angle[t]), 0.75 * grid.resolution / max(math.hypot(dx, dy), 1e-9))
+            weight = max(0.0, 1 - (off_axis / edge) ** 2)
             if d < (z - depth if echo else z):
                 out[c] = np.nansum([out[c], weight * logits[1 if echo else 2]])
             elif echo:
                 out[c] = np.nansum([out[c], weight * logits[0]])
     return out.reshape(grid.shape)
+
+
+def awkward_readings(rng: np.random.Generator, grid: Grid, count: int) -> Readings:
+    """Readings at the edges of what there is.
+
+    Sensors on corners, edges and centres of cells, inside and outside of the grid, that look along rows, columns and
+    diagonals; cones from a thread to a half plane; ranges from none to beyond the grid.
+    """
+    size, span = grid.resolution, max(grid.width, grid.height)
+    places = rng.integers(-4, 2 * span + 4, (2, count)) / 2 + rng.choice([0.0, 0.0, 0.25, 1e-13], (2, count))
+    z_max = rng.choice([0.5, 1.0, 1.5], count) * span * size
+    z = np.minimum(rng.choice([1e-3, 0.5, 1.0, 2.5, 0.3 * span, span], count) * size + rng.choice([0, 0.01]), z_max)
+    return Readings.from_columns(
+        names=('sonar',),
+        x=(grid.column + places[0]) * size,
+        y=(grid.row + places[1]) * size,
+        yaw=rng.integers(-9, 10, count) * math.pi / 4 + rng.choice([0.0, 0.0, 1e-9, 0.3], count),
+        z=np.where(rng.random(count) < 0.2, z_max, z),
+        z_max=z_max,
+        half_angle=rng.choice([1e-6, 1e-3, 0.1, math.pi / 8, math.pi / 4, 1.2, 1.55, 1.5707], count),
+        sigma=rng.choice([0.0, 0.2, 3.0], count) * size,
+        stamp=np.arange(count),
+    )
+
+
+def pairs_of(state: State, t: int) -> tuple[list[int], list[int], list[float], list[int]]:
+    """What is stored of reading t: the cells of its runs in order; cells, densities and logs of its band."""
+    share = state.shares[t]
+    assert share['stored']
+    words = state.pairs.cell[share['at'] :]
+    free = [c for k in range(share['runs']) for c in range(words[2 * k], words[2 * k + 1] + 1)]
+    begin, m = share['at'] + 2 * share['runs'], share['bands']
+    return (
+        free,
+        state.pairs.cell[begin : begin + m].tolist(),
+        state.pairs.density[begin + m : begin + 2 * m].tolist(),
+        state.pairs.log[begin + 2 * m : begin + 3 * m].tolist(),
+    )
+
+
+def readings_of_tile(tiles: Tiles, tile: int) -> list[int]:
+    """The readings in the list of a tile, the one entered last at the end."""
+    chunk, fill, out = tiles.head[tile], tiles.fill[tile], []
+    while chunk >= 0:
+        out = tiles.chunks[chunk, :fill].tolist() + out
+        chunk, fill = tiles.chunks[chunk, -1], tiles.chunks.shape[1] - 1
+    return out

@@ -56,6 +56,33 @@ def test_expectations_are_the_share_of_each_cause(seed: int) -> None:
         assert e.obstacles[t] == len(met)
 
 
+@pytest.mark.parametrize('seed', range(10))
+def test_the_sum_over_obstacles_is_that_over_all_that_may_have_happened(seed: int) -> None:
+    rng = np.random.default_rng(200 + seed)
+    model = random_model(rng)
+    for met in (rng.uniform(0, 2, n).tolist() for n in range(9)):
+        z, sigma = rng.uniform(0, 2), rng.uniform(0.05, 0.5)
+        enumerated = sum(naive.causes(z, 2.0, sigma, met, model))
+        assert naive.likelihood(z, 2.0, sigma, met, model) == pytest.approx(enumerated, rel=1e-12)
+
+
+@pytest.mark.parametrize('seed', range(6))
+def test_awkward_readings_have_the_likelihood_of_their_cells(seed: int) -> None:
+    rng = np.random.default_rng(300 + seed)
+    grid = Grid(0.1, -7, 2, 13, 11)
+    readings, model = naive.awkward_readings(rng, grid, 60), random_model(rng)
+    occupied = (rng.random(grid.shape) < 0.2).astype(np.int8)
+    told = expectations(readings, grid, occupied, model).log_likelihood
+    for t in range(len(readings)):
+        z, z_max, sigma = readings.z[t], readings.z_max[t], naive.sigma_of(readings, t, grid, model)
+        away = naive.cells_of(readings, t, grid, model, 1e-9)
+        ties = [abs(abs(z - d) - model.cut * sigma) < 1e-9 for d in [*away.values(), z_max]]
+        # where rounding does not tell what belongs to the cone, or to the noise
+        if not any(ties) and set(away) == set(naive.cells_of(readings, t, grid, model, -1e-9)):
+            met = [d for c, d in away.items() if occupied.ravel()[c]]
+            assert told[t] == pytest.approx(math.log(naive.likelihood(z, z_max, sigma, met, model)), abs=1e-9)
+
+
 def test_p_lost_of_zero_is_the_papers_model() -> None:
     rng = np.random.default_rng(7)
     readings = random_readings(rng, GRID, 20)

@@ -10,12 +10,13 @@ import pytest
 
 from conftest import random_readings
 from forward_grid_mapper.core.errors import Cancelled, InputError
-from forward_grid_mapper.core.forward_model import log_likelihood
+from forward_grid_mapper.core.forward_model import expectations, log_likelihood
 from forward_grid_mapper.core.grid import Grid
 from forward_grid_mapper.core.mapping import Mapper
 from forward_grid_mapper.core.maps import MapSet
 from forward_grid_mapper.core.parameters import Parameters
 from forward_grid_mapper.core.readings import Readings
+from forward_grid_mapper.core.search import ROUNDING
 
 AREA = Grid(0.1, -13, 4, 30, 20)
 
@@ -83,9 +84,33 @@ def test_all_maps_know_the_same_grid_and_the_figures_fit_the_map() -> None:
     assert np.array_equal(np.isnan(maps.uncertainty), maps.ml == -1)
     assert set(np.unique(maps.ml)) == {-1, 0, 1}
     likelihood = log_likelihood(maps.readings, maps.grid, maps.ml, maps.parameters.model)
-    assert maps.log_likelihood == pytest.approx(likelihood, abs=1e-9)
+    # logs are whole numbers of rounded likelihoods
+    error = ROUNDING * len(maps.readings)
+    assert maps.log_likelihood == pytest.approx(likelihood, abs=error)
     prior = maps.parameters.search.prior
-    assert maps.objective == pytest.approx(likelihood + (maps.ml == 1).sum() * math.log(prior / (1 - prior)), abs=1e-9)
+    assert maps.objective - maps.log_likelihood == pytest.approx(
+        (maps.ml == 1).sum() * math.log(prior / (1 - prior)), abs=1e-9
+    )
+
+
+@pytest.mark.parametrize('seed', range(3))
+def test_unexplained_readings_are_those_that_chance_explains_best(seed: int) -> None:
+    maps = run(some(seed))
+    random = expectations(maps.readings, maps.grid, maps.ml, maps.parameters.model).random
+    assert np.array_equal(maps.unexplained, random > 0.5)
+    assert 0 < maps.unexplained.sum() < len(maps.readings)
+
+
+def test_the_map_so_far_is_known_while_the_search_runs() -> None:
+    mapper, seen = Mapper(Parameters()), []
+    assert mapper.so_far() is None
+    maps = mapper.run(some(), lambda stage, progress: seen.append(mapper.so_far()) if progress else None)
+    assert len(seen) == maps.statistics['sweeps']
+    for grid, ml in seen:
+        assert grid == maps.grid
+        assert np.array_equal(ml == -1, maps.ml == -1)
+    assert np.array_equal(seen[-1][1], maps.ml)
+    assert not any(ml is maps.ml for _, ml in seen), 'a copy'
 
 
 def test_learning_raises_the_likelihood_and_reports_the_values() -> None:

@@ -12,17 +12,20 @@ import pytest
 
 import naive
 from conftest import random_readings
-from forward_grid_mapper.core.cone_index import ConeIndex, build_cone_index, effective_sigma
+from forward_grid_mapper.core.cones import effective_sigma
 from forward_grid_mapper.core.errors import ParameterError
-from forward_grid_mapper.core.flips import compute_gains, evidence, flip_in_order, mark_cells, refresh_all
-from forward_grid_mapper.core.forward_model import Causes, causes_of, expectations, log_likelihood
+from forward_grid_mapper.core.evidence import Evidence
+from forward_grid_mapper.core.flips import gain_of as gain_of_flip
+from forward_grid_mapper.core.forward_model import expectations, log_likelihood
 from forward_grid_mapper.core.grid import Grid
 from forward_grid_mapper.core.learning import learn
 from forward_grid_mapper.core.live_map import LiveMap
+from forward_grid_mapper.core.logs import QUANTUM
 from forward_grid_mapper.core.mapping import Mapper
+from forward_grid_mapper.core.moves import flip_in_order
 from forward_grid_mapper.core.parameters import ModelParameters, Parameters, SearchParameters, find
 from forward_grid_mapper.core.readings import Readings
-from forward_grid_mapper.core.search import Search
+from forward_grid_mapper.core.search import LEAST, Search
 from forward_grid_mapper.core.uncertainty import marginals
 from forward_grid_mapper.simulation.drive import NOISY, corridor_drive, door_drive
 
@@ -54,9 +57,12 @@ def every_map(grid: Grid) -> np.ndarray:
     return np.array(list(itertools.product((0, 1), repeat=grid.size)), np.uint8).reshape(-1, *grid.shape)
 
 
-def prepare(readings: Readings, grid: Grid, model: ModelParameters) -> tuple[ConeIndex, Causes]:
-    sigma = effective_sigma(readings, model, grid.resolution)
-    return build_cone_index(readings, grid, model), causes_of(readings, sigma, model)
+def prepare(readings: Readings, grid: Grid, model: ModelParameters, start: np.ndarray | None = None) -> Evidence:
+    made = Evidence(grid, model)
+    if start is not None:
+        made.state.maps.occupied[:] = start.ravel()
+    made.extend(readings)
+    return made
 
 
 def search(
@@ -67,10 +73,7 @@ def search(
     prior: float = 0.5,
     shift_moves: bool = True,
 ) -> Search:
-    made = Search(*prepare(readings, grid, model), grid.width, SearchParameters(prior=prior, shift_moves=shift_moves))
-    if start is not None:
-        made.state.occupied[:] = start.ravel()
-    return made
+    return Search(prepare(readings, grid, model, start), SearchParameters(prior=prior, shift_moves=shift_moves))
 
 
 def found(*arguments: object, **options: object) -> list[int]:
@@ -80,10 +83,7 @@ def found(*arguments: object, **options: object) -> list[int]:
 
 def gain_of(cell: int, readings: Readings, occupied: np.ndarray, model: ModelParameters = PAPER) -> float:
     """What the search believes a flip of `cell` of `LINE` to gain."""
-    index, causes = prepare(readings, LINE, model)
-    state = search(readings, LINE, model, occupied).state
-    refresh_all(index, causes, state)
-    return evidence(index, state, cell)
+    return gain_of_flip(prepare(readings, LINE, model, occupied).state, 0.0, cell)
 
 
 def flipped(occupied: np.ndarray, cell: int) -> np.ndarray:
@@ -276,17 +276,16 @@ Order = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 def climb(readings: Readings, grid: Grid, order: Order, model: ModelParameters = PAPER) -> np.ndarray:
     """Single flips, sweep by sweep, until none gains."""
-    index, causes = prepare(readings, grid, model)
-    climber = search(readings, grid, model)
-    state, least = climber.state, climber.least
-    refresh_all(index, causes, state)
+    state = prepare(readings, grid, model).state
+    least = LEAST[0] + LEAST[1] * state.maps.seen
     for _ in range(200):
-        mark_cells(index, state)
-        compute_gains(index, state, 0.0)
-        cells = np.flatnonzero(state.gain > least)
+        gain = state.maps.evidence * QUANTUM
+        cells = np.flatnonzero(gain > least)
         if not len(cells):
-            return state.occupied.reshape(grid.shape)
-        flip_in_order(index, causes, state, 0.0, least, order(cells, state.gain))
+            return state.maps.occupied.reshape(grid.shape)
+        cells = order(cells, gain)
+        # what they gained at first does not matter: none waits
+        flip_in_order(state, 0.0, LEAST, cells, np.zeros(len(cells)))
     raise AssertionError('the sweeps do not end')
 
 
@@ -332,11 +331,12 @@ def test_a_move_leaves_a_place_that_no_single_flip_can() -> None:
 def test_the_search_starts_from_the_empty_map_since_a_full_one_ends_lower() -> None:
     recording = door_drive(1, NOISY, seed=0)
     readings, grid = recording.readings, recording.world.grid
-    assert not search(readings, grid).state.occupied.any()
+    assert not search(readings, grid).evidence.state.maps.occupied.any()
     empty, full = (search(readings, grid, start=start).run() for start in (None, np.ones(grid.shape, np.uint8)))
     heights = [log_likelihood(readings, grid, end.occupied.reshape(grid.shape), PAPER) for end in (empty, full)]
     assert heights[0] > heights[1] + 10
-    unseen = empty.evidence == 0
+    unseen = prepare(readings, grid, PAPER).state.maps.seen == 0
+    assert (empty.evidence[unseen] == 0).all()
     assert full.occupied[unseen].all(), 'nothing ever frees them'
     assert not empty.occupied[unseen].any()
 
@@ -449,7 +449,7 @@ def test_echoes_that_may_be_lost_do_not_wipe_out_a_smooth_wall() -> None:
 @pytest.mark.parametrize('seed', range(3))
 def test_the_tails_of_the_noise_cost_work_and_change_no_map(seed: int) -> None:
     readings = random_readings(np.random.default_rng(seed), AREA, 100)
-    pairs = [len(prepare(readings, AREA, model)[0].band_cell) for model in (PAPER, WHOLE)]
+    pairs = [int(prepare(readings, AREA, model).state.shares['bands'].sum()) for model in (PAPER, WHOLE)]
     assert pairs[0] < 0.8 * pairs[1]
     assert found(readings, AREA, PAPER) == found(readings, AREA, WHOLE)
 

@@ -1,0 +1,82 @@
+"""The lists of readings by tile: nobody is missing, nobody is there twice, and lists grow without loss."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import naive
+from conftest import random_readings
+from forward_grid_mapper.core.evidence import Evidence
+from forward_grid_mapper.core.grid import Grid
+from forward_grid_mapper.core.parameters import ModelParameters
+from forward_grid_mapper.core.tiles import CHUNK, SHIFT, enter, more_chunks, moved, no_tiles
+
+
+@pytest.mark.parametrize('some', [naive.awkward_readings, random_readings])
+@pytest.mark.parametrize('grid', [Grid(0.1, -7, 12, 41, 33), Grid(0.1, 0, 0, 8, 16), Grid(0.1, 3, 3, 1, 9)])
+@pytest.mark.parametrize('batches', [1, 7])
+def test_a_tile_lists_every_reading_that_sees_one_of_its_cells_once(some: object, grid: Grid, batches: int) -> None:
+    readings = some(np.random.default_rng(1), grid, 300)
+    evidence = Evidence(grid, ModelParameters(sigma=0.03))
+    for part in np.array_split(np.arange(len(readings)), batches):
+        evidence.extend(readings.select(part))
+    tiles = evidence.state.tiles
+    expected: list[set[int]] = [set() for _ in tiles.head]
+    for t in range(len(readings)):
+        free, band, _, _ = naive.pairs_of(evidence.state, t)
+        for c in free + band:
+            row, column = divmod(c, grid.width)
+            expected[(row >> SHIFT) * tiles.across + (column >> SHIFT)].add(t)
+    assert [naive.readings_of_tile(tiles, k) for k in range(len(tiles.head))] == [sorted(e) for e in expected]
+    assert max(map(len, expected)) > CHUNK, 'too few to need a chain'
+
+
+def test_a_grid_has_tiles_for_all_of_its_cells() -> None:
+    for height, width, up, across in (
+        (1, 1, 1, 1),
+        (8, 8, 1, 1),
+        (9, 8, 2, 1),
+        (8, 9, 1, 2),
+        (16, 17, 2, 3),
+        (0, 0, 0, 0),
+    ):
+        tiles = no_tiles(height, width)
+        assert (tiles.across, len(tiles.head)) == (across, up * across)
+        assert all(naive.readings_of_tile(tiles, k) == [] for k in range(len(tiles.head)))
+
+
+def test_lists_keep_what_they_have_as_they_grow() -> None:
+    rng = np.random.default_rng(2)
+    tiles = more_chunks(no_tiles(40, 50))
+    kept: list[list[int]] = [[] for _ in tiles.head]
+    for t in range(2000):
+        if tiles.used[0] + len(tiles.head) > len(tiles.chunks):
+            room = len(tiles.chunks)
+            tiles = more_chunks(tiles)
+            assert len(tiles.chunks) > room
+        row = int(rng.integers(40))
+        first, last = sorted(rng.integers(0, 50, 2).tolist())
+        for _ in range(2):
+            enter(tiles, row, first, last, t)
+        for column in range(first >> SHIFT, (last >> SHIFT) + 1):
+            kept[(row >> SHIFT) * tiles.across + column].append(t)
+    assert [naive.readings_of_tile(tiles, k) for k in range(len(tiles.head))] == kept
+    assert tiles.used[0] == sum(-(-len(list_) // CHUNK) for list_ in kept)
+
+
+def test_lists_move_with_their_cells() -> None:
+    rng = np.random.default_rng(3)
+    tiles = more_chunks(no_tiles(20, 30))
+    for t in range(300):
+        enter(tiles, int(rng.integers(20)), *sorted(rng.integers(0, 30, 2).tolist()), t)
+    larger = moved(tiles, (50, 70), (16, 8))
+    for row in range(0, 50, 8):
+        for column in range(0, 70, 8):
+            told = naive.readings_of_tile(larger, (row >> SHIFT) * larger.across + (column >> SHIFT))
+            inside = 16 <= row < 36 and 8 <= column < 38
+            old = ((row - 16) >> SHIFT) * tiles.across + ((column - 8) >> SHIFT)
+            assert told == (naive.readings_of_tile(tiles, old) if inside else [])
+    assert (larger.latest.max(), larger.used[0]) == (299, tiles.used[0])
+    with pytest.raises(ValueError, match='whole tiles'):
+        moved(tiles, (50, 70), (4, 8))
