@@ -18,12 +18,12 @@ from .grid import Grid
 from .jit import kernel
 from .logs import QUANTUM, ratios_for
 from .maps import UNKNOWN
-from .pairs import WORD, WORDS_PER_BAND_PAIR, WORDS_PER_RUN, Lattice, bench_for, renumber, room_for_words
+from .pairs import WORD, WORDS_PER_BAND_PAIR, WORDS_PER_RUN, Lattice, bench_for, room_for_words
 from .parameters import ModelParameters
 from .prior import patterns
 from .readings import Readings
 from .threads import parts, run_each
-from .tiles import SHIFT, enter, more_chunks, moved, no_tiles
+from .tiles import SHIFT, enter, more_chunks, no_tiles
 
 STRAIGHT = 1.5707
 """Radians off the normal from where on no reading grazes."""
@@ -95,6 +95,13 @@ def share_table(readings: Readings, sigma: Floats, model: ModelParameters) -> ND
     return shares
 
 
+def _maps(grid: Grid, occupied: NDArray[np.uint8]) -> Maps:
+    """Return what is kept for the cells of a grid, without readings, on the map `occupied`, shape `grid.shape`."""
+    seen, evidence = np.zeros(grid.size, np.int32), np.zeros(grid.size, np.int64)
+    occupied = occupied.reshape(grid.shape)
+    return Maps(occupied.ravel(), evidence, seen, patterns(occupied, grid.shape))
+
+
 class Evidence:
     """Readings, a map, and what flipping each of its cells would gain.
 
@@ -140,12 +147,7 @@ class Evidence:
             shares=np.empty(0, SHARE),
             pairs=room_for_words(0),
             tiles=no_tiles(grid.height, grid.width),
-            maps=Maps(
-                np.zeros(grid.size, np.uint8) if start is None else np.array(start, np.uint8).ravel(),
-                np.zeros(grid.size, np.int64),
-                np.zeros(grid.size, np.int32),
-                np.zeros(grid.size, np.uint8) if start is None else patterns(np.array(start, np.uint8), grid.shape),
-            ),
+            maps=_maps(grid, np.zeros(grid.shape, np.uint8) if start is None else np.array(start, np.uint8)),
             bench=bench_for(0),
             ratios=ratios_for(0),
             seers=np.empty((0, 2), np.int32),
@@ -210,50 +212,34 @@ class Evidence:
         self._reserve(end)
         s = self.state
         s.cones[begin:end], s.shares[begin:end] = cones, shares
-        if not begin and self._model.grazing_angle < STRAIGHT:
-            self._face(end)
-        done = begin
-        while done < end:
-            s = self.state
-            done = _index(s, (done, end, self._words), self._totals)
-            check(s.stop)
-            if done < end:
-                self.state = s._replace(tiles=more_chunks(s.tiles))
-        self._size = end
-        self._make_room()
-        self._enter(begin, end, new=True)
+        self._take_in(begin, end)
 
     def weigh(self, readings: NDArray[np.int64]) -> None:
         """Let each of `readings` (indices, shape (N,)) stand for one more reading that says the same."""
         weigh(self.state, readings)
 
     def grow(self, grid: Grid) -> None:
-        """Go on with a larger grid, whose new cells are free.
+        """Go on with a larger grid, whose new cells are free; all readings are taken in anew.
 
         Parameters
         ----------
         grid : Grid
-            Holds the old one; both begin at whole tiles of the lattice.
+            Holds the old one.
         """
-        s, old = self.state, self.grid
+        old, maps, size = self.grid, self.state.maps, self._size
         window = grid.window(old)
-        up, right = window[0].start, window[1].start
-
-        def larger(values: NDArray[Any]) -> NDArray[Any]:
-            out = np.zeros(grid.shape, values.dtype)
-            out[window] = values.reshape(old.shape)
-            return out.ravel()
-
-        shares = s.shares[: self._size]
-        renumber(shares, s.pairs, (old.width, grid.width, up * grid.width + right))
-        s.cones['x'][: self._size] += right
-        s.cones['y'][: self._size] += up
-        self.state = s._replace(
-            lattice=s.lattice._replace(height=grid.height, width=grid.width),
-            tiles=moved(s.tiles, (grid.height, grid.width), (up, right)),
-            maps=Maps(*(larger(values) for values in s.maps)),
-        )
+        occupied = np.zeros(grid.shape, np.uint8)
+        occupied[window] = maps.occupied.reshape(old.shape)
+        self.state.cones['x'][:size] += window[1].start
+        self.state.cones['y'][:size] += window[0].start
         self.grid = grid
+        self.state = self.state._replace(
+            lattice=self.state.lattice._replace(height=grid.height, width=grid.width),
+            tiles=no_tiles(grid.height, grid.width),
+            maps=_maps(grid, occupied),
+        )
+        self._totals[:] = 0
+        self._take_in(0, size)
 
     def rebuild(self) -> None:
         """Explain all readings anew, after the map was changed in many places."""
@@ -288,6 +274,21 @@ class Evidence:
         for other in own:
             np.add(maps.evidence, other.evidence, out=maps.evidence)
 
+    def _take_in(self, begin: int, end: int) -> None:
+        """Index readings whose cones are in place, and add what they say to the evidence."""
+        if not begin and self._model.grazing_angle < STRAIGHT:
+            self._face(end)
+        done = begin
+        while done < end:
+            s = self.state
+            done = _index(s, (done, end, self._words), self._totals)
+            check(s.stop)
+            if done < end:
+                self.state = s._replace(tiles=more_chunks(s.tiles))
+        self._size = end
+        self._make_room()
+        self._enter(begin, end, new=True)
+
     def _face(self, end: int) -> None:
         """Learn from the first readings which way surfaces face."""
         sums: list[NDArray[np.int64]] = []
@@ -316,7 +317,7 @@ class Evidence:
         words, largest = int(self._totals[WORDS]), int(self._totals[LARGEST])
         if words > len(s.pairs.cell):
             kept = len(s.pairs.cell)
-            pairs = room_for_words(words if not kept else words * 3 // 2)
+            pairs = room_for_words(words if not kept else max(words, min(words * 3 // 2, self._words)))
             pairs.cell[:kept] = s.pairs.cell
             s = s._replace(pairs=pairs)
         if largest + 3 > len(s.bench.new):

@@ -32,7 +32,6 @@ from .prior import Prior, local_prior, prior_gains, shapes
 from .readings import Readings
 from .search import LEAST, Search, Window
 from .threads import cores
-from .tiles import SHIFT
 from .uncertainty import marginals
 
 SAME_PLACE = 0.5
@@ -162,10 +161,8 @@ class OnlineMap:
         evidence, g = self._evidence, self.grid
         if evidence is not None and evidence.grid.union(g) == evidence.grid:
             return evidence
-        margin, tile = MARGIN + max(g.width, g.height) // 4, 1 << SHIFT
-        left, bottom = (math.floor((at - margin) / tile) * tile for at in (g.column, g.row))
-        width, height = (n + 2 * margin + tile for n in (g.width, g.height))
-        larger = Grid(g.resolution, left, bottom, width, height)
+        margin = MARGIN + max(g.width, g.height) // 4
+        larger = Grid(g.resolution, g.column - margin, g.row - margin, g.width + 2 * margin, g.height + 2 * margin)
         p = self._parameters
         if evidence is None:
             # surfaces would have to be faced anew as readings come

@@ -11,7 +11,7 @@ are wanted, which takes longer and comes to the same.
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -181,19 +181,3 @@ def _sort(bench: Bench, m: int) -> None:
             at -= 1
         bench.key[at] = key
         bench.cell[at] = cell
-
-
-@kernel
-def renumber(shares: Any, pairs: Pairs, cells: tuple[int, int, int]) -> None:
-    """Give the cells of all stored pairs their numbers on a larger grid.
-
-    `cells` are the old width, the new one, and what cell 0 becomes.
-    """
-    width, wider, first = np.uint32(cells[0]), np.uint32(cells[1]), np.uint32(cells[2])
-    for t in range(len(shares)):
-        share = shares[t]
-        if share.stored:
-            end = share.at + WORDS_PER_RUN * share.runs + share.bands
-            for k in range(np.uint64(share.at), np.uint64(end)):
-                row = np.uint32(pairs.cell[k] // width)
-                pairs.cell[k] = np.uint32(first + row * wider + (pairs.cell[k] - row * width))

@@ -34,7 +34,7 @@ from .prior import Prior, local_prior, log_prior, prior_gains, shapes
 LEAST_GAIN = 1e-4
 """Nats that a flip must gain."""
 
-ROUNDING = 1.2e-7
+ROUNDING = 2e-7
 """Nats that it must gain in addition for each of the cell's readings: what float32 ratios may be off, so that the
 search cannot go round, not even where ten thousand readings are off to the same side."""
 

@@ -57,24 +57,6 @@ def more_chunks(tiles: Tiles) -> Tiles:
     return tiles._replace(chunks=chunks)
 
 
-def moved(tiles: Tiles, shape: tuple[int, int], by: tuple[int, int]) -> Tiles:
-    """Return the same lists on a grid of another shape (height, width), where the old one begins at cell `by`.
-
-    Raises
-    ------
-    ValueError
-        If that is not the corner of a tile.
-    """
-    if by[0] % (1 << SHIFT) or by[1] % (1 << SHIFT):
-        raise ValueError('a grid with tiles moves by whole tiles')
-    new = no_tiles(*shape)
-    up, right = by[0] >> SHIFT, by[1] >> SHIFT
-    for old, values in ((tiles.head, new.head), (tiles.fill, new.fill), (tiles.latest, new.latest)):
-        block = old.reshape(-1, tiles.across)
-        values.reshape(-1, new.across)[up : up + len(block), right : right + tiles.across] = block
-    return new._replace(chunks=tiles.chunks, used=tiles.used)
-
-
 @kernel
 def enter(tiles: Tiles, row: int, first: int, last: int, t: Any) -> None:
     """Enter reading t for the cells `first` to `last` of a row; there must be room for a chunk a tile."""
