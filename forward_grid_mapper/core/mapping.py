@@ -23,6 +23,7 @@ from .parameters import Parameters, SearchParameters
 from .readings import Readings
 from .search import Progress, Search, SearchResult
 from .threads import cores
+from .transient import transient_echoes
 from .uncertainty import marginals
 
 Watch = Callable[[str, Progress | None], None]
@@ -129,13 +130,15 @@ class Mapper:
         ml = finish(evidence, search.extend, search.least_passed, parameters.model.p_rand, driven)
         probability = marginals(result.evidence, result.neighbours, search)
         uncertainty = np.where(evidence.state.maps.seen > 0, probability, np.float32(np.nan)).reshape(ml.shape)
+        unexplained = parameters.model.p_rand / readings.z_max > 0.5 * evidence.likelihoods
         return MapSet(
-            grid=evidence.grid,
+            grid=grid,
             live=live_map,
             ml=ml,
             uncertainty=uncertainty,
             readings=readings,
-            unexplained=parameters.model.p_rand / readings.z_max > 0.5 * evidence.likelihoods,
+            unexplained=unexplained,
+            transient=transient_echoes(readings, unexplained, grid, ml, parameters.model),
             log_likelihood=evidence.log_likelihood,
             objective=evidence.log_likelihood + result.log_prior,
             parameters=parameters,

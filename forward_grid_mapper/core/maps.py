@@ -52,6 +52,8 @@ class MapSet:
     objective : float
         The log-likelihood plus the log prior odds of the occupied cells.
     parameters : Parameters
+    transient : float32
+        Echoes that the map does not explain and that end in free space: people, say (`transient`).
     statistics : dict
         Plain numbers about the run: pairs, flips, shifts, sweeps, converged, seconds by stage.
     """
@@ -65,6 +67,7 @@ class MapSet:
     log_likelihood: float
     objective: float
     parameters: Parameters
+    transient: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 0), np.float32))
     statistics: dict[str, Any] = field(default_factory=dict)
 
     def with_live(self, grid: Grid, live: NDArray[np.float32]) -> MapSet:
@@ -82,4 +85,7 @@ class MapSet:
         uncertainty, shown = (np.full(whole.shape, np.nan, np.float32) for _ in range(2))
         uncertainty[whole.window(self.grid)] = self.uncertainty
         shown[whole.window(grid)] = live
-        return replace(self, grid=whole, live=shown, ml=ml, uncertainty=uncertainty)
+        transient = np.zeros(whole.shape, np.float32)
+        if self.transient.size:
+            transient[whole.window(self.grid)] = self.transient
+        return replace(self, grid=whole, live=shown, ml=ml, uncertainty=uncertainty, transient=transient)
