@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 
+from .health import sensor_health
 from .mapping import Mapper
 from .maps import MapSet
 from .parameters import Parameters
@@ -17,4 +18,6 @@ def warm_up() -> MapSet:
     yaw = np.linspace(-math.pi, math.pi, 24, endpoint=False)
     z = 1.0 / np.maximum(np.abs(np.cos(yaw)), np.abs(np.sin(yaw)))
     readings = Readings.from_columns(('',), x=0.0, y=0.0, yaw=yaw, z=np.minimum(z, 1.4), z_max=1.4, half_angle=0.1)
-    return Mapper(Parameters(), learn_rounds=1).run(readings)
+    maps = Mapper(Parameters(), learn_rounds=1).run(readings)
+    sensor_health(maps)
+    return maps

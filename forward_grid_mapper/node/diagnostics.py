@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
@@ -52,8 +53,8 @@ class Health:
         self._slowest = 0
         em = {'state': str(run) if run else 'idle', 'last run': last_run}
         return [
-            _status(f'{name}: readings', level, message, name, values),
-            _status(f'{name}: EM', DiagnosticStatus.OK, em['state'], name, em),
+            status(f'{name}: readings', level, message, name, values),
+            status(f'{name}: EM', DiagnosticStatus.OK, em['state'], name, em),
         ]
 
     def _judge(self, placer: Placer, paused: bool) -> tuple[bytes, str]:
@@ -90,6 +91,7 @@ def array(statuses: list[DiagnosticStatus], stamp: Any) -> DiagnosticArray:
     return message
 
 
-def _status(name: str, level: bytes, message: str, hardware: str, values: dict[str, Any]) -> DiagnosticStatus:
+def status(name: str, level: bytes, message: str, hardware: str, values: Mapping[str, Any]) -> DiagnosticStatus:
+    """Return one status with its keys and values."""
     pairs = [KeyValue(key=key, value=str(value)) for key, value in values.items()]
     return DiagnosticStatus(name=name, level=level, message=message, hardware_id=hardware, values=pairs)

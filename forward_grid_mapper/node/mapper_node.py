@@ -32,6 +32,7 @@ from .deferred import DeferredService, Reply
 from .em import EmWorker, Outcome, Run, summary
 from .frames import MapFrame, Mounts, Transforms
 from .grid_message import grid_message
+from .sensor_status import SensorWatch
 
 NAME = 'forward_grid_mapper'
 QUEUE = 2000
@@ -70,6 +71,7 @@ class MapperNode(Node):
         self._lock = threading.Lock()
         self._saving = threading.Lock()
         self._health = diagnostics.Health()
+        self._sensors = SensorWatch()
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._watched = 0.0
         self._em = EmWorker(self._watch, self.get_logger().error)
@@ -190,6 +192,7 @@ class MapperNode(Node):
             generation = self._generation
 
         def finish(outcome: Outcome) -> None:
+            self._sensors.judge(outcome.maps, lambda: generation == self._generation)
             with self._lock:
                 if generation != self._generation:
                     outcome = Outcome(None, 'EM was cancelled by reset')
@@ -234,6 +237,7 @@ class MapperNode(Node):
         self._live = LiveMap(self.parameters)
         self._live_count = self._published = 0
         self._last_run = 'none since the reset'
+        self._sensors.clear()
         # late subscribers must not get the maps that were forgotten
         nothing = Grid(self.parameters.grid.resolution, 0, 0, 1, 1)
         with self._lock:
@@ -354,4 +358,5 @@ class MapperNode(Node):
             self._paused,
             extra,
         )
+        statuses.append(self._sensors.status(self.get_fully_qualified_name().lstrip('/'), placer.readings))
         self._diagnostics_out.publish(diagnostics.array(statuses, self.get_clock().now().to_msg()))
