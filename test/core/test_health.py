@@ -104,7 +104,7 @@ def test_first_obstacles() -> None:
     rows, columns = grid.cells_of(np.array([2.05]), np.array([0.05]))
     ml[rows, columns] = 1
     readings = Readings.from_columns(
-        ('a',), x=[0.0, 0.0, 0.0, 9.0], y=0.05, yaw=[0.0, 0.2, 1.0, 0.0], z=3.0, z_max=[3.0, 3.0, 3.0, 3.0],
+        ('a',), x=[0.0, 0.0, 0.0, 9.0], y=0.05, yaw=[0.0, 0.2, 1.0, 0.0], z=[3.0] * 4, z_max=[3.0, 3.0, 3.0, 3.0],
         half_angle=0.25,
     )  # fmt: skip
     found = first_obstacles(readings, grid, ml)
