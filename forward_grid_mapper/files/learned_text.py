@@ -8,6 +8,8 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+import yaml
+
 from ..core.errors import OutputError
 from ..core.joint_learning import Learned
 from ..core.messages import Pose2
@@ -82,8 +84,6 @@ def parameter_file_text(learned: Learned, mounts: Mapping[str, Pose2], ros: Mapp
     source : str
         What they were learned from, for a comment.
     """
-    import yaml
-
     lines = [f'# Learned from {" ".join(source.split())}, together with the map:' if source else '# Learned:']
     for name in LEARNED:
         estimate = learned.estimates.get(name)
@@ -94,7 +94,9 @@ def parameter_file_text(learned: Learned, mounts: Mapping[str, Pose2], ros: Mapp
     text = '\n'.join(lines) + '\n' + dump_parameters(learned.parameters)
     extra = {f'sensors.{frame}.pose': [float(v) for v in pose] for frame, pose in mounts.items()} | dict(ros)
     for key, value in extra.items():
-        text += '    ' + yaml.safe_dump({key: value}, default_flow_style=None, width=1000).strip() + '\n'
+        # a list on one line, as the rest of the file has it
+        flow = None if isinstance(value, list) else False
+        text += '    ' + yaml.safe_dump({key: value}, default_flow_style=flow, width=1000).strip() + '\n'
     return text
 
 
