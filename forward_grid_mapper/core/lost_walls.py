@@ -56,7 +56,8 @@ def lost_walls(before: MapSet, after: MapSet) -> list[Stretch]:
     """Return the stretches of wall that `before` shows and `after` does not, the longest first.
 
     A cell is lost if at least `LEAST_ECHOES` readings are its echoes in `before`, `after` has no occupied cell within
-    one cell of it, and no sensor was ever within 0.3 m of it. Stretches shorter than `LEAST_LENGTH` are left out.
+    one cell of it, and no sensor was ever within 0.3 m of it. Stretches shorter than `LEAST_LENGTH`, and those whose
+    echoes `after` explains by other obstacles, are left out.
 
     Parameters
     ----------
@@ -84,8 +85,9 @@ def lost_walls(before: MapSet, after: MapSet) -> list[Stretch]:
     for part in _stretches(lost):
         row, column = np.divmod(part, whole.width)
         length = (max(np.ptp(row), np.ptp(column)) + 1) * whole.resolution
-        if length >= LEAST_LENGTH:
-            echoes = np.unique(reading[np.isin(cell, part)])
+        echoes = np.unique(reading[np.isin(cell, part)])
+        # a wall whose echoes the new map explains otherwise was moved, not lost
+        if length >= LEAST_LENGTH and turned[echoes].sum() >= LEAST_ECHOES:
             start = float(x[column.min()]), float(y[row.min()])
             end = float(x[column.max()]), float(y[row.max()])
             found.append(Stretch(len(part), float(length), start, end, int(turned[echoes].sum())))
