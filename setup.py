@@ -9,6 +9,7 @@ SHARE = f'share/{NAME}'
 COMMANDS = {
     'mapper': 'node.main',
     'process_bag': 'commands.process_bag',
+    'learn': 'commands.learn',
     'replay_bag': 'commands.replay_bag',
     'simulate': 'commands.simulate',
     'experiment': 'commands.experiment',

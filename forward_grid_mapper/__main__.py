@@ -17,6 +17,7 @@ from . import __version__
 COMMANDS = {
     'mapper': ('node.main', 'the ROS 2 node: map while driving'),
     'process_bag': ('commands.process_bag', 'map a recorded drive'),
+    'learn': ('commands.learn', 'learn the sensor model from a recorded drive'),
     'replay_bag': ('commands.replay_bag', 'play a recorded drive to the node'),
     'simulate': ('commands.simulate', 'record a drive through a small world with a known map'),
     'experiment': ('commands.experiment', "repeat the paper's experiments: a table and a figure"),

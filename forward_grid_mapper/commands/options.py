@@ -11,6 +11,19 @@ from ..files.parameter_file import load_parameters, parse_setting
 from ..files.parameter_text import dump_parameters
 
 
+def add_bag_options(parser: argparse.ArgumentParser) -> None:
+    """Add `--range-topics`, `--odom-topic` and `--sensor`."""
+    parser.add_argument('--range-topics', nargs='+', metavar='TOPIC', help='Range topics (default: all in the bag)')
+    parser.add_argument('--odom-topic', metavar='TOPIC', help='Odometry topic (needed if the bag has several)')
+    parser.add_argument(
+        '--sensor',
+        action='append',
+        default=[],
+        metavar='FRAME=X,Y,YAW',
+        help='pose of a sensor on the robot in metres and radians (or 90deg); wins over /tf_static; may be repeated',
+    )
+
+
 def add_mapping_options(parser: argparse.ArgumentParser) -> None:
     """Add `--params`, `--set` and `--list-parameters`."""
     group = parser.add_argument_group('parameters')

@@ -18,7 +18,7 @@ from ..files.report import report_text
 from ..files.results import write_results
 from .console import Ticker, readable, run
 from .offline import Drive, read_drive
-from .options import add_mapping_options, chosen_parameters
+from .options import add_bag_options, add_mapping_options, chosen_parameters
 
 COMMAND = 'process_bag'
 
@@ -32,15 +32,7 @@ def parser() -> argparse.ArgumentParser:
     )
     made.add_argument('bag', help='ROS 2 bag folder, single .mcap or .db3 file, ROS 1 .bag, or a journal of the node')
     made.add_argument('-o', '--output', metavar='DIR', help='new folder for the results (default: BAG_maps)')
-    made.add_argument('--range-topics', nargs='+', metavar='TOPIC', help='Range topics (default: all in the bag)')
-    made.add_argument('--odom-topic', metavar='TOPIC', help='Odometry topic (needed if the bag has several)')
-    made.add_argument(
-        '--sensor',
-        action='append',
-        default=[],
-        metavar='FRAME=X,Y,YAW',
-        help='pose of a sensor on the robot in metres and radians (or 90deg); wins over /tf_static; may be repeated',
-    )
+    add_bag_options(made)
     made.add_argument(
         '--learn',
         type=int,
@@ -100,7 +92,7 @@ def _learned(maps: MapSet) -> str:
     return (
         f'learned p_hit {m.p_hit:.3f}, p_rand {m.p_rand:.3f}, p_lost {m.p_lost:.3f}, sigma {m.sigma:.3f} m together '
         f'with the map: p_hit is biased upward this way, and smooth walls may be lost; compare with a run '
-        f'without --learn'
+        f'without --learn; the command learn tells how sure they are, and stops before walls are lost'
     )
 
 

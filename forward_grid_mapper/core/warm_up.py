@@ -7,6 +7,7 @@ import math
 
 import numpy as np
 
+from .health import sensor_health
 from .mapping import Mapper
 from .maps import MapSet
 from .online_map import OnlineMap
@@ -23,4 +24,6 @@ def warm_up() -> MapSet:
     # twice the same, then a place so far away that the grid grows
     for moved in (0.0, 0.0, 40.0):
         online.add(dataclasses.replace(readings, x=readings.x + moved))
-    return Mapper(Parameters(), learn_rounds=1).run(readings)
+    maps = Mapper(Parameters(), learn_rounds=1).run(readings)
+    sensor_health(maps)
+    return maps

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 from collections.abc import Mapping
@@ -11,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from .. import __version__
+from ..core.health import SensorHealth, health_warning, sensor_health
 from ..core.maps import UNKNOWN, MapSet
 from ..core.parameters import TABLE
 from .output_folder import output_errors
@@ -39,13 +41,14 @@ def report_data(maps: MapSet, source: Mapping[str, Any]) -> dict[str, Any]:
     rest = dict(source)
     counts = dict(rest.pop('counts', None) or {})
     counts.setdefault('accepted', len(maps.readings))
-    sensors = _sensors(maps)
+    health = sensor_health(maps)
+    sensors = _sensors(maps, health)
     for name, row in (rest.pop('sensors', None) or {}).items():
         sensors[name] = {**sensors.get(name, {}), **row}
     statistics = dict(maps.statistics)
     data = {
         'version': __version__,
-        'warnings': list(rest.pop('warnings', None) or []),
+        'warnings': [*(rest.pop('warnings', None) or []), *filter(None, [health_warning(health)])],
         'input': rest,
         'counts': counts,
         'sensors': sensors,
@@ -87,7 +90,7 @@ def write_report(folder: Path | str, data: dict[str, Any]) -> None:
             path.write_text(text, encoding='utf-8')
 
 
-def _sensors(maps: MapSet) -> dict[str, dict[str, Any]]:
+def _sensors(maps: MapSet, health: Mapping[str, SensorHealth]) -> dict[str, dict[str, Any]]:
     readings = maps.readings
     table = {}
     for index, name in enumerate(readings.sensor_names):
@@ -96,6 +99,7 @@ def _sensors(maps: MapSet) -> dict[str, dict[str, Any]]:
             'accepted': int(np.count_nonzero(mine)),
             'no_echo': int(np.count_nonzero(mine & ~readings.echo)),
             'unexplained': int(np.count_nonzero(mine & maps.unexplained)),
+            'health': dataclasses.asdict(health[name]),
         }
     return table
 

@@ -72,12 +72,15 @@ def _sensors(data: dict[str, Any]) -> Iterator[str]:
     if not sensors:
         return
     width = max(12, *(len(name) + 2 for name in sensors))
-    yield f'{"Sensors":<{width}}{"accepted":>12}{"no echo":>12}{"unexplained":>14}'
+    heads = ('accepted', 'no echo', 'random', 'short')
+    yield f'{"Sensors":<{width}}{"".join(f"{head:>10}" for head in heads)}  verdict'
     for name, row in sorted(sensors.items()):
-        total = row.get('accepted')
-        shares = (_share(row.get(key), total) for key in ('no_echo', 'unexplained'))
-        no_echo, unexplained = shares
-        yield f'  {name:<{width - 2}}{_number(total):>12}{no_echo:>12}{unexplained:>14}'
+        total, health = row.get('accepted'), row.get('health') or {}
+        shares = [_share(row.get(key), total) for key in ('no_echo', 'unexplained')]
+        # of a sensor without readings there is no share
+        shares.append(_share(health.get('short'), 1))
+        cells = ''.join(f'{cell:>10}' for cell in (_number(total), *shares))
+        yield f'  {name:<{width - 2}}{cells}  {health.get("verdict", "")}'.rstrip()
 
 
 def _map(data: dict[str, Any]) -> Iterator[str]:

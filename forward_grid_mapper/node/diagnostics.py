@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
@@ -135,7 +135,7 @@ def array(statuses: list[DiagnosticStatus], stamp: Any) -> DiagnosticArray:
     return message
 
 
-def status(name: str, level: bytes, message: str, hardware: str, values: dict[str, Any]) -> DiagnosticStatus:
+def status(name: str, level: bytes, message: str, hardware: str, values: Mapping[str, Any]) -> DiagnosticStatus:
     """Return a status with its values as text."""
     pairs = [KeyValue(key=key, value=str(value)) for key, value in values.items()]
     return DiagnosticStatus(name=name, level=level, message=message, hardware_id=hardware, values=pairs)

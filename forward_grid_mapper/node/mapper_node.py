@@ -35,6 +35,7 @@ from .frames import MapFrame, Mounts, Transforms
 from .grid_message import grid_message
 from .journal_keeper import JournalKeeper
 from .online import OnlineWorker
+from .sensor_status import SensorWatch
 from .surroundings import Surroundings
 
 NAME = 'forward_grid_mapper'
@@ -77,6 +78,7 @@ class MapperNode(Node):
         self._lock = threading.Lock()
         self._saving = threading.Lock()
         self._health = diagnostics.Health()
+        self._sensors = SensorWatch()
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._watched = 0.0
         self._em = EmWorker(self._watch, self.get_logger().error)
@@ -246,6 +248,7 @@ class MapperNode(Node):
             generation = self._generation
 
         def finish(outcome: Outcome) -> None:
+            self._sensors.judge(outcome.maps, lambda: generation == self._generation)
             with self._lock:
                 if generation != self._generation:
                     outcome = Outcome(None, 'EM was cancelled by reset')
@@ -298,6 +301,7 @@ class MapperNode(Node):
         self._live = LiveMap(self.parameters)
         self._live_count = self._published = 0
         self._last_run = 'none since the reset'
+        self._sensors.clear()
         # late subscribers must not get the maps that were forgotten
         nothing = Grid(self.parameters.grid.resolution, 0, 0, 1, 1)
         with self._lock:
@@ -423,4 +427,5 @@ class MapperNode(Node):
         )
         diagnostics.add_faults(statuses[0], self._surroundings.faults())
         statuses += self._journal.statuses(self.get_fully_qualified_name().lstrip('/'))
+        statuses.append(self._sensors.status(self.get_fully_qualified_name().lstrip('/'), placer.readings))
         self._diagnostics_out.publish(diagnostics.array(statuses, self.get_clock().now().to_msg()))

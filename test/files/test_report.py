@@ -54,8 +54,12 @@ def test_numbers_come_from_the_maps() -> None:
     assert data['map']['occupied_cells'] == 36 * 26 - 34 * 24
     assert data['map']['unknown_cells'] == 40 * 30 - 36 * 26
     assert data['result'] == {'readings': 60, 'unexplained': 6, 'log_likelihood': -123.5, 'objective': -150.25}
-    assert data['sensors']['sonar_right'] == {'accepted': 30, 'no_echo': 0, 'unexplained': 0}
-    assert data['sensors']['sonar_left'] == {'accepted': 30, 'no_echo': 7, 'unexplained': 6}
+    for name, counts in (('right', (30, 0, 0)), ('left', (30, 7, 6))):
+        row = data['sensors'][f'sonar_{name}']
+        assert (row['accepted'], row['no_echo'], row['unexplained']) == counts
+        assert row['health']['readings'] == 30
+        assert row['health']['random'] == counts[2] / 30
+        assert row['health']['verdict'] == 'ok'
 
 
 def test_the_source_is_not_changed() -> None:
@@ -84,6 +88,18 @@ def test_text_tells_what_matters() -> None:
     ):
         assert part in text
     assert all(len(line) <= 100 for line in text.splitlines())
+
+
+def test_a_broken_sensor_is_warned_of_and_in_the_table() -> None:
+    maps = made_maps(readings=200)
+    maps = dataclasses.replace(maps, unexplained=maps.readings.sensor == 1)
+    data = report_data(maps, {'warnings': ['first']})
+    assert data['warnings'][0] == 'first'
+    assert 'sonar_right (mostly random)' in data['warnings'][1]
+    text = report_text(data)
+    assert 'WARNINGS (2)' in text
+    (row,) = (line for line in text.splitlines() if line.startswith('  sonar_right'))
+    assert row.split()[1] == '100' and '100.0 %' in row and row.endswith('mostly random')
 
 
 def test_an_empty_source_is_enough() -> None:

@@ -62,6 +62,10 @@ def test_a_drive_becomes_three_maps_that_late_subscribers_get(
     assert answer.success, answer.message
     for word in ('iterations', 'log-likelihood', 'flips', 'seconds'):
         assert word in answer.message
+    sensors = robot.until(
+        lambda: 'judged' not in robot.diagnostics['sensors']['message'] and robot.diagnostics['sensors']
+    )
+    assert {frame for frame, _ in door.mounts} <= set(sensors) and ' short: ' in sensors[door.mounts[0][0]]
     robot.listen()
     for name in MAPS:
         message = robot.until(lambda name=name: robot.maps[name] and robot.maps[name][-1], what=name)

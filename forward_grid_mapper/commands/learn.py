@@ -1,0 +1,88 @@
+"""`learn`: p_hit, p_rand, p_lost and σ from a recorded drive, with standard errors and doubts."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import os
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from ..core.errors import OutputError, ParameterError
+from ..core.health import health_warning, sensor_health
+from ..core.joint_learning import learn_jointly
+from ..files.learned_text import learned_text, parameter_file_text, write_new_file
+from ..files.parameter_file import load_parameters, parse_sensor
+from .console import Ticker, readable, run
+from .offline import read_drive
+from .options import add_bag_options, add_mapping_options, chosen_parameters
+
+COMMAND = 'learn'
+
+
+def parser() -> argparse.ArgumentParser:
+    """Return the parser of the command line."""
+    made = argparse.ArgumentParser(
+        COMMAND,
+        description='Learn p_hit, p_rand, p_lost and sigma from a recorded drive, in turn with the map: prints each '
+        'value with its standard error, and warns of values that lose smooth walls or rest on few readings. Look at '
+        'the maps of process_bag before you drive by them.',
+    )
+    made.add_argument('bag', help='ROS 2 bag folder, single .mcap or .db3 file, or ROS 1 .bag')
+    made.add_argument(
+        '-o', '--output', metavar='FILE', help='new parameter YAML, for process_bag --params and for the node'
+    )
+    add_bag_options(made)
+    made.add_argument(
+        '--rounds', type=int, default=5, metavar='N', help='at most so many rounds of map and updates (default 5)'
+    )
+    made.add_argument(
+        '--keep-going', action='store_true', help='hand out values although their map has lost walls of the first one'
+    )
+    made.add_argument('-q', '--quiet', action='store_true', help='print nothing but warnings and errors')
+    add_mapping_options(made)
+    return made
+
+
+def learn(options: argparse.Namespace) -> int:
+    """Do what the command line asks for."""
+    parameters, mounts = chosen_parameters(options)
+    mounts |= dict(parse_sensor(text) for text in options.sensor)
+    if options.rounds < 1:
+        raise ParameterError('--rounds must be a positive number')
+    output = Path(options.output) if options.output else None
+    if output is not None:
+        # before the work, not after it
+        if os.path.lexists(output):
+            raise OutputError(f'{output} exists; choose another file with --output, or remove it first')
+        if not output.parent.is_dir():
+            raise OutputError(f'{output.parent} is no folder; make it first, or choose another with --output')
+    bag = Path(options.bag)
+    with Ticker(options.quiet) as ticker:
+        drive = read_drive(bag, parameters, mounts, options.range_topics, options.odom_topic, ticker.reading)
+        found = learn_jointly(drive.placer.readings, parameters, options.rounds, options.keep_going, ticker.mapping)
+        suspects = health_warning(sensor_health(found.maps))
+    doubts = (*drive.source['warnings'], *found.warnings, *filter(None, [suspects]))
+    found = dataclasses.replace(found, warnings=doubts)
+    if options.quiet:
+        for warning in doubts:
+            print(f'{COMMAND}: warning: {warning}', file=sys.stderr)
+    else:
+        print(learned_text(found), end='')
+    if output is not None:
+        ros = load_parameters(options.params).node if options.params else {}
+        write_new_file(output, parameter_file_text(found, mounts, ros, readable(bag)))
+        if not options.quiet:
+            print(f'\nthe parameters are in {output}; compare the maps with and without them:')
+            print(f'  python3 -m forward_grid_mapper process_bag {readable(bag)} --params {output}')
+    return 0
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command; return its exit code."""
+    return run(parser(), learn, arguments)
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,121 @@
+"""What learning found, as a page of text and as a parameter file."""
+
+from __future__ import annotations
+
+import math
+import textwrap
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from ..core.errors import OutputError
+from ..core.joint_learning import Learned
+from ..core.messages import Pose2
+from ..core.standard_errors import LEARNED
+from .output_folder import output_errors
+from .parameter_text import dump_parameters
+
+_WIDTH = 100
+
+_HOW = (
+    'Standard errors: observed information of the readings given the map, and the scatter of 30 blocks of time where '
+    'that is larger; 95 % intervals. Both are conditional on the map: that the map was made from the same readings is '
+    'not in them. Such a map fits its readings too well: p_rand and sigma come out too low or, with a prior that '
+    'makes cells dear, p_hit too high, by many standard errors.'
+)
+
+
+def learned_text(learned: Learned) -> str:
+    """Return warnings, the learned values and the rounds as lines of text."""
+    parts = [_warnings(learned), _values(learned), _rounds(learned)]
+    return '\n\n'.join('\n'.join(lines) for part in parts if (lines := list(part))) + '\n'
+
+
+def _warnings(learned: Learned) -> Iterator[str]:
+    if learned.warnings:
+        yield f'WARNINGS ({len(learned.warnings)})'
+    for warning in learned.warnings:
+        yield textwrap.fill(warning, _WIDTH, initial_indent='  ! ', subsequent_indent='    ')
+
+
+def _values(learned: Learned) -> Iterator[str]:
+    start, model = learned.rounds[0].model, learned.parameters.model
+    yield f'{"Parameter":<12}{"start":>9}{"learned":>9}{"std error":>11}{"95 % interval":>19}{"informed by":>20}'
+    for name in LEARNED:
+        row = f'  {name:<10}{getattr(start, name):9.4f}{getattr(model, name):9.4f}'
+        estimate = learned.estimates.get(name)
+        if estimate is None:
+            yield f'{row}{"–":>11}{"not learned":>19}'
+            continue
+        known = math.isfinite(estimate.error)
+        error = f'{estimate.error:.4f}' if known else '–'
+        interval = f'{estimate.low:.4f} … {estimate.high:.4f}' if known else '–'
+        yield f'{row}{error:>11}{interval:>19}{estimate.readings:>11,.0f} readings'
+    yield textwrap.fill(_HOW, _WIDTH, initial_indent='  ', subsequent_indent='  ')
+
+
+def _rounds(learned: Learned) -> Iterator[str]:
+    yield (
+        f'{"Round":<7}{"p_hit":>8}{"p_rand":>8}{"p_lost":>8}{"sigma":>8}{"log-likelihood":>16}{"old map":>11}'
+        f'{"occupied":>10}{"by chance":>11}{"lost wall":>11}'
+    )
+    for number, r in enumerate(learned.rounds):
+        m = r.model
+        before = f'{r.log_likelihood_before:.1f}' if math.isfinite(r.log_likelihood_before) else '–'
+        verdict = ' kept' if number == learned.accepted else ' refused' if number > learned.accepted else ''
+        yield (
+            f'  {number:<5}{m.p_hit:8.4f}{m.p_rand:8.4f}{m.p_lost:8.4f}{m.sigma:8.4f}{r.log_likelihood:16.1f}'
+            f'{before:>11}{r.occupied:10,}{r.unexplained:11,}{r.lost_length:9.1f} m{verdict}'
+        )
+
+
+def parameter_file_text(learned: Learned, mounts: Mapping[str, Pose2], ros: Mapping[str, Any], source: str = '') -> str:
+    """Return a ROS 2 parameter file with the learned values, and the sensor poses that were given.
+
+    Parameters
+    ----------
+    learned : Learned
+    mounts : mapping of str to Pose2
+        Poses of sensors, for the file to hold them as well.
+    ros : mapping
+        Parameters that ROS itself gives every node.
+    source : str
+        What they were learned from, for a comment.
+    """
+    lines = [f'# Learned from {" ".join(source.split())}, together with the map:' if source else '# Learned:']
+    for name in LEARNED:
+        estimate = learned.estimates.get(name)
+        value = getattr(learned.parameters.model, name)
+        sure = f' ± {estimate.error:.2g}' if estimate and math.isfinite(estimate.error) else ', no standard error'
+        lines.append(f'#   {name} {value:.4g}{sure}')
+    lines += [f'# WARNING: {line}' for line in learned.warnings]
+    text = '\n'.join(lines) + '\n' + dump_parameters(learned.parameters)
+    extra = {f'sensors.{frame}.pose': [float(v) for v in pose] for frame, pose in mounts.items()} | dict(ros)
+    for key, value in extra.items():
+        # a list on one line, as the rest of the file has it
+        flow = None if isinstance(value, list) else False
+        text += '    ' + yaml.safe_dump({key: value}, default_flow_style=flow, width=1000).strip() + '\n'
+    return text
+
+
+def write_new_file(path: Path, text: str) -> None:
+    """Write a file that must not exist yet; nothing is left if that fails.
+
+    Raises
+    ------
+    OutputError
+        If it exists, or cannot be written.
+    """
+    with output_errors(path):
+        try:
+            file = path.open('x', encoding='utf-8')
+        except FileExistsError as error:
+            raise OutputError(f'{path} exists; choose another file with --output, or remove it first') from error
+        try:
+            with file:
+                file.write(text)
+        except OSError:
+            path.unlink(missing_ok=True)
+            raise

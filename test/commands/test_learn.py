@@ -1,0 +1,101 @@
+"""The command `learn`: what it prints, the file it writes, and that process_bag takes it."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+import yaml
+from drive_samples import code_of, everything_in, mapped, tape, write_tape
+
+from forward_grid_mapper.commands import learn
+from forward_grid_mapper.core.parameters import Parameters
+from forward_grid_mapper.files import drawing
+from forward_grid_mapper.files.parameter_file import load_parameters
+
+LEARNED = ('p_hit', 'p_rand', 'p_lost', 'sigma')
+
+
+@pytest.fixture(scope='module')
+def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A sound bag of the drive."""
+    return write_tape(tmp_path_factory.mktemp('plain') / 'bag', tape())
+
+
+def said(capsys: pytest.CaptureFixture[str], *arguments: object, code: int = 0) -> str:
+    capsys.readouterr()
+    assert code_of(learn.main, *arguments) == code
+    out, err = capsys.readouterr()
+    assert 'Traceback' not in err
+    return out if code == 0 else err
+
+
+def test_values_errors_and_rounds_are_told(bag: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    text = said(capsys, bag, '--rounds', 2)
+    start = Parameters().model
+    for name in LEARNED:
+        (row,) = re.findall(rf'^  {name} +([\d.]+) +([\d.]+) .*readings$', text, re.MULTILINE)
+        assert float(row[0]) == getattr(start, name)
+    assert re.search(r'^  p_hit .* \d\.\d{4} +\d\.\d{4} … \d\.\d{4}', text, re.MULTILINE)
+    assert 'conditional on the map' in text and '95 %' in text
+    assert re.search(r'^  0 .* 0\.0 m$', text, re.MULTILINE) and re.search(r'^  2 .* kept$', text, re.MULTILINE)
+    assert all(len(line) <= 110 for line in text.splitlines())
+
+
+def test_the_file_is_what_process_bag_takes(
+    tmp_path: Path, bag: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(drawing, 'draw', lambda path, picture: path.write_bytes(b''))
+    given = tmp_path / 'given.yaml'
+    frame, pose = tape().mounts[0]
+    given.write_text(
+        yaml.safe_dump(
+            {
+                '/**': {
+                    'ros__parameters': {
+                        'prior': 0.3,
+                        'use_sim_time': True,
+                        'range_topics': ['a', 'b'],
+                        f'sensors.{frame}.pose': list(map(float, pose)),
+                    }
+                }
+            }
+        )
+    )
+    output = tmp_path / 'learned.yaml'
+    options = ('--rounds', 1, '--params', given, '--set', 'p_rand=0.3', '--sensor', 'other=1,2,90deg')
+    text = said(capsys, bag, '-o', output, *options)
+    assert str(output) in text
+    values, mounts, node = load_parameters(output)
+    assert node == {'use_sim_time': True}
+    assert set(mounts) == {frame, 'other'} and mounts[frame] == pytest.approx(pose)
+    parameters = Parameters.from_flat(values)
+    assert parameters.search.prior == 0.3 and parameters.node.range_topics == ('a', 'b')
+    assert parameters.model.p_rand != 0.3
+    assert output.read_text().startswith('# Learned from')
+    report = mapped(bag, tmp_path / 'maps', '--params', output)
+    assert {name: report['parameters'][name] for name in LEARNED} == {name: values[name] for name in LEARNED}
+
+
+def test_files_are_never_overwritten(tmp_path: Path, bag: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    taken = tmp_path / 'mine.yaml'
+    taken.write_text('mine')
+    before = everything_in(tmp_path)
+    for path, expected in ((taken, 'exists'), (tmp_path, 'exists'), (tmp_path / 'none' / 'x.yaml', 'no folder')):
+        message = said(capsys, bag, '-o', path, code=1)
+        assert message.startswith('learn: error: ') and expected in message and '--output' in message
+    assert everything_in(tmp_path) == before and taken.read_text() == 'mine'
+
+
+def test_a_bad_request(bag: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert '--rounds' in said(capsys, bag, '--rounds', 0, code=1)
+    assert 'p_hit' in said(capsys, bag, '--set', 'p_hit=2', code=1)
+    assert 'absent' in said(capsys, tmp_path / 'absent', code=1)
+
+
+def test_quiet(bag: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    capsys.readouterr()
+    assert code_of(learn.main, bag, '-q', '--rounds', 1) == 0
+    out, err = capsys.readouterr()
+    assert out == '' and all(line.startswith('learn: warning: ') for line in err.splitlines()) and err

@@ -1,0 +1,47 @@
+"""The status of the sensors, before EM, after it, and after a reset."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+pytest.importorskip('rclpy', reason='the tests of the node need rclpy')
+
+from diagnostic_msgs.msg import DiagnosticStatus
+
+from forward_grid_mapper.core.mapping import Mapper
+from forward_grid_mapper.core.parameters import Parameters
+from forward_grid_mapper.node.sensor_status import SensorWatch
+from forward_grid_mapper.simulation.drive import drive
+from forward_grid_mapper.simulation.sonar import NOISY
+from forward_grid_mapper.simulation.world import rooms_world
+
+
+def told(status: DiagnosticStatus) -> dict[str, str]:
+    return {pair.key: pair.value for pair in status.values}
+
+
+def test_the_dead_sensor_is_named_once_em_has_run() -> None:
+    readings = drive(rooms_world(), np.array([[2.0, 2.0], [5.0, 2.0], [5.0, 6.0]]), 0.1, noise=NOISY).readings
+    readings = dataclasses.replace(readings, z=np.where(readings.sensor == 4, readings.z_max, readings.z))
+    watch = SensorWatch()
+    before = watch.status('mapper', readings)
+    assert before.name == 'mapper: sensors' and before.level == DiagnosticStatus.OK
+    assert told(before)['sonar_04'].endswith('readings, 100% no echo')
+    assert len(before.values) == 24
+
+    maps = Mapper(Parameters()).run(readings)
+    watch.judge(None, lambda: True)
+    watch.judge(maps, lambda: False)
+    assert watch.status('mapper', readings).message == before.message
+    watch.judge(maps, lambda: True)
+    after = watch.status('mapper', readings)
+    assert after.level == DiagnosticStatus.WARN
+    assert 'sonar_04 (never hears anything)' in after.message and after.message.count('sonar_') == 1
+    assert told(after)['sonar_04'].endswith('never hears anything')
+    assert told(after)['sonar_05'].endswith(': ok')
+
+    watch.clear()
+    assert watch.status('mapper', readings.select(slice(0))).level == DiagnosticStatus.OK
