@@ -109,7 +109,7 @@ class Ticker:
     def mapping(self, stage: str, progress: Progress | None) -> None:
         """Report a stage of mapping or a sweep of the search, for `Mapper.run`."""
         if progress is None:
-            self.say(f'{stage} (the first run compiles its kernels, which takes some ten seconds once)')
+            self.say(f'{stage} (the first run compiles its kernels, which takes half a minute once)')
         else:
             self.say(f'{stage}: sweep {progress.sweeps}, {progress.flips:,} flips, {progress.gain:,.0f} nats gained')
 

@@ -96,7 +96,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         node = MapperNode()
         begin = time.monotonic()
-        node.get_logger().info('preparing kernels; the first start compiles them, which takes some ten seconds')
+        node.get_logger().info('preparing kernels; the first start compiles them, which takes half a minute')
         warm_up()
         node.get_logger().info(f'kernels are ready after {time.monotonic() - begin:.1f} s')
         executor = SingleThreadedExecutor()

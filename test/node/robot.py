@@ -33,7 +33,7 @@ from forward_grid_mapper.core.messages import NANOSECONDS, OdometryMessage, Rang
 LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 RELIABLE = QoSProfile(depth=100_000, reliability=ReliabilityPolicy.RELIABLE)
 MAPS = ('live_map', 'ml_map', 'uncertainty_map')
-START_TIME = 120.0
+START_TIME = 240.0
 """Seconds; a first start compiles every kernel, on a machine that may have other work."""
 
 
