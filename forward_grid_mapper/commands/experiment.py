@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import itertools
+import math
 import sys
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
@@ -34,7 +35,16 @@ GAINS = tuple(
 )
 """The settings of the standard map among which the best is taken, which a user could not know."""
 
-PAPER = {'p_hit': 0.9, 'p_rand': 0.05, 'p_lost': 0.0, 'sigma': 0.05, 'prior': 0.5}
+PAPER = {
+    'p_hit': 0.9,
+    'p_rand': 0.05,
+    'p_lost': 0.0,
+    'sigma': 0.05,
+    'prior': 0.5,
+    'grazing_angle': math.pi / 2,
+    **dict.fromkeys(('driven_cost', 'line_bonus', 'end_cost', 'isolated_cost', 'least_passed'), 0.0),
+    **dict.fromkeys(('bridges', 'extend'), 0),
+}
 """Maximum likelihood without a prior, as printed in the paper."""
 
 

@@ -166,7 +166,11 @@ class SearchParameters:
         1000.0,
     )
     line_bonus: float = _param(
-        0.3, 'What an occupied cell gains where a wall passes through it; 0 is the paper.', 'nats', 0.0, 10.0
+        0.3,
+        'What an occupied cell gains where a wall passes through it, no more than its prior costs; 0 is the paper.',
+        'nats',
+        0.0,
+        10.0,
     )
     end_cost: float = _param(1.0, 'What the end of a wall costs, or a corner; 0 is the paper.', 'nats', 0.0, 100.0)
     isolated_cost: float = _param(
@@ -210,13 +214,6 @@ class SearchParameters:
     uncertainty_prior: float = _param(
         0.38, 'Prior occupancy used in the uncertainty map.', 'probability', 1e-6, 0.999999
     )
-
-    def __post_init__(self) -> None:
-        if self.line_bonus > 0 and math.log(self.prior / (1 - self.prior)) + self.line_bonus >= 0:
-            raise ParameterError(
-                f'prior = {self.prior:g} and line_bonus = {self.line_bonus:g} make walls likelier than none: they '
-                f'would grow where nothing was seen; log(prior / (1 - prior)) + line_bonus must be less than 0'
-            )
 
 
 @dataclass(frozen=True)

@@ -41,14 +41,20 @@ class Prior(NamedTuple):
     shape: Floats
 
 
+LEAST_COST = 0.05
+"""Nats that a cell of a wall must cost, all in all; if walls were likelier than none, they would grow out of sight."""
+
+
 def shapes(parameters: SearchParameters) -> Floats:
     """Return what each of the 256 patterns adds to the log prior odds of an occupied cell."""
+    cost = math.log((1 - parameters.prior) / parameters.prior)
+    line = min(parameters.line_bonus, max(cost - LEAST_COST, 0.0))
     out = np.full(256, -parameters.end_cost)
     out[0] = -parameters.isolated_cost
     for pattern in range(1, 256):
         bits = [k for k in range(8) if pattern >> k & 1]
         if any(min((a - b) % 8, (b - a) % 8) >= OPPOSITE_ENOUGH for a in bits for b in bits):
-            out[pattern] = parameters.line_bonus
+            out[pattern] = line
     return out
 
 
