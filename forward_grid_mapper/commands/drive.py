@@ -12,6 +12,7 @@ from ..core.live_map import LiveMap
 from ..core.maps import MapSet
 from ..core.parameters import Parameters
 from ..core.placing import Placer
+from ..files.doubt import thinned
 
 
 class LiveOfAll:
@@ -62,10 +63,5 @@ class Drive:
 
 def thinning_note(placer: Placer) -> list[str]:
     """Return what is to be told where `max_readings` lets EM have only some of the readings."""
-    bound, count = placer.parameters.max_readings, len(placer.buffer)
-    if not bound or count <= bound:
-        return []
-    return [
-        f'EM maps from {bound} of {count} readings (max_readings): where a sensor looked often from one place in one '
-        f'direction, the oldest went'
-    ]
+    count = len(placer.buffer)
+    return list(filter(None, [thinned(min(count, placer.parameters.max_readings or count), count)]))

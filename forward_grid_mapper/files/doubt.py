@@ -1,4 +1,4 @@
-"""Whether a map is to be believed: most readings should have a likelier cause in it than chance."""
+"""What is to be said of a map with its results: whether it explains the readings, and whether it knows them all."""
 
 from __future__ import annotations
 
@@ -21,4 +21,14 @@ def doubt(maps: MapSet) -> str:
     return (
         f'{unexplained} of {count} readings have chance as their likeliest cause: the map does not explain what was '
         f'measured; are the poses of the sensors, odometry and the field of view right?'
+    )
+
+
+def thinned(used: int, accepted: int) -> str:
+    """Return what is to be told where `max_readings` let EM have only `used` of the readings; empty otherwise."""
+    if used >= accepted:
+        return ''
+    return (
+        f'EM maps from {used} of {accepted} readings (max_readings): where a sensor looked often from one place in one '
+        f'direction, the oldest went'
     )

@@ -25,7 +25,7 @@ from ..core.maps import MapSet
 from ..core.messages import NANOSECONDS, odometry_message, range_message
 from ..core.parameters import Parameters
 from ..core.placing import MOST_FRAMES, Placer
-from ..files.doubt import doubt
+from ..files.doubt import doubt, thinned
 from ..files.output_folder import free_name
 from ..files.results import write_results
 from . import diagnostics, ros_parameters
@@ -68,7 +68,7 @@ class MapperNode(Node):
         self._given_mounts = mounts
         self._maps: MapSet | None = None
         self._live = LiveMap(self.parameters)
-        self._live_count = self._published = 0
+        self._live_count = self._published = self._explained = 0
         self._paused = False
         self._last_run = 'none yet'
         self._told: set[str] = set()
@@ -246,6 +246,7 @@ class MapperNode(Node):
     def _start_em(self, done: Any) -> bool:
         with self._lock:
             generation = self._generation
+        count = len(self._placer.buffer)
 
         def finish(outcome: Outcome) -> None:
             self._sensors.judge(outcome.maps, lambda: generation == self._generation)
@@ -253,7 +254,7 @@ class MapperNode(Node):
                 if generation != self._generation:
                     outcome = Outcome(None, 'EM was cancelled by reset')
                 elif outcome.maps is not None:
-                    self._maps = outcome.maps
+                    self._maps, self._explained = outcome.maps, count
                     self._publish('ml_map', outcome.maps.grid, outcome.maps.ml)
                     self._publish('uncertainty_map', outcome.maps.grid, outcome.maps.uncertainty)
                     if self._online:
@@ -339,7 +340,7 @@ class MapperNode(Node):
             maps = self._maps_to_save()
             # one after the other, so that each finds a name of its own
             with self._saving:
-                told = self._write(maps.with_live(*live), len(maps.readings))
+                told = self._write(maps.with_live(*live), self._explained)
             reply.send(True, told)
         except MapperError as error:
             reply.send(False, str(error))
@@ -375,6 +376,8 @@ class MapperNode(Node):
         warnings = []
         if newer > 0:
             warnings.append(f'{newer} readings came after EM: only the live map has them; call run_em before save_maps')
+        if note := thinned(len(maps.readings), explained):
+            warnings.append(note)
         parent = Path(self.parameters.node.save_directory).expanduser().resolve()
         stamp = time.strftime('%Y-%m-%d_%H-%M-%S')
         node = self.parameters.node

@@ -114,8 +114,12 @@ def test_node_and_offline_keep_the_same_readings(start: Any, robot: Robot, tmp_p
     assert robot.diagnostics['readings']['readings kept to map from'] == '300 of at most 300'
     assert robot.call('run_em').message.startswith('300 readings')
     saved = Path(robot.call('save_maps').message.split(', ')[0]).parent
+    told = json.loads((saved / 'report.json').read_text())['warnings']
+    assert any('EM maps from 300 of 1500 readings' in text for text in told)
+    assert not any('came after EM' in text for text in told)
     out = tmp_path / 'offline'
     assert process_bag([str(folder), '-o', str(out), '-q', '--set', 'max_readings=300']) == 0
+    assert told == json.loads((out / 'report.json').read_text())['warnings']
     ours, offline = read_npz(saved / 'maps.npz'), read_npz(out / 'maps.npz')
     assert ours.grid == offline.grid
     for name in ('live', 'ml', 'uncertainty'):

@@ -1,0 +1,55 @@
+"""EM in the background: however a run ends, whoever waits is told, and the next one can begin."""
+
+from __future__ import annotations
+
+import threading
+from typing import Any
+
+import pytest
+
+from forward_grid_mapper.core.mapping import Mapper
+from forward_grid_mapper.core.parameters import Parameters
+from forward_grid_mapper.core.readings import Readings
+from forward_grid_mapper.node import em
+from forward_grid_mapper.node.em import EmWorker, Outcome
+
+READING = Readings.from_columns(names=('sonar',), x=0.0, y=0.0, yaw=0.0, z=[1.0], z_max=4.0, half_angle=0.2)
+
+
+def outcome_of(worker: EmWorker) -> Outcome:
+    ended = threading.Event()
+    found: list[Outcome] = []
+
+    def done(outcome: Outcome) -> None:
+        found.append(outcome)
+        ended.set()
+
+    assert worker.start(READING, Parameters(), done) is not None
+    assert ended.wait(60.0)
+    return found[0]
+
+
+@pytest.mark.parametrize(
+    ('error', 'told'), [(MemoryError(), 'does not fit the memory'), (ValueError('odd'), "EM failed: ValueError('odd')")]
+)
+def test_a_run_that_fails_says_why_and_the_next_begins(
+    monkeypatch: pytest.MonkeyPatch, error: Exception, told: str
+) -> None:
+    logged: list[str] = []
+    worker = EmWorker(lambda run: None, logged.append)
+
+    def fail(*arguments: Any) -> None:
+        raise error
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Mapper, 'run', fail)
+        assert told in outcome_of(worker).message
+    maps = outcome_of(worker).maps
+    assert maps is not None
+    assert len(maps.readings) == 1
+
+
+def test_a_run_that_cannot_fit_does_not_begin(monkeypatch: pytest.MonkeyPatch) -> None:
+    worker = EmWorker(lambda run: None, print)
+    monkeypatch.setattr(em, 'shortage', lambda readings, parameters: 'there is no room')
+    assert outcome_of(worker) == Outcome(None, 'there is no room')
