@@ -67,19 +67,24 @@ def promising(s: State, prior: Prior, least: Least, window: tuple[int, int, int,
 
 
 @kernel
-def highest(s: State, prior: Prior, cells: NDArray[np.int64], gains: Floats) -> Any:
-    """Tell which of `cells` gain at least as much as each of their eight neighbours, and are not beside one like it."""
+def highest(s: State, cells: NDArray[np.int64], gains: Floats, room: Floats) -> NDArray[np.bool_]:
+    """Tell which of `cells` gain more than those of their eight neighbours that gain as well; of equals, the first.
+
+    `room` (float64, shape (cells of the map,)) must be 0, and is left so.
+    """
     height, width = s.lattice.height, s.lattice.width
+    for i in range(len(cells)):
+        room[cells[i]] = gains[i]
     chosen = np.ones(len(cells), np.bool_)
     for i in range(len(cells)):
         row, column = cells[i] // width, cells[i] % width
         for y in range(max(row - 1, 0), min(row + 2, height)):
             for x in range(max(column - 1, 0), min(column + 2, width)):
                 o = y * width + x
-                if s.maps.seen[o] and o != cells[i]:
-                    gain = gain_of(s, prior, o)
-                    if gain > gains[i] or (gain == gains[i] and o < cells[i]):
-                        chosen[i] = False
+                if room[o] > gains[i] or (room[o] == gains[i] and o < cells[i]):
+                    chosen[i] = False
+    for i in range(len(cells)):
+        room[cells[i]] = 0.0
     return chosen
 
 

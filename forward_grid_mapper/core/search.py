@@ -44,7 +44,7 @@ FEW = 32
 """Flips in a round below which sweeps are faster."""
 
 
-LITTLE = 0.005
+LITTLE = 0.01
 """Share of all that was gained which a round must add for another one to follow."""
 
 
@@ -193,7 +193,7 @@ class Search:
         """Flip all that gain more than their neighbours at once; return whether that helped."""
         maps = self.evidence.state.maps
         cells, gains = self._promising()
-        cells = cells[highest(self.evidence.state, self._prior, cells, gains)]
+        cells = cells[highest(self.evidence.state, cells, gains, np.zeros(self.evidence.grid.size))]
         if len(cells) < FEW:
             return False
         before = self._objective()

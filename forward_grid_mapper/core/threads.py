@@ -7,7 +7,7 @@ import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
-LEAST_PART = 20000
+LEAST_PART = 5000
 """Readings below which a thread is not worth its while."""
 
 
