@@ -44,7 +44,7 @@ FEW = 32
 """Flips in a round below which sweeps are faster."""
 
 
-LITTLE = 0.01
+LITTLE = 0.005
 """Share of all that was gained which a round must add for another one to follow."""
 
 

@@ -1,0 +1,270 @@
+#!/usr/bin/env python3
+"""How good the maps are: the default, the paper's plain ML map, and the standard map at its best gains.
+
+usage: quality.py [--quick] [--ablate] [--set NAME=VALUE ...] [--runs 5] [--pictures DIR]
+
+On the simulated worlds of the paper, on worlds of our own, with cones of 15° and 30°, on readings drawn from the
+forward model itself, and on the recordings under ../shared/data where they are. Each way of mapping has the same
+parameters everywhere; but the standard map has the gains of the best F1, or of the best nav_iou, for the very world,
+and for its log loss the gains and the scale that lose least there, which nobody could know.
+
+--quick takes one seed of everything; --ablate also scores the default without each of its parts; --set changes the
+default; --runs are those of the timing; --pictures draws maps into a folder.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import math
+import os
+import platform
+import statistics
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numba
+import numpy as np
+from quality_pictures import draw_pictures
+from quality_scores import (
+    OFTEN,
+    Belief,
+    Figures,
+    Standard,
+    known_cells,
+    least_loss,
+    on_truth,
+    oracle,
+    reliability,
+    score,
+    together,
+)
+from quality_worlds import Case, drawn_cases, recorded_cases, scoring_tool, simulated_cases
+
+from forward_grid_mapper.core.mapping import Mapper
+from forward_grid_mapper.core.parameters import Parameters
+from forward_grid_mapper.core.warm_up import warm_up
+from forward_grid_mapper.files.parameter_file import load_parameters, parse_setting
+from forward_grid_mapper.simulation.drive import corridor_drive
+
+PAPER = Path(__file__).resolve().parents[1] / 'config' / 'paper.yaml'
+
+NO_SHAPES: dict[str, Any] = {'line_bonus': 0.0, 'end_cost': 0.0, 'isolated_cost': 0.0, 'bridges': 0}
+
+PLAIN: dict[str, Any] = {**NO_SHAPES, 'grazing_angle': 1.5708, 'driven_cost': 0.0, 'extend': 0, 'least_passed': 0.0}
+"""Flips and shifts, and nothing else, with the default's sensor model."""
+
+ABLATIONS: dict[str, dict[str, Any]] = {
+    'grazing readings': {'grazing_angle': 1.5708},
+    'driven cells': {'driven_cost': 0.0},
+    'prior for walls': NO_SHAPES,
+    'bridges': {'bridges': 0},
+    'extension': {'extend': 0},
+    'unknown': {'least_passed': 0.0},
+    'shifts': {'shift_moves': False},
+    'lost echoes': {'p_lost': 0.0},
+    'neighbours (uncertainty)': {'neighbour_weight': 0.0, 'alpha': 0.8, 'uncertainty_prior': 0.3},
+    'all of these but lost echoes': {**PLAIN, 'neighbour_weight': 0.0, 'alpha': 0.8, 'uncertainty_prior': 0.3},
+}
+"""What the default is without each of its parts."""
+
+DRAWN = {
+    'p_hit 0.9, p_rand 0.05, p_lost 0': {'p_hit': 0.9, 'p_rand': 0.05, 'p_lost': 0.0},
+    'p_hit 0.9, p_rand 0.05, p_lost 0.1': {'p_hit': 0.9, 'p_rand': 0.05, 'p_lost': 0.1},
+    'the default: four of five are noise': {'p_hit': 0.7, 'p_rand': 0.4, 'p_lost': 0.4},
+}
+
+COLUMNS = (
+    ('F1', 'f1', '.3f'),
+    ('door', 'door', '.1f'),
+    ('shut', 'doors_closed', '.0f'),
+    ('cover', 'coverage', '.3f'),
+    ('gap', 'gap', '.0f'),
+    (f'cov {OFTEN}', 'coverage_often', '.3f'),
+    (f'gap {OFTEN}', 'gap_often', '.0f'),
+    ('smooth', 'smooth', '.2f'),
+    ('dots', 'dots', '.0f'),
+    ('nav_iou', 'nav_iou', '.3f'),
+    ('leak', 'leak', '.3f'),
+    ('blocked', 'blocked', '.3f'),
+    ('loss', 'loss', '.3f'),
+)
+
+LEGEND = f"""\
+door: least width left open, m; shut: doors that are less than half open, of all; cover: share of the columns of rough
+walls with an occupied cell at most one cell across; gap: longest run without, cells; cov {OFTEN}, gap {OFTEN}: the
+same over wall cells met by at least {OFTEN} readings; smooth: recall of smooth walls; dots: occupied cells in free
+space; nav_iou, leak, blocked: of ../shared/tools/score_map.py; loss: log loss of the uncertainty map, nats a cell.
+Means over seeds, but for door, shut, gap and smooth the worst seed. "-": nothing of the kind there."""
+
+
+@dataclass
+class Results:
+    """Figures of one way of mapping by group, and what its uncertainty map says of simulated cells."""
+
+    figures: dict[str, Figures] = field(default_factory=dict)
+    beliefs: list[Belief] = field(default_factory=list)
+    known: dict[str, list[Any]] = field(default_factory=dict)
+
+
+def groups_of(cases: Iterable[Case]) -> dict[str, list[Case]]:
+    """Return the cases by group."""
+    return {name: list(group) for name, group in itertools.groupby(cases, key=lambda case: case.group)}
+
+
+def belief(uncertainty: Any, case: Case) -> Belief:
+    """Return what an uncertainty map says of a case."""
+    known = known_cells(uncertainty, case)
+    return Belief(np.asarray(uncertainty[known], np.float64), case.truth[known] > 0.5)
+
+
+def results(groups: dict[str, list[Case]], parameters: Parameters, tool: ModuleType | None) -> Results:
+    """Map and score all cases."""
+    out = Results()
+    for name, cases in groups.items():
+        figures, out.known[name] = [], []
+        for case in cases:
+            maps = Mapper(parameters).run(case.readings)
+            uncertainty = on_truth(maps.uncertainty, maps.grid, case, tool)
+            said = belief(uncertainty, case)
+            figures.append(score(maps.ml, maps.grid, case, tool, said.loss))
+            out.known[name].append(known_cells(uncertainty, case))
+            if case.world is not None:
+                out.beliefs.append(said)
+        out.figures[name] = together(figures)
+    return out
+
+
+def line(f: Figures) -> str:
+    """Return the columns of one row of the table."""
+    cells = []
+    for head, name, form in COLUMNS:
+        value = getattr(f, name)
+        cells.append(f'{"-" if math.isnan(value) else format(value, form):>{max(len(head), 5) + 1}s}')
+    return ''.join(cells)
+
+
+def print_table(rows: dict[str, Results], groups: dict[str, list[Case]], tool: ModuleType | None) -> None:
+    """Print the table, with the standard map last in each group."""
+    print(f'{"":24s}' + ''.join(f'{head:>{max(len(head), 5) + 1}s}' for head, *_ in COLUMNS))
+    known = next(iter(rows.values())).known
+    above = []
+    for name, cases in groups.items():
+        print(f'{name}, {len(cases)} x {len(cases[0].readings)} readings')
+        standard, fit_to_drive = oracle(cases, known[name], tool)
+        for title, result in rows.items():
+            print(f'  {title:22s}{line(result.figures[name])}')
+        print(f'  {"standard, best F1":22s}{line(standard)}')
+        print(f'  {"standard, best nav_iou":22s}{line(fit_to_drive)}', flush=True)
+        if not next(iter(rows.values())).figures[name].loss < standard.loss:
+            above.append(name)
+    print(LEGEND)
+    print('\nlog loss of the first row is not below that of the standard map on:', ', '.join(above) or 'none')
+
+
+def print_ablations(groups: dict[str, list[Case]], base: dict[str, Any], whole: Results, tool: Any) -> None:
+    """Print one row for the default without each of its parts."""
+    names = list(groups)
+    own = [n for n in names if groups[n][0].world is not None and not n.startswith(('door n', 'corridor'))]
+    doors = [n for n in names if n.startswith('door n')]
+    hall = [n for n in names if n.startswith('corridor')][:1]
+    recordings = [n for n in names if groups[n][0].world is None]
+
+    def mean(r: Results, which: Sequence[str], name: str) -> float:
+        return float(np.mean([getattr(r.figures[n], name) for n in which])) if which else math.nan
+
+    print('\nthe default without                 door n=…        corridor 15°                 own worlds', end='')
+    print(''.join(f'{n:>13s}' for n in recordings), '   simulated')
+    print(f'{"":32s}{"F1":>7s}{"open":>6s}{"F1":>8s}{"dots":>6s}{"cover":>7s}{"smooth":>8s}', end='')
+    print(f'{"F1":>7s}{"nav":>7s}{"cover":>7s}' + f'{"F1":>7s}{"nav":>6s}' * len(recordings) + f'{"loss":>9s}')
+    for title, changes in {'nothing': None, **ABLATIONS}.items():
+        r = whole if changes is None else results(groups, Parameters.from_flat({**base, **changes}), tool)
+        least = min(r.figures[n].door for n in doors)
+        row = (
+            f'{title:32s}{mean(r, doors, "f1"):7.3f}{least:6.1f}{mean(r, hall, "f1"):8.3f}{mean(r, hall, "dots"):6.0f}'
+        )
+        row += f'{mean(r, hall, "coverage"):7.3f}{mean(r, hall, "smooth"):8.2f}'
+        row += ''.join(f'{mean(r, own, key):7.3f}' for key in ('f1', 'nav_iou', 'coverage'))
+        row += ''.join(f'{r.figures[n].f1:7.3f}{r.figures[n].nav_iou:6.3f}' for n in recordings)
+        print(row + f'{mean(r, own + doors + hall, "loss"):9.3f}', flush=True)
+
+
+def print_drawn(base: dict[str, Any], quick: bool) -> None:
+    """Print log losses on readings drawn from the forward model, with the default's and with the true parameters."""
+    print('\nReadings drawn from the forward model on the true map: log loss, nats a cell')
+    print(f'{"drawn with":38s}{"world":16s}{"constant":>9s}{"standard":>9s}{"default":>9s}{"told":>8s}{"mapped":>8s}')
+    for title, model in DRAWN.items():
+        for case in drawn_cases(model, quick):
+            losses = []
+            for changes in ({}, model):
+                maps = Mapper(Parameters.from_flat({**base, **changes})).run(case.readings)
+                uncertainty = on_truth(maps.uncertainty, maps.grid, case, None)
+                said = belief(uncertainty, case)
+                losses.append(said.loss)
+                if not changes:
+                    mapped = belief(np.where(on_truth(maps.ml, maps.grid, case, None) >= 0, uncertainty, np.nan), case)
+            standard = least_loss([Standard(case, None)], [known_cells(uncertainty, case)])
+            print(f'{title:38s}{case.group:16s}{said.base:9.3f}{standard:9.3f}{losses[0]:9.3f}', end='')
+            print(f'{losses[1]:8.3f}{mapped.loss:8.3f}')
+    print('constant: the share of occupied cells everywhere; standard: the standard map at its best gains and scale;')
+    print('told: the default but with the parameters of the sensor model that the readings were drawn with;')
+    print('mapped: the default, over cells that its ML map knows as free or occupied')
+
+
+def print_cost(base: dict[str, Any], paper: dict[str, Any], runs: int) -> None:
+    """Print what the default costs beside plain EM, run by turns."""
+    variants = {
+        'default': base,
+        "plain EM, the default's model": {**base, **PLAIN},
+        'plain EM, config/paper.yaml': paper,
+    }
+    readings = corridor_drive(0).readings
+    seconds: dict[str, list[float]] = {name: [] for name in variants}
+    for _ in range(runs):
+        for name, flat in variants.items():
+            spent = Mapper(Parameters.from_flat(flat)).run(readings).statistics['seconds']
+            seconds[name].append(sum(spent[stage] for stage in ('index', 'search', 'uncertainty')))
+    print(f'\nSeconds for the corridor, {len(readings)} readings: index, search and finishing; medians of {runs} runs')
+    ours = statistics.median(seconds['default'])
+    for name, spent in seconds.items():
+        middle = statistics.median(spent)
+        print(f'  {name:32s}{middle:7.2f} s   the default takes {ours / middle:.2f} times as long')
+
+
+def main() -> None:
+    """Run the benchmark."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument('--quick', action='store_true', help='one seed of everything')
+    parser.add_argument('--ablate', action='store_true', help='also the default without each of its parts')
+    parser.add_argument('--set', action='append', default=[], metavar='NAME=VALUE', help='change the default')
+    parser.add_argument('--runs', type=int, default=5, help='runs of the timing')
+    parser.add_argument('--pictures', type=Path, metavar='DIR', help='draw maps into this folder')
+    options = parser.parse_args()
+    base = dict(parse_setting(text) for text in options.set)
+    paper = dict(load_parameters(PAPER).values)
+    print(f'{platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}, ', end='')
+    print(f'numpy {np.__version__}, numba {numba.__version__}' + (f'; changed: {base}' if base else ''))
+    warm_up()
+    tool = scoring_tool()
+    groups = groups_of(simulated_cases(options.quick))
+    if tool is not None:
+        groups |= groups_of(recorded_cases(tool))
+    variants = {'default': base, 'paper, plain ML': paper}
+    rows = {title: results(groups, Parameters.from_flat(flat), tool) for title, flat in variants.items()}
+    print_table(rows, groups, tool)
+    for title, result in rows.items():
+        print(f'\nReliability of the uncertainty map, all simulated worlds: {title}')
+        print('\n'.join(reliability(result.beliefs)))
+    if options.ablate:
+        print_ablations(groups, base, rows['default'], tool)
+    print_drawn(base, options.quick)
+    print_cost(base, paper, options.runs)
+    if options.pictures:
+        draw_pictures(options.pictures, groups, base, paper, tool)
+
+
+if __name__ == '__main__':
+    main()
