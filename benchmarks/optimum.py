@@ -21,6 +21,9 @@ from forward_grid_mapper.core.parameters import ModelParameters, SearchParameter
 from forward_grid_mapper.core.readings import Readings
 from forward_grid_mapper.core.search import Search
 
+INDEPENDENT = {'line_bonus': 0.0, 'end_cost': 0.0, 'isolated_cost': 0.0}
+"""Cells that know nothing of each other, as in the sum over all maps here."""
+
 
 def random_readings(rng: np.random.Generator, grid: Grid, count: int) -> Readings:
     """Return readings from random places of the grid in random directions, one in four without echo."""
@@ -51,14 +54,14 @@ def main() -> None:
     for width, height, cases in ((4, 3, options.cases), (4, 4, max(1, options.cases // 10))):
         grid = Grid(0.1, 0, 0, width, height)
         for p_hit, prior in ((0.9, 0.5), (0.6, 0.4), (0.3, 0.3)):
-            model = ModelParameters(p_hit=p_hit, p_rand=0.1, p_lost=0.1, sigma=0.06)
+            model = ModelParameters(p_hit=p_hit, p_rand=0.1, p_lost=0.1, sigma=0.06, grazing_angle=math.pi / 2)
             logit = math.log(prior / (1 - prior))
             short = []
             for seed in range(cases):
                 readings = random_readings(np.random.default_rng(seed), grid, options.readings)
                 evidence = Evidence(grid, model)
                 evidence.extend(readings)
-                cells = Search(evidence, SearchParameters(prior=prior)).run().occupied
+                cells = Search(evidence, SearchParameters(prior=prior, **INDEPENDENT)).run().occupied
                 ours = log_likelihood(readings, grid, cells.reshape(grid.shape), model) + logit * int(cells.sum())
                 short.append(best_of_all(readings, grid, model, logit) - ours)
             reached = np.mean(np.array(short) < 1e-3)

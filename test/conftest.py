@@ -2,16 +2,46 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from forward_grid_mapper.core.grid import Grid
+from forward_grid_mapper.core.parameters import ModelParameters, SearchParameters
 from forward_grid_mapper.core.readings import Readings
 
 sys.path.insert(0, str(Path(__file__).parent))
+
+PLAIN_MODEL: dict[str, Any] = {'grazing_angle': math.pi / 2}
+"""Every cone whole."""
+
+PLAIN_SEARCH: dict[str, Any] = {
+    'driven_cost': 0.0,
+    'line_bonus': 0.0,
+    'end_cost': 0.0,
+    'isolated_cost': 0.0,
+    'bridges': 0,
+    'extend': 0,
+    'least_passed': 0.0,
+    'neighbour_weight': 0.0,
+}
+"""Independent cells, and nothing made of the map that the search found."""
+
+PLAIN: dict[str, Any] = {**PLAIN_MODEL, **PLAIN_SEARCH}
+"""The model and the search of the paper, whatever the defaults are."""
+
+
+def plain_model(**values: Any) -> ModelParameters:
+    return ModelParameters(**{**PLAIN_MODEL, **values})
+
+
+def plain_search(**values: Any) -> SearchParameters:
+    return SearchParameters(**{**PLAIN_SEARCH, **values})
+
 
 SHARED = Path(__file__).resolve().parents[2] / 'shared'
 

@@ -10,6 +10,7 @@ import numpy as np
 from forward_grid_mapper.core.flips import State
 from forward_grid_mapper.core.grid import Grid
 from forward_grid_mapper.core.parameters import ModelParameters
+from forward_grid_mapper.core.prior import Prior
 from forward_grid_mapper.core.readings import Readings
 from forward_grid_mapper.core.tiles import Tiles
 
@@ -196,4 +197,109 @@ def readings_of_tile(tiles: Tiles, tile: int) -> list[int]:
     while chunk >= 0:
         out = tiles.chunks[chunk, :fill].tolist() + out
         chunk, fill = tiles.chunks[chunk, -1], tiles.chunks.shape[1] - 1
+    return out
+
+
+def neighbours_of(c: int, shape: tuple[int, int]) -> dict[int, int]:
+    """The neighbours of a cell on the grid, by their bearing in eighths of a turn from east."""
+    row, column = divmod(c, shape[1])
+    out = {}
+    for y, x in itertools.product((-1, 0, 1), repeat=2):
+        if (x or y) and 0 <= row + y < shape[0] and 0 <= column + x < shape[1]:
+            out[round(math.atan2(y, x) / (math.pi / 4)) % 8] = c + y * shape[1] + x
+    return out
+
+
+def pattern_of(occupied: np.ndarray, c: int, shape: tuple[int, int]) -> int:
+    return sum(1 << k for k, o in neighbours_of(c, shape).items() if occupied.ravel()[o])
+
+
+def log_prior(prior: Prior, occupied: np.ndarray, shape: tuple[int, int]) -> float:
+    """That of a whole map, cell by cell."""
+    cells = np.flatnonzero(occupied.ravel()).tolist()
+    return math.fsum(prior.local[c] + prior.shape[pattern_of(occupied, c, shape)] for c in cells)
+
+
+def prior_gain(prior: Prior, occupied: np.ndarray, c: int, shape: tuple[int, int]) -> float:
+    """What flipping cell c adds to the log prior: the difference of two whole maps, of which the rest is left out."""
+    # only the cell and its neighbours are priced otherwise afterwards
+    nearby = {c, *neighbours_of(c, shape).values()}
+    flipped = occupied.copy().ravel()
+    flipped[c] ^= 1
+    after, before = (
+        math.fsum(prior.local[k] + prior.shape[pattern_of(cells, k, shape)] for k in nearby if cells[k])
+        for cells in (flipped, occupied.ravel())
+    )
+    return after - before
+
+
+def log_likelihoods(readings: Readings, grid: Grid, maps: np.ndarray, model: ModelParameters) -> np.ndarray:
+    """Those of many maps, shape (maps, cells), at once."""
+    share = 1 - model.p_rand - model.p_lost
+    total = np.zeros(len(maps))
+    for t in range(len(readings)):
+        z, z_max, sigma = readings.z[t], readings.z_max[t], sigma_of(readings, t, grid, model)
+        no_echo = normal(z, z_max, sigma, model.cut)
+        likelihood, left = np.full(len(maps), model.p_rand / z_max + model.p_lost * no_echo), np.full(len(maps), share)
+        for c, d in sorted(cells_of(readings, t, grid, model).items(), key=lambda pair: pair[1]):
+            answers = model.p_hit * maps[:, c]
+            likelihood += left * answers * normal(z, d, sigma, model.cut)
+            left *= 1 - answers
+        total += np.log(likelihood + left * no_echo)
+    return total
+
+
+def box_sum(values: np.ndarray) -> np.ndarray:
+    """Sums over the 3 x 3 cells around each, as far as there are any."""
+    out = np.zeros_like(values)
+    for row, column in np.ndindex(values.shape):
+        out[row, column] = values[max(row - 1, 0) : row + 2, max(column - 1, 0) : column + 2].sum()
+    return out
+
+
+def normals(readings: Readings, grid: Grid, model: ModelParameters) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """C, S and M of `facing`, before they are summed over 3 x 3 cells."""
+    sums = np.zeros((3, *grid.shape))
+    xs, ys = grid.centers()
+    for t in range(len(readings)):
+        if readings.z[t] >= readings.z_max[t]:
+            continue
+        sigma = sigma_of(readings, t, grid, model)
+        for c in cells_of(readings, t, grid, model):
+            row, column = divmod(c, grid.width)
+            dx, dy = xs[column] - readings.x[t], ys[row] - readings.y[t]
+            d, bearing = math.hypot(dx, dy), math.atan2(dy, dx)
+            if d > max(readings.z[t] - 4 * sigma, 0.0):
+                w = math.exp(-0.5 * ((d - readings.z[t]) / sigma) ** 2)
+                sums[:, row, column] += w * math.cos(2 * bearing), w * math.sin(2 * bearing), w
+    return sums[0], sums[1], sums[2]
+
+
+def passed(
+    readings: Readings, grid: Grid, occupied: np.ndarray, model: ModelParameters, weight: np.ndarray | None = None
+) -> np.ndarray:
+    """How many readings are expected to have passed each cell, shape (cells,): the formula of `finishing`."""
+    out = np.zeros(grid.size)
+    share = 1 - model.p_rand - model.p_lost
+    for t in range(len(readings)):
+        z, z_max, sigma = readings.z[t], readings.z_max[t], sigma_of(readings, t, grid, model)
+        away = cells_of(readings, t, grid, model)
+        chance, no_echo = model.p_rand / z_max, normal(z, z_max, sigma, model.cut)
+        met = sorted((d, c) for c, d in away.items() if occupied.ravel()[c])
+        free_end = z - model.cut * sigma
+        terms, left = [], share
+        for d, _ in met:
+            terms.append((d, left * model.p_hit * normal(z, d, sigma, model.cut)))
+            left *= 1 - model.p_hit
+        whole = sum(term for _, term in terms) + left * no_echo
+        total = chance + model.p_lost * no_echo + whole
+        for c, d in away.items():
+            before = sum(term for at, term in terms if at <= d)
+            p = (whole - before) / total
+            if d <= free_end and no_echo == 0.0:
+                # by chance it came through what lies in the free zone before the cell, if all of that let it
+                blocking = [at for at, _ in met if at <= free_end]
+                behind = bool(blocking) and d > min(blocking)
+                p += chance / total * ((1 - model.p_hit) ** len(blocking) if behind else 1.0)
+            out[c] += p * (1 if weight is None else weight[t])
     return out

@@ -6,8 +6,9 @@ at distance d, with A the share of T from occupied cells up to d,
 
     p(passed) = (T − A) / (c + T)
 
-and in the free zone T / (c + T), plus chance (e_*) for a reading with an echo: something that the map lacks may have
-been there at its range. A cell through which less than about one reading passed is not known to be free.
+and in the free zone T / (c + T), plus chance (e_*) for a reading with an echo too short to be the largest range:
+something that the map lacks may have been there. Chance counts (1 − p_hit) for each obstacle that it had to get by in
+the free zone. A cell through which less than about one reading passed is not known to be free.
 
 Where a straight wall ends in the open and the cells ahead have nothing against them, it goes on for a few cells: a wall
 is more likely to leave the view than to end there.

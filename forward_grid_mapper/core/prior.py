@@ -106,10 +106,10 @@ def note_flip(pattern: NDArray[np.uint8], c: int, height: int, width: int) -> No
     """Bring the patterns of the neighbours of cell c, which was flipped, up to date."""
     row, column = c // width, c % width
     for k in range(8):
-        o = neighbour(c, k, width)
-        y, x = o // width, o % width
-        if 0 <= o < height * width and abs(y - row) <= 1 and abs(x - column) <= 1:
-            pattern[o] ^= 1 << ((k + 4) & 7)
+        x = column + (1 if k in (0, 1, 7) else (-1 if k in (3, 4, 5) else 0))
+        y = row + (1 if k in (1, 2, 3) else (-1 if k in (5, 6, 7) else 0))
+        if 0 <= x < width and 0 <= y < height:
+            pattern[y * width + x] ^= 1 << ((k + 4) & 7)
 
 
 def patterns(occupied: NDArray[np.uint8], shape: tuple[int, int]) -> NDArray[np.uint8]:

@@ -14,15 +14,16 @@ import pytest
 PACKAGE = Path(__file__).resolve().parents[2] / 'forward_grid_mapper'
 PROGRAM = """
 import sys, time
-from forward_grid_mapper.core import jit, warm_up
+from forward_grid_mapper.core import jit, live_map, parameters, readings
 begin = time.perf_counter()
-maps = warm_up.warm_up()
-print(time.perf_counter() - begin, jit.CACHE, warm_up.__file__)
+live = live_map.LiveMap(parameters.Parameters())
+live.add(readings.Readings.from_columns(x=0.0, y=0.0, yaw=0.0, z=[1.0], z_max=2.0, half_angle=0.1))
+print(time.perf_counter() - begin, jit.CACHE, live_map.__file__)
 """
 
 
 def run(install: Path, temporary: Path) -> tuple[float, Path]:
-    """Map with a copy of the package; return the seconds and the folder of kernels."""
+    """Make a live map with a copy of the package; return the seconds and the folder of kernels."""
     changes = {'PYTHONPATH': str(install), 'HOME': '/dev/null', 'TMPDIR': str(temporary), 'XDG_CACHE_HOME': ''}
     environment = {k: v for k, v in os.environ.items() if k != 'NUMBA_CACHE_DIR'} | changes
     done = subprocess.run(

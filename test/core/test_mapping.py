@@ -8,13 +8,15 @@ import math
 import numpy as np
 import pytest
 
-from conftest import random_readings
+import naive
+from conftest import PLAIN, PLAIN_MODEL, random_readings
 from forward_grid_mapper.core.errors import Cancelled, InputError
 from forward_grid_mapper.core.forward_model import expectations, log_likelihood
 from forward_grid_mapper.core.grid import Grid
 from forward_grid_mapper.core.mapping import Mapper
 from forward_grid_mapper.core.maps import MapSet
 from forward_grid_mapper.core.parameters import Parameters
+from forward_grid_mapper.core.prior import Prior, local_prior, shapes
 from forward_grid_mapper.core.readings import Readings
 from forward_grid_mapper.core.search import ROUNDING
 
@@ -63,7 +65,7 @@ def turned(readings: Readings) -> Readings:
 @pytest.mark.parametrize('seed', range(8))
 def test_mirrored_or_turned_readings_give_the_mirrored_or_turned_maps(seed: int) -> None:
     readings = some(seed)
-    plain, mirror, turn = (run(r, cell_distance='center') for r in (readings, mirrored(readings), turned(readings)))
+    plain, mirror, turn = (run(r, **PLAIN) for r in (readings, mirrored(readings), turned(readings)))
     for name, tolerance in (('ml', 0), ('live', 1e-5), ('uncertainty', 1e-4)):
         expected = getattr(plain, name)
         np.testing.assert_allclose(getattr(mirror, name)[:, ::-1], expected, atol=tolerance)
@@ -73,13 +75,13 @@ def test_mirrored_or_turned_readings_give_the_mirrored_or_turned_maps(seed: int)
 @pytest.mark.parametrize('seed', range(4))
 def test_with_nearest_points_the_same_holds_but_for_ties(seed: int) -> None:
     # two neighbours can be equally near, and then the first in the order of cells is taken
-    plain, mirror = (run(r, cell_distance='nearest') for r in (some(seed), mirrored(some(seed))))
+    plain, mirror = (run(r, **PLAIN, cell_distance='nearest') for r in (some(seed), mirrored(some(seed))))
     assert (mirror.ml[:, ::-1] != plain.ml).sum() <= 4
     assert mirror.objective == pytest.approx(plain.objective, abs=2.0)
 
 
 def test_all_maps_know_the_same_grid_and_the_figures_fit_the_map() -> None:
-    maps = run(some())
+    maps = run(some(), **PLAIN)
     assert maps.live.shape == maps.ml.shape == maps.uncertainty.shape == maps.grid.shape
     assert np.array_equal(np.isnan(maps.uncertainty), maps.ml == -1)
     assert set(np.unique(maps.ml)) == {-1, 0, 1}
@@ -93,16 +95,42 @@ def test_all_maps_know_the_same_grid_and_the_figures_fit_the_map() -> None:
     )
 
 
+@pytest.mark.parametrize('values', [{}, {'extend': 0, 'least_passed': 1.5}, {'line_bonus': 0.1, 'driven_cost': 0.0}])
+def test_with_all_that_makes_maps_better_they_still_know_the_same_grid(values: dict[str, float]) -> None:
+    maps, plain = run(some(), **values), run(some(), **PLAIN)
+    assert maps.live.shape == maps.ml.shape == maps.uncertainty.shape == maps.grid.shape
+    seen = ~np.isnan(maps.uncertainty)
+    assert np.array_equal(seen, plain.ml != -1)
+    assert not (maps.ml[~seen] != -1).any(), 'what nobody saw is unknown'
+    assert (maps.ml[seen] == -1).any(), 'and some of what was seen, but not gone through'
+
+
+@pytest.mark.parametrize('driven_cost', [0.0, 2.0])
+def test_the_objective_is_the_likelihood_and_the_prior_of_the_map_that_was_found(driven_cost: float) -> None:
+    # as it is before walls are drawn out and free told from unknown; the likelihood is that of whole cones
+    whole = {**PLAIN_MODEL, 'extend': 0, 'least_passed': 0.0, 'driven_cost': driven_cost}
+    maps = run(some(), **whole)
+    likelihood = log_likelihood(maps.readings, maps.grid, maps.ml, maps.parameters.model)
+    assert maps.log_likelihood == pytest.approx(likelihood, abs=ROUNDING * len(maps.readings))
+    driven = np.zeros(maps.grid.shape, bool)
+    driven[maps.grid.cells_of(maps.readings.x, maps.readings.y)] = True
+    search = maps.parameters.search
+    prior = Prior(local_prior(search, driven & (driven_cost > 0)).ravel(), shapes(search))
+    told = naive.log_prior(prior, maps.ml == 1, maps.grid.shape)
+    assert maps.objective - maps.log_likelihood == pytest.approx(told, abs=1e-9)
+    assert (maps.ml == 1)[driven].any() == (driven_cost == 0.0)
+
+
 @pytest.mark.parametrize('seed', range(3))
 def test_unexplained_readings_are_those_that_chance_explains_best(seed: int) -> None:
-    maps = run(some(seed))
+    maps = run(some(seed), **PLAIN)
     random = expectations(maps.readings, maps.grid, maps.ml, maps.parameters.model).random
     assert np.array_equal(maps.unexplained, random > 0.5)
     assert 0 < maps.unexplained.sum() < len(maps.readings)
 
 
 def test_the_map_so_far_is_known_while_the_search_runs() -> None:
-    mapper, seen = Mapper(Parameters()), []
+    mapper, seen = Mapper(Parameters.from_flat(PLAIN)), []
     assert mapper.so_far() is None
     maps = mapper.run(some(), lambda stage, progress: seen.append(mapper.so_far()) if progress else None)
     assert len(seen) == maps.statistics['sweeps']
@@ -115,8 +143,8 @@ def test_the_map_so_far_is_known_while_the_search_runs() -> None:
 
 def test_learning_raises_the_likelihood_and_reports_the_values() -> None:
     readings = some()
-    plain = run(readings)
-    learned = Mapper(Parameters(), learn_rounds=3).run(readings)
+    plain = run(readings, **PLAIN)
+    learned = Mapper(Parameters.from_flat(PLAIN), learn_rounds=3).run(readings)
     assert learned.log_likelihood > plain.log_likelihood
     assert learned.parameters.model != plain.parameters.model
 
@@ -127,7 +155,7 @@ def test_no_readings_is_an_error_that_says_so() -> None:
 
 
 def test_a_run_can_be_cancelled_at_any_stage() -> None:
-    for stage in ('live map', 'index', 'search'):
+    for stage in ('live map', 'index', 'search', 'uncertainty'):
         mapper = Mapper(Parameters())
         with pytest.raises(Cancelled):
             mapper.run(

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import naive
-from conftest import random_readings
+from conftest import plain_model, random_readings
 from forward_grid_mapper.core.evidence import Evidence
 from forward_grid_mapper.core.flips import flip
 from forward_grid_mapper.core.forward_model import expectations, log_likelihood
@@ -28,6 +28,7 @@ from forward_grid_mapper.core.moves import (
     unsettle,
 )
 from forward_grid_mapper.core.parameters import ModelParameters
+from forward_grid_mapper.core.prior import Prior, patterns
 from forward_grid_mapper.core.readings import Readings
 from forward_grid_mapper.core.search import LEAST
 
@@ -45,15 +46,15 @@ def random_case(
     readings.x[:] += 0.001234
     readings.y[:] -= 0.000777
     readings.z[:] = np.minimum(readings.z + 0.000345, readings.z_max)
-    model = ModelParameters(
+    readings.sigma[:] *= 1.0017
+    model = plain_model(
         p_hit=rng.choice([0.05, 0.6, 0.98]),
         p_rand=rng.choice([0.001, 0.1, 0.4]),
         p_lost=rng.choice([0.0, 0.25]),
         sigma=rng.choice([0.01, 0.06]),
         cell_distance=str(rng.choice(['center', 'nearest'])),
     )
-    evidence = Evidence(GRID, model, memory=memory)
-    evidence.state.maps.occupied[:] = rng.random(GRID.size) < filled
+    evidence = Evidence(GRID, model, memory=memory, start=rng.random(GRID.shape) < filled)
     evidence.extend(readings)
     return evidence, readings
 
@@ -62,21 +63,32 @@ def model_of(evidence: Evidence) -> ModelParameters:
     return evidence._model
 
 
-def height(evidence: Evidence, readings: Readings, prior: float = 0.0) -> float:
+def prior_of(name: str) -> Prior:
+    """All in sixteenths of a nat, so that sums are exact in any order."""
+    if name in ('none', 'less'):
+        return Prior(np.full(GRID.size, {'none': 0.0, 'less': -0.5}[name]), np.zeros(256))
+    rng = np.random.default_rng(256)
+    return Prior(rng.integers(-30, -5, GRID.size) / 16, rng.integers(-24, 16, 256) / 16)
+
+
+PRIORS = pytest.mark.parametrize('prior', [prior_of('less'), prior_of('shapes')], ids=['independent', 'shapes'])
+
+
+def height(evidence: Evidence, readings: Readings, prior: Prior) -> float:
     shaped = evidence.state.maps.occupied.reshape(GRID.shape)
-    return log_likelihood(readings, GRID, shaped, model_of(evidence)) + prior * int(shaped.sum())
+    return log_likelihood(readings, GRID, shaped, model_of(evidence)) + naive.log_prior(prior, shaped, GRID.shape)
 
 
-def gain(evidence: Evidence, prior: float, c: int) -> float:
+def gain(evidence: Evidence, prior: Prior, c: int) -> float:
     maps = evidence.state.maps
-    return int(maps.evidence[c]) * QUANTUM + (-prior if maps.occupied[c] else prior)
+    return int(maps.evidence[c]) * QUANTUM + naive.prior_gain(prior, maps.occupied, c, GRID.shape)
 
 
 WHOLE = (0, GRID.height, 0, GRID.width)
 
 
 def listed(
-    evidence: Evidence, prior: float, least: tuple[float, float] = LEAST, window: tuple[int, int, int, int] = WHOLE
+    evidence: Evidence, prior: Prior, least: tuple[float, float] = LEAST, window: tuple[int, int, int, int] = WHOLE
 ) -> tuple[np.ndarray, np.ndarray]:
     cells, gains = np.empty(GRID.size, np.int64), np.empty(GRID.size)
     n = promising(evidence.state, prior, least, window, cells, gains)
@@ -94,8 +106,9 @@ def neighbours(c: int) -> list[int]:
 
 
 @pytest.mark.parametrize('seed', range(10))
-@pytest.mark.parametrize('prior', [0.0, -2.0])
-def test_promising_cells_are_those_whose_flip_gains(seed: int, prior: float) -> None:
+@pytest.mark.parametrize('name', ['none', 'less', 'shapes'])
+def test_promising_cells_are_those_whose_flip_gains(seed: int, name: str) -> None:
+    prior = prior_of(name)
     evidence, _ = random_case(seed)
     least = (0.01, 0.002)
     seen = evidence.state.maps.seen
@@ -111,16 +124,19 @@ def test_promising_cells_are_those_whose_flip_gains(seed: int, prior: float) -> 
 
 
 @pytest.mark.parametrize('seed', range(10))
-def test_the_highest_are_those_that_no_neighbour_beats(seed: int) -> None:
+@PRIORS
+def test_the_highest_are_those_that_no_neighbour_beats(seed: int, prior: Prior) -> None:
     evidence, _ = random_case(seed)
     # make ties
     evidence.state.maps.evidence[:] = evidence.state.maps.evidence >> 23 << 23
-    cells, gains = listed(evidence, -0.5, NOTHING)
-    told = cells[highest(evidence.state, -0.5, cells, gains)].tolist()
+    cells, gains = listed(evidence, prior, NOTHING)
+    room = np.zeros(GRID.size)
+    told = cells[highest(evidence.state, cells, gains, room)].tolist()
+    assert not room.any()
     expected = []
     for c in cells:
-        rivals = [(gain(evidence, -0.5, o), -o) for o in neighbours(c) if evidence.state.maps.seen[o]]
-        if all((gain(evidence, -0.5, c), -c) > rival for rival in rivals):
+        rivals = [(gain(evidence, prior, o), -o) for o in neighbours(c) if o in cells]
+        if all((gain(evidence, prior, c), -c) > rival for rival in rivals):
             expected.append(int(c))
     assert told == expected
     assert len(told) > 0
@@ -129,10 +145,12 @@ def test_the_highest_are_those_that_no_neighbour_beats(seed: int) -> None:
 
 @pytest.mark.parametrize('seed', range(10))
 @pytest.mark.parametrize('memory', [math.inf, 0.0])
-def test_flips_in_order_are_made_while_they_gain_and_what_they_gain_is_told(seed: int, memory: float) -> None:
+@PRIORS
+def test_flips_in_order_are_made_while_they_gain_and_what_they_gain_is_told(
+    seed: int, memory: float, prior: Prior
+) -> None:
     evidence, readings = random_case(seed, memory=memory)
     twin, _ = random_case(seed)
-    prior = -0.5
     cells, gains = listed(evidence, prior)
     order = np.argsort(-gains, kind='stable')
     before = height(evidence, readings, prior)
@@ -209,11 +227,15 @@ def test_the_joint_gain_of_a_reading_is_the_difference_of_two_evaluations(filled
 
 @pytest.mark.parametrize('memory', [math.inf, 0.0])
 @pytest.mark.parametrize('seed', range(10))
-def test_the_best_shifts_are_those_that_brute_force_finds(seed: int, memory: float) -> None:
+@PRIORS
+def test_the_best_shifts_are_those_that_brute_force_finds(seed: int, memory: float, prior: Prior) -> None:
     evidence, readings = random_case(seed, memory=memory)
-    maps, prior = evidence.state.maps, -0.5
+    maps = evidence.state.maps
     cells = np.flatnonzero((maps.occupied == 1) & (maps.seen > 0))
+    kept = maps.occupied.copy()
     targets, gains = best_shifts(evidence.state, prior, LEAST, cells, joints(evidence, cells))
+    assert np.array_equal(maps.occupied, kept)
+    assert np.array_equal(maps.pattern, patterns(kept, GRID.shape))
     before = height(evidence, readings, prior)
     for c, target, told in zip(cells.tolist(), targets.tolist(), gains.tolist(), strict=True):
         exact = {}
@@ -236,8 +258,7 @@ def test_the_best_shifts_are_those_that_brute_force_finds(seed: int, memory: flo
 def test_a_reading_of_weight_three_says_of_shifts_what_three_readings_say(seed: int) -> None:
     heavy, readings = random_case(seed)
     heavy.weigh(np.repeat(np.arange(len(readings)), 2))
-    thrice = Evidence(GRID, model_of(heavy))
-    thrice.state.maps.occupied[:] = heavy.state.maps.occupied
+    thrice = Evidence(GRID, model_of(heavy), start=heavy.state.maps.occupied.reshape(GRID.shape))
     thrice.extend(readings.select(np.repeat(np.arange(len(readings)), 3)))
     cells = np.flatnonzero(heavy.state.maps.occupied)
     assert np.array_equal(joints(heavy, cells), joints(thrice, cells))
@@ -255,9 +276,10 @@ def test_what_readings_say_of_shifts_adds_up_and_needs_no_memory(seed: int) -> N
 
 
 @pytest.mark.parametrize('seed', range(10))
-def test_shifts_are_made_while_they_gain_and_what_they_gain_is_told(seed: int) -> None:
+@PRIORS
+def test_shifts_are_made_while_they_gain_and_what_they_gain_is_told(seed: int, prior: Prior) -> None:
     evidence, readings = random_case(seed)
-    maps, prior = evidence.state.maps, -0.5
+    maps = evidence.state.maps
     cells = np.flatnonzero((maps.occupied == 1) & (maps.seen > 0))
     targets, gains = best_shifts(evidence.state, prior, LEAST, cells, joints(evidence, cells))
     order = np.argsort(-gains, kind='stable')[: int((targets >= 0).sum())]
@@ -285,7 +307,7 @@ def test_shifts_of_what_has_gone_or_to_where_something_is_are_left_out() -> None
     occupied, free = (np.flatnonzero(evidence.state.maps.occupied == v) for v in (1, 0))
     before = evidence.state.maps.occupied.copy()
     for cells, targets in ((free[:5], free[5:10]), (occupied[:5], occupied[5:10])):
-        assert shift_in_order(evidence.state, 0.0, LEAST, cells, targets) == (0, 0.0)
+        assert shift_in_order(evidence.state, prior_of('none'), LEAST, cells, targets) == (0, 0.0)
     assert np.array_equal(evidence.state.maps.occupied, before)
 
 
@@ -312,11 +334,11 @@ def test_readings_that_see_a_flip_are_found_and_unsettle_all_their_cells(
 
 def test_stop_ends_every_loop() -> None:
     evidence, _ = random_case(1)
-    cells, gains = listed(evidence, 0.0)
+    cells, gains = listed(evidence, prior_of('none'))
     occupied = np.flatnonzero(evidence.state.maps.occupied)
     before = evidence.state.maps.occupied.copy()
     evidence.state.stop[0] = 1
-    assert flip_in_order(evidence.state, 0.0, LEAST, cells, gains) == (0, 0.0)
+    assert flip_in_order(evidence.state, prior_of('none'), LEAST, cells, gains) == (0, 0.0)
     assert not joints(evidence, occupied).any()
-    assert shift_in_order(evidence.state, 0.0, LEAST, occupied, occupied + 1) == (0, 0.0)
+    assert shift_in_order(evidence.state, prior_of('none'), LEAST, occupied, occupied + 1) == (0, 0.0)
     assert np.array_equal(evidence.state.maps.occupied, before)

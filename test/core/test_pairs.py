@@ -10,12 +10,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import naive
-from conftest import random_readings
+from conftest import plain_model, random_readings
 from forward_grid_mapper.core.cones import walk
 from forward_grid_mapper.core.evidence import Evidence
 from forward_grid_mapper.core.grid import Grid
-from forward_grid_mapper.core.pairs import _sort, bench_for, make, renumber
-from forward_grid_mapper.core.parameters import ModelParameters
+from forward_grid_mapper.core.pairs import _sort, bench_for, make
 
 GRID = Grid(0.1, -7, 12, 41, 33)
 
@@ -25,7 +24,7 @@ GRID = Grid(0.1, -7, 12, 41, 33)
 @pytest.mark.parametrize('cut', [4.0, 5.0, 40.0])
 def test_runs_and_band_are_the_free_zone_and_the_rest_of_the_cone(some: object, nearest: bool, cut: float) -> None:
     readings = some(np.random.default_rng(4), GRID, 80)
-    model = ModelParameters(cut=cut, sigma=0.06, cell_distance='nearest' if nearest else 'center')
+    model = plain_model(cut=cut, sigma=0.06, cell_distance='nearest' if nearest else 'center')
     evidence = Evidence(GRID, model)
     evidence.extend(readings)
     state = evidence.state
@@ -55,7 +54,7 @@ def test_runs_and_band_are_the_free_zone_and_the_rest_of_the_cone(some: object, 
 
 
 def test_each_run_lies_in_one_row() -> None:
-    evidence = Evidence(GRID, ModelParameters(sigma=0.01))
+    evidence = Evidence(GRID, plain_model(sigma=0.01))
     evidence.extend(random_readings(np.random.default_rng(5), GRID, 60))
     state = evidence.state
     for share in state.shares[:60]:
@@ -69,7 +68,7 @@ def test_cells_of_equal_distance_stay_in_the_order_of_the_grid() -> None:
     readings = naive.awkward_readings(np.random.default_rng(6), grid, 1)
     for name, value in {'x': 1.05, 'y': 1.05, 'yaw': 0.0, 'z': 0.5, 'z_max': 2.0, 'half_angle': 1.5}.items():
         getattr(readings, name)[:] = value
-    evidence = Evidence(grid, ModelParameters())
+    evidence = Evidence(grid, plain_model())
     evidence.extend(readings)
     _, band, _, _ = naive.pairs_of(evidence.state, 0)
     squares = [(c % 21 - 10) ** 2 + (c // 21 - 10) ** 2 for c in band]
@@ -77,32 +76,15 @@ def test_cells_of_equal_distance_stay_in_the_order_of_the_grid() -> None:
 
 
 def test_pairs_made_anew_are_those_that_are_stored() -> None:
-    model = ModelParameters(cell_distance='nearest')
+    model = plain_model(cell_distance='nearest')
     evidence = Evidence(GRID, model)
     evidence.extend(naive.awkward_readings(np.random.default_rng(7), GRID, 100))
     s = evidence.state
     for t, share in enumerate(s.shares[:100]):
         sizes = (int(share['runs']), int(share['bands']))
-        make(s.cones, s.lattice, t, s.bench.pairs, 0, sizes, s.bench)
+        assert make(s.cones, s.lattice, s.facing, t, s.bench.pairs, 0, s.bench) == sizes
         words = 2 * sizes[0] + 2 * sizes[1]
         assert np.array_equal(s.bench.pairs.cell[:words], s.pairs.cell[share['at'] : share['at'] + words])
-
-
-def test_pairs_get_the_numbers_of_their_cells_on_a_larger_grid() -> None:
-    evidence = Evidence(GRID, ModelParameters(), memory=20_000)
-    evidence.extend(random_readings(np.random.default_rng(9), GRID, 50))
-    state = evidence.state
-    stored = np.flatnonzero(state.shares['stored'])
-    assert 10 < len(stored) < 50
-    before = [naive.pairs_of(state, t) for t in stored]
-    up, right, wider = 5, 3, 60
-    renumber(state.shares, state.pairs, (GRID.width, wider, up * wider + right))
-
-    def numbers(cells: list[int]) -> list[int]:
-        return [(c // GRID.width + up) * wider + c % GRID.width + right for c in cells]
-
-    for t, (free, band, density, log) in zip(stored, before, strict=True):
-        assert naive.pairs_of(state, t) == (numbers(free), numbers(band), density, log)
 
 
 @given(
@@ -129,7 +111,7 @@ def test_densities_integrate_to_one() -> None:
     for name, value in {'x': 0.0, 'y': 0.0025, 'yaw': 0.0, 'z': 1.0, 'z_max': 3.0, 'half_angle': 0.1}.items():
         getattr(readings, name)[:] = value
     readings.sigma[:] = 0.05
-    evidence = Evidence(grid, ModelParameters())
+    evidence = Evidence(grid, plain_model(cut=5.0))
     evidence.extend(readings)
     _, _, density, _ = naive.pairs_of(evidence.state, 0)
     assert math.fsum(density) * grid.resolution == pytest.approx(1.0, abs=1e-5)

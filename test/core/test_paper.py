@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import naive
-from conftest import random_readings
+from conftest import PLAIN, plain_model, plain_search, random_readings
 from forward_grid_mapper.core.cones import effective_sigma
 from forward_grid_mapper.core.errors import ParameterError
 from forward_grid_mapper.core.evidence import Evidence
@@ -23,7 +23,8 @@ from forward_grid_mapper.core.live_map import LiveMap
 from forward_grid_mapper.core.logs import QUANTUM
 from forward_grid_mapper.core.mapping import Mapper
 from forward_grid_mapper.core.moves import flip_in_order
-from forward_grid_mapper.core.parameters import ModelParameters, Parameters, SearchParameters, find
+from forward_grid_mapper.core.parameters import ModelParameters, Parameters, find
+from forward_grid_mapper.core.prior import Prior
 from forward_grid_mapper.core.readings import Readings
 from forward_grid_mapper.core.search import LEAST, Search
 from forward_grid_mapper.core.uncertainty import marginals
@@ -34,7 +35,7 @@ LINE = Grid(0.1, 0, 0, 12, 1)
 
 AREA = Grid(0.1, 0, 0, 12, 9)
 
-PAPER = ModelParameters(p_hit=0.6, p_rand=0.1, p_lost=0.0, sigma=0.05, cut=5.0, cell_distance='center')
+PAPER = plain_model(p_hit=0.6, p_rand=0.1, p_lost=0.0, sigma=0.05, cut=5.0, cell_distance='center')
 
 WHOLE = replace(PAPER, cut=40.0)
 """The same with the tails of the noise."""
@@ -58,11 +59,13 @@ def every_map(grid: Grid) -> np.ndarray:
 
 
 def prepare(readings: Readings, grid: Grid, model: ModelParameters, start: np.ndarray | None = None) -> Evidence:
-    made = Evidence(grid, model)
-    if start is not None:
-        made.state.maps.occupied[:] = start.ravel()
+    made = Evidence(grid, model, start=start)
     made.extend(readings)
     return made
+
+
+def no_prior(grid: Grid) -> Prior:
+    return Prior(np.zeros(grid.size), np.zeros(256))
 
 
 def search(
@@ -73,7 +76,7 @@ def search(
     prior: float = 0.5,
     shift_moves: bool = True,
 ) -> Search:
-    return Search(prepare(readings, grid, model, start), SearchParameters(prior=prior, shift_moves=shift_moves))
+    return Search(prepare(readings, grid, model, start), plain_search(prior=prior, shift_moves=shift_moves))
 
 
 def found(*arguments: object, **options: object) -> list[int]:
@@ -83,7 +86,7 @@ def found(*arguments: object, **options: object) -> list[int]:
 
 def gain_of(cell: int, readings: Readings, occupied: np.ndarray, model: ModelParameters = PAPER) -> float:
     """What the search believes a flip of `cell` of `LINE` to gain."""
-    return gain_of_flip(prepare(readings, LINE, model, occupied).state, 0.0, cell)
+    return gain_of_flip(prepare(readings, LINE, model, occupied).state, no_prior(LINE), cell)
 
 
 def flipped(occupied: np.ndarray, cell: int) -> np.ndarray:
@@ -285,7 +288,7 @@ def climb(readings: Readings, grid: Grid, order: Order, model: ModelParameters =
             return state.maps.occupied.reshape(grid.shape)
         cells = order(cells, gain)
         # what they gained at first does not matter: none waits
-        flip_in_order(state, 0.0, LEAST, cells, np.zeros(len(cells)))
+        flip_in_order(state, no_prior(grid), LEAST, cells, np.zeros(len(cells)))
     raise AssertionError('the sweeps do not end')
 
 
@@ -349,7 +352,7 @@ def test_the_mixed_marginal_is_that_of_eq_42_to_45_with_the_prior_counted_once()
     result = search(readings, prior=0.3).run()
     occupied = result.occupied.reshape(LINE.shape)
     alpha, prior = 0.6, 0.2
-    q = marginals(result.evidence, SearchParameters(alpha=alpha, uncertainty_prior=prior))
+    q = marginals(result.evidence, result.neighbours, plain_search(alpha=alpha, uncertainty_prior=prior))
     for c in range(LINE.size):
         both = [occupied.copy(), occupied.copy()]
         both[0][0, c], both[1][0, c] = 0, 1
@@ -363,7 +366,7 @@ def test_without_evidence_the_marginal_is_the_prior_at_any_alpha() -> None:
     prior = 0.2
     h = math.log(prior / (1 - prior))
     for alpha in (0.0, 0.3, 1.0):
-        q = float(marginals(np.zeros(1), SearchParameters(alpha=alpha, uncertainty_prior=prior))[0])
+        q = float(marginals(np.zeros(1), np.zeros(1), plain_search(alpha=alpha, uncertainty_prior=prior))[0])
         assert q == pytest.approx(prior)
         # Table 2's last line mixes in the prior as if the likelihood ratio contained it already
         printed = 1 / (1 + math.exp(-(1 - alpha) * h))
@@ -390,7 +393,7 @@ def test_eq_26_alone_says_nothing_of_the_free_space_before_an_obstacle() -> None
     assert alone == pytest.approx(0.0)
     summed = search(readings, start=occupied).run().evidence[2]
     assert summed == pytest.approx(5 * math.log(1 - PAPER.p_hit), abs=0.2)
-    q = marginals(np.array([alone, summed]), SearchParameters(alpha=1.0, uncertainty_prior=0.5))
+    q = marginals(np.array([alone, summed]), np.zeros(2), plain_search(alpha=1.0, uncertainty_prior=0.5))
     assert q[0] == pytest.approx(0.5)
     assert q[1] < 0.02
 
@@ -401,7 +404,7 @@ def test_eq_26_alone_says_nothing_of_the_free_space_before_an_obstacle() -> None
 def test_readings_without_echo_hold_the_free_space() -> None:
     # two ranges by chance in the open, where ten others heard nothing
     readings = along(0.55, 0.55, *[1.1] * 10)
-    parameters = replace(Parameters.from_flat({'resolution': 0.1, 'prior': 0.3}), model=PAPER)
+    parameters = replace(Parameters.from_flat({**PLAIN, 'resolution': 0.1, 'prior': 0.3}), model=PAPER)
     whole, echoes = (Mapper(parameters).run(part) for part in (readings, readings.select(readings.echo)))
     assert (whole.ml[-whole.grid.row, :11] == 0).all()
     assert echoes.ml[-echoes.grid.row, 5] == 1, 'a dot'

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import naive
-from conftest import random_readings
+from conftest import plain_model, plain_search, random_readings
 from forward_grid_mapper.core import search as search_module
 from forward_grid_mapper.core.errors import Cancelled
 from forward_grid_mapper.core.evidence import Evidence
@@ -20,12 +20,13 @@ from forward_grid_mapper.core.flips import flip, gain_of
 from forward_grid_mapper.core.forward_model import log_likelihood
 from forward_grid_mapper.core.grid import Grid
 from forward_grid_mapper.core.parameters import ModelParameters, SearchParameters
+from forward_grid_mapper.core.prior import Prior, local_prior, shapes
 from forward_grid_mapper.core.readings import Readings
 from forward_grid_mapper.core.search import FEW, LEAST, Progress, Search
 from forward_grid_mapper.core.uncertainty import marginals
 
 GRID = Grid(0.1, 0, 0, 12, 9)
-MODEL = ModelParameters(p_hit=0.6, p_rand=0.1, p_lost=0.1, sigma=0.06)
+MODEL = plain_model(p_hit=0.6, p_rand=0.1, p_lost=0.1, sigma=0.06)
 
 
 def make(
@@ -36,11 +37,14 @@ def make(
     start: np.ndarray | None = None,
     **search: object,
 ) -> Search:
-    evidence = Evidence(grid, model, stop=stop)
-    if start is not None:
-        evidence.state.maps.occupied[:] = start.ravel()
+    evidence = Evidence(grid, model, stop=stop, start=start)
     evidence.extend(readings)
-    return Search(evidence, SearchParameters(**search))
+    return Search(evidence, plain_search(**search))
+
+
+def independent(prior: float, grid: Grid = GRID) -> Prior:
+    """That of cells that know nothing of each other."""
+    return Prior(np.full(grid.size, math.log(prior / (1 - prior))), np.zeros(256))
 
 
 def objective(
@@ -54,14 +58,14 @@ def objective(
 @pytest.mark.parametrize('cell_distance', ['center', 'nearest'])
 def test_every_gain_is_the_difference_of_two_evaluations(p_hit: float, cell_distance: str) -> None:
     rng = np.random.default_rng(round(p_hit * 100))
-    model = ModelParameters(p_hit=p_hit, p_rand=0.02, p_lost=0.1, sigma=0.06, cell_distance=cell_distance)
+    model = plain_model(p_hit=p_hit, p_rand=0.02, p_lost=0.1, sigma=0.06, cell_distance=cell_distance)
     readings = random_readings(rng, GRID, 300)
     start = rng.random(GRID.size) < 0.15
     state = make(readings, model=model, start=start).evidence.state
     occupied = state.maps.occupied.reshape(GRID.shape)
     for c in rng.permutation(GRID.size)[:40]:
         before = log_likelihood(readings, GRID, occupied, model)
-        told = gain_of(state, 0.0, c)
+        told = gain_of(state, independent(0.5), c)
         flip(state, c)
         after = log_likelihood(readings, GRID, occupied, model)
         assert told == pytest.approx(after - before, abs=1e-4)
@@ -109,7 +113,7 @@ def test_the_objective_never_falls_and_ends_at_an_optimum(
     seen = maps.seen
     assert not result.occupied[seen == 0].any()
     for c in range(grid.size):
-        assert gain_of(search.evidence.state, math.log(prior / (1 - prior)), c) <= LEAST[0] + LEAST[1] * seen[c] or (
+        assert gain_of(search.evidence.state, independent(prior, grid), c) <= LEAST[0] + LEAST[1] * seen[c] or (
             seen[c] == 0
         )
     for c in rng.permutation(grid.size)[:150]:
@@ -142,9 +146,9 @@ def test_rounds_flip_many_cells_at_once_and_the_gain_told_is_theirs(seed: int) -
 def test_a_round_that_does_not_help_is_taken_back(monkeypatch: pytest.MonkeyPatch) -> None:
     # all cells that gain, neighbours or not, are far too many
     readings = random_readings(np.random.default_rng(0), AREA, 300)
-    search = make(readings, AREA, model=ModelParameters(p_hit=0.98, p_rand=0.001, p_lost=0.0, sigma=0.3))
+    search = make(readings, AREA, model=plain_model(p_hit=0.98, p_rand=0.001, p_lost=0.0, sigma=0.3))
     before = search.evidence.state.maps.evidence.copy()
-    monkeypatch.setattr(search_module, 'highest', lambda state, prior, cells, gains: np.ones(len(cells), bool))
+    monkeypatch.setattr(search_module, 'highest', lambda state, cells, gains, room: np.ones(len(cells), bool))
     assert not search._round(lambda progress: None)
     assert search.progress == Progress(0, 0, 0, 0.0)
     assert not search.evidence.state.maps.occupied.any()
@@ -200,7 +204,7 @@ def test_marginals_are_those_of_eq_43_by_brute_force() -> None:
     result = make(readings, grid).run()
     occupied = result.occupied.reshape(grid.shape)
     for alpha, prior in ((1.0, 0.5), (0.3, 0.2)):
-        q = marginals(result.evidence, SearchParameters(alpha=alpha, uncertainty_prior=prior))
+        q = marginals(result.evidence, result.neighbours, plain_search(alpha=alpha, uncertainty_prior=prior))
         for c in range(grid.size):
             likelihood = []
             for value in (0, 1):
@@ -212,7 +216,7 @@ def test_marginals_are_those_of_eq_43_by_brute_force() -> None:
 
 
 def test_alpha_zero_leaves_the_prior() -> None:
-    q = marginals(np.array([-50.0, 0.0, 1e9]), SearchParameters(alpha=0.0, uncertainty_prior=0.3))
+    q = marginals(np.array([-50.0, 0.0, 1e9]), np.zeros(3), plain_search(alpha=0.0, uncertainty_prior=0.3))
     assert q == pytest.approx(0.3)
 
 
@@ -222,7 +226,7 @@ def test_the_search_finds_the_best_map_of_all_mostly(record_property: object) ->
     reached, lost, cases = 0, [], 40
     for seed in range(cases):
         readings = random_readings(np.random.default_rng(seed), grid, 12)
-        best = max(objective(readings, m, MODEL, 0.3, grid) for m in maps)
+        best = (naive.log_likelihoods(readings, grid, maps, MODEL) + math.log(0.3 / 0.7) * maps.sum(axis=1)).max()
         found = objective(readings, make(readings, grid, prior=0.3).run().occupied, MODEL, 0.3, grid)
         assert found <= best + 1e-9
         reached += found > best - 1e-3
@@ -251,7 +255,7 @@ def test_many_readings_that_round_alike_do_not_make_the_search_go_round() -> Non
     )
     grid = Grid(0.1, 0, 0, 16, 1)
     for p_rand in np.linspace(0.02, 0.2, 19):
-        model = ModelParameters(p_hit=0.05, p_rand=float(p_rand), p_lost=0.0, sigma=0.05)
+        model = plain_model(p_hit=0.05, p_rand=float(p_rand), p_lost=0.0, sigma=0.05)
         assert make(readings, grid, model).run().converged
 
 
@@ -303,3 +307,122 @@ def test_max_sweeps_bounds_rounds_sweeps_and_shifts_together(most: int) -> None:
     result = make(readings, AREA, max_sweeps=most).run()
     assert result.progress.sweeps == most
     assert not result.converged
+
+
+# With the prior of shapes, driven cells and bridges
+
+SHAPED = SearchParameters(prior=0.4, driven_cost=3.0)
+ENDS = SearchParameters(prior=0.2, line_bonus=1.2, end_cost=2.5, isolated_cost=4.0, bridges=6)
+
+
+def shaped(readings: Readings, grid: Grid, parameters: SearchParameters, driven: np.ndarray) -> tuple[Search, Prior]:
+    evidence = Evidence(grid, MODEL)
+    evidence.extend(readings)
+    whole = Prior(local_prior(parameters, driven).ravel(), shapes(parameters))
+    return Search(evidence, parameters, driven.ravel()), whole
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.sampled_from([SHAPED, ENDS]), st.sampled_from([GRID, AREA]))
+def test_with_shapes_the_objective_of_either_stage_never_falls_and_ends_at_an_optimum(
+    seed: int, parameters: SearchParameters, grid: Grid
+) -> None:
+    rng = np.random.default_rng(seed)
+    readings = random_readings(rng, grid, int(rng.integers(1, 150)))
+    driven = rng.random(grid.shape) < 0.1
+    search, whole = shaped(readings, grid, parameters, driven)
+    plain = whole._replace(shape=np.zeros(256))
+    maps = search.evidence.state.maps
+    rounding = 3e-7 * len(readings)
+    stage = plain
+
+    def now(prior: Prior) -> float:
+        return log_likelihood(readings, grid, maps.occupied.reshape(grid.shape), MODEL) + naive.log_prior(
+            prior, maps.occupied, grid.shape
+        )
+
+    last, before = {id(p): now(p) for p in (plain, whole)}, Progress(0, 0, 0, 0.0)
+    stages = []
+
+    def watch(progress: Progress) -> None:
+        nonlocal stage, before, last
+        if search._prior.shape.any():
+            stage = whole
+        stages.append(stage is whole)
+        assert now(stage) >= last[id(stage)] - rounding
+        assert now(stage) - last[id(stage)] == pytest.approx(progress.gain - before.gain, abs=1e-4 + rounding)
+        last, before = {id(p): now(p) for p in (plain, whole)}, progress
+
+    result = search.run(watch)
+    assert result.converged
+    assert stages == sorted(stages), 'the plain one first'
+    assert result.log_prior == pytest.approx(naive.log_prior(whole, result.occupied, grid.shape), abs=1e-9)
+    end = now(whole)
+    state = search.evidence.state
+    for c in range(grid.size):
+        told = gain_of(state, whole, c)
+        assert not maps.seen[c] or told <= LEAST[0] + LEAST[1] * maps.seen[c]
+        sign = -1 if maps.occupied[c] else 1
+        odds = sign * naive.prior_gain(whole, maps.occupied, c, grid.shape) if maps.seen[c] else 0.0
+        assert result.neighbours[c] == pytest.approx(odds, abs=1e-9)
+    for c in rng.permutation(grid.size)[:60]:
+        maps.occupied[c] ^= 1
+        assert not maps.seen[c] or now(whole) <= end + 2e-4
+        maps.occupied[c] ^= 1
+
+
+@pytest.mark.parametrize('seed', range(6))
+def test_with_shapes_no_shift_gains_at_the_end(seed: int) -> None:
+    readings = random_readings(np.random.default_rng(seed), GRID, 100)
+    search, whole = shaped(readings, GRID, ENDS, np.zeros(GRID.shape, bool))
+    result = search.run()
+
+    def height(occupied: np.ndarray) -> float:
+        cells = occupied.reshape(GRID.shape)
+        return log_likelihood(readings, GRID, cells, MODEL) + naive.log_prior(whole, cells, GRID.shape)
+
+    end = height(result.occupied)
+    for c in np.flatnonzero(result.occupied).tolist():
+        for o in naive.neighbours_of(c, GRID.shape).values():
+            if not result.occupied[o]:
+                moved = result.occupied.copy()
+                moved[[c, o]] ^= 1
+                assert height(moved) <= end + 4e-4
+
+
+def test_cells_driven_over_stay_free() -> None:
+    readings = random_readings(np.random.default_rng(3), AREA, 400, z_max=2.0)
+    free = np.zeros(AREA.shape, bool)
+    before = shaped(readings, AREA, SHAPED, free)[0].run().occupied
+    driven = before.reshape(AREA.shape) == 1
+    search, _ = shaped(readings, AREA, dataclasses.replace(SHAPED, driven_cost=1000.0), driven)
+    after = search.run().occupied
+    assert before.any()
+    assert not (after[driven.ravel()]).any()
+
+
+def test_a_search_changes_nothing_outside_of_its_window() -> None:
+    readings = random_readings(np.random.default_rng(5), AREA, 400, z_max=2.0)
+    evidence = Evidence(AREA, MODEL)
+    evidence.extend(readings)
+    window = (5, 20, 8, 30)
+    result = Search(evidence, SHAPED, window=window).run()
+    occupied = result.occupied.reshape(AREA.shape)
+    inside = np.zeros(AREA.shape, bool)
+    inside[5:20, 8:30] = True
+    assert occupied[inside].any()
+    # shifts and bridges may end a cell or a few beyond it
+    assert not occupied[naive.box_sum(inside.astype(int)) == 0].any()
+
+
+@pytest.mark.parametrize('weight', [0.0, 0.6])
+def test_uncertainty_mixes_evidence_neighbours_and_prior(weight: float) -> None:
+    rng = np.random.default_rng(0)
+    evidence, neighbours = rng.normal(0, 5, (4, 5)), rng.normal(0, 2, (4, 5))
+    parameters = SearchParameters(alpha=0.7, neighbour_weight=weight, uncertainty_prior=0.3)
+    told = marginals(evidence, neighbours, parameters)
+    assert told.shape == (4, 5)
+    odds = np.exp(evidence) ** 0.7 * np.exp(neighbours) ** weight * 0.3 / 0.7
+    assert told == pytest.approx(odds / (1 + odds), abs=1e-6)
+    far = marginals(np.array([-1e9, 1e9]), np.zeros(2), parameters)
+    assert far.tolist() == [pytest.approx(0.0), 1.0]

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from conftest import random_readings
+from conftest import PLAIN_MODEL, PLAIN_SEARCH, random_readings
 from forward_grid_mapper.core import threads
 from forward_grid_mapper.core.evidence import Evidence
 from forward_grid_mapper.core.grid import Grid
@@ -62,31 +62,35 @@ def test_there_is_a_core() -> None:
     assert threads.cores() >= 1
 
 
-def search(workers: int, memory: float, cell_distance: str, seed: int) -> tuple[SearchResult, Evidence]:
+def search(workers: int, memory: float, cell_distance: str, seed: int, plain: bool) -> tuple[SearchResult, Evidence]:
     readings = random_readings(np.random.default_rng(seed), AREA, 600, z_max=3.0)
     readings.half_angle[:] *= 0.3
-    model = ModelParameters(p_hit=0.7, p_rand=0.1, sigma=0.06, cell_distance=cell_distance)
+    surfaces = PLAIN_MODEL if plain else {}
+    model = ModelParameters(p_hit=0.7, p_rand=0.1, sigma=0.06, cell_distance=cell_distance, **surfaces)
     evidence = Evidence(AREA, model, memory=memory, threads=workers)
     evidence.extend(readings)
-    return Search(evidence, SearchParameters()).run(), evidence
+    assert evidence.state.facing.known.any() != plain
+    return Search(evidence, SearchParameters(**(PLAIN_SEARCH if plain else {}))).run(), evidence
 
 
 @pytest.mark.parametrize('cell_distance', ['center', 'nearest'])
-@pytest.mark.parametrize('seed', range(2))
+@pytest.mark.parametrize(('seed', 'plain'), [(0, True), (1, False)], ids=['plain', 'whole'])
 def test_neither_threads_nor_memory_change_a_bit_of_the_search(
-    monkeypatch: pytest.MonkeyPatch, cell_distance: str, seed: int
+    monkeypatch: pytest.MonkeyPatch, cell_distance: str, seed: int, plain: bool
 ) -> None:
-    plain, evidence = search(1, np.inf, cell_distance, seed)
-    assert plain.progress.shifts > 0
-    assert plain.progress.flips > 50
+    first, evidence = search(1, np.inf, cell_distance, seed, plain)
+    assert first.progress.shifts > 0
+    assert first.progress.flips > 50
     monkeypatch.setattr(threads, 'LEAST_PART', 50)
     half = evidence.state.pairs.cell.nbytes / 2
     for workers, memory in ((3, np.inf), (1, half), (1, 0.0), (3, half), (3, 0.0)):
-        other, less = search(workers, memory, cell_distance, seed)
+        other, less = search(workers, memory, cell_distance, seed, plain)
         assert (less.unstored > 0) == (memory < np.inf)
-        assert np.array_equal(other.occupied, plain.occupied)
-        assert np.array_equal(other.evidence, plain.evidence)
-        assert other.progress == plain.progress
+        assert np.array_equal(other.occupied, first.occupied)
+        assert np.array_equal(other.evidence, first.evidence)
+        assert np.array_equal(other.neighbours, first.neighbours)
+        assert other.log_prior == first.log_prior
+        assert other.progress == first.progress
         assert less.log_likelihood == evidence.log_likelihood
 
 

@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 
 import naive
-from conftest import random_readings
+from conftest import plain_model, random_readings
 from forward_grid_mapper.core.evidence import Evidence
 from forward_grid_mapper.core.grid import Grid
-from forward_grid_mapper.core.parameters import ModelParameters
-from forward_grid_mapper.core.tiles import CHUNK, SHIFT, enter, more_chunks, moved, no_tiles
+from forward_grid_mapper.core.tiles import CHUNK, SHIFT, enter, more_chunks, no_tiles
 
 
 @pytest.mark.parametrize('some', [naive.awkward_readings, random_readings])
@@ -18,7 +17,7 @@ from forward_grid_mapper.core.tiles import CHUNK, SHIFT, enter, more_chunks, mov
 @pytest.mark.parametrize('batches', [1, 7])
 def test_a_tile_lists_every_reading_that_sees_one_of_its_cells_once(some: object, grid: Grid, batches: int) -> None:
     readings = some(np.random.default_rng(1), grid, 300)
-    evidence = Evidence(grid, ModelParameters(sigma=0.03))
+    evidence = Evidence(grid, plain_model(sigma=0.03))
     for part in np.array_split(np.arange(len(readings)), batches):
         evidence.extend(readings.select(part))
     tiles = evidence.state.tiles
@@ -63,20 +62,3 @@ def test_lists_keep_what_they_have_as_they_grow() -> None:
             kept[(row >> SHIFT) * tiles.across + column].append(t)
     assert [naive.readings_of_tile(tiles, k) for k in range(len(tiles.head))] == kept
     assert tiles.used[0] == sum(-(-len(list_) // CHUNK) for list_ in kept)
-
-
-def test_lists_move_with_their_cells() -> None:
-    rng = np.random.default_rng(3)
-    tiles = more_chunks(no_tiles(20, 30))
-    for t in range(300):
-        enter(tiles, int(rng.integers(20)), *sorted(rng.integers(0, 30, 2).tolist()), t)
-    larger = moved(tiles, (50, 70), (16, 8))
-    for row in range(0, 50, 8):
-        for column in range(0, 70, 8):
-            told = naive.readings_of_tile(larger, (row >> SHIFT) * larger.across + (column >> SHIFT))
-            inside = 16 <= row < 36 and 8 <= column < 38
-            old = ((row - 16) >> SHIFT) * tiles.across + ((column - 8) >> SHIFT)
-            assert told == (naive.readings_of_tile(tiles, old) if inside else [])
-    assert (larger.latest.max(), larger.used[0]) == (299, tiles.used[0])
-    with pytest.raises(ValueError, match='whole tiles'):
-        moved(tiles, (50, 70), (4, 8))

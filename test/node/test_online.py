@@ -24,7 +24,8 @@ from forward_grid_mapper.simulation.sonar import NOISY
 
 def test_maps_follow_the_readings_and_em_polishes_them(start: Any, robot: Robot, tmp_path: Path) -> None:
     door = door_drive(16, NOISY, seed=3)
-    start(*RELIABLE, *mounts(door), '-p', 'online:=true', '-p', 'publish_rate:=10.0', '-p', f'save_directory:={tmp_path}')
+    options = ('-p', 'online:=true', '-p', 'publish_rate:=10.0', '-p', f'save_directory:={tmp_path}')
+    start(*RELIABLE, *mounts(door), *options)
     robot.meet()
     robot.listen()
     messages = merged(door)
@@ -43,10 +44,9 @@ def test_maps_follow_the_readings_and_em_polishes_them(start: Any, robot: Robot,
     visible = visible_surface(door.world, door.readings, 0.2)
 
     def f1(message: Any) -> float:
-        origin, resolution = message.info.origin.position, message.info.resolution
-        grid = Grid(
-            resolution, round(origin.x / resolution), round(origin.y / resolution), message.info.width, message.info.height
-        )
+        info = message.info
+        column, row = (round(at / info.resolution) for at in (info.origin.position.x, info.origin.position.y))
+        grid = Grid(info.resolution, column, row, info.width, info.height)
         ml = np.where(values(message) == 100, 1, values(message)).astype(np.int8)
         return score_map(ml, grid, door.world, visible).f1
 

@@ -1,0 +1,81 @@
+"""Cells that the robot drove over: points, and what lies between those that belong together."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from forward_grid_mapper.core.driven import LONGEST_PAUSE, LONGEST_STEP, driven_cells, mark_driven
+from forward_grid_mapper.core.grid import Grid
+from forward_grid_mapper.core.readings import Readings
+
+GRID = Grid(0.1, -10, 5, 40, 30)
+MS = 1_000_000
+
+
+def readings_at(x: list[float], y: list[float], stamp: list[int]) -> Readings:
+    return Readings.from_columns(x=x, y=y, yaw=0.0, z=np.ones(len(x)), z_max=2.0, half_angle=0.1, stamp=stamp)
+
+
+def cells(*places: tuple[float, float]) -> set[tuple[int, int]]:
+    out = {(math.floor(y / 0.1) - GRID.row, math.floor(x / 0.1) - GRID.column) for x, y in places}
+    return {(r, c) for r, c in out if 0 <= r < GRID.height and 0 <= c < GRID.width}
+
+
+def told(*arguments: list[float]) -> set[tuple[int, int]]:
+    return {(int(r), int(c)) for r, c in np.argwhere(driven_cells(readings_at(*arguments), GRID))}
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.integers(1, 12))
+def test_the_cells_are_those_of_the_points_and_of_the_way_between(seed: int, count: int) -> None:
+    rng = np.random.default_rng(seed)
+    x, y = np.cumsum(rng.uniform(-0.5, 0.5, (2, count)), axis=1) + np.array([[0.5], [2.0]])
+    stamp = np.cumsum(rng.choice([0, 100, 400, 600], count)) * MS
+    shuffle = rng.permutation(count) if len(set(stamp)) == count else np.arange(count)
+    found = told(x[shuffle], y[shuffle], stamp[shuffle])
+    expected = cells(*zip(x, y, strict=True))
+    assert expected <= found
+    near = set(expected)
+    for i in range(count - 1):
+        step = math.hypot(x[i + 1] - x[i], y[i + 1] - y[i])
+        if stamp[i + 1] - stamp[i] <= LONGEST_PAUSE and step <= LONGEST_STEP:
+            way = [(x[i] + f * (x[i + 1] - x[i]), y[i] + f * (y[i + 1] - y[i])) for f in np.linspace(0, 1, 400)]
+            near |= cells(*way)
+            # no more than a quarter of a cell lies between the points that are set
+            coarse = int(step / 0.1 * 4.0) + 2
+            expected |= cells(
+                *(
+                    (x[i] + f * (x[i + 1] - x[i]), y[i] + f * (y[i + 1] - y[i]))
+                    for f in np.arange(coarse) / (coarse - 1)
+                )
+            )
+    assert found <= near | expected
+    assert len(found ^ expected) <= 2, 'but for rounding'
+
+
+@pytest.mark.parametrize(
+    ('pause', 'step', 'joined'), [(400, 0.7, True), (500, 0.7, True), (501, 0.7, False), (400, 0.81, False)]
+)
+def test_gaps_and_jumps_are_not_joined(pause: int, step: float, joined: bool) -> None:
+    found = told([0.05, 0.05 + step], [1.05, 1.05], [0, pause * MS])
+    assert len(found) == (round(step / 0.1) + 1 if joined else 2)
+
+
+def test_readings_are_taken_in_the_order_of_their_stamps() -> None:
+    # there and back again: out of order the ends would be joined
+    x, y, stamp = [0.05, 1.65, 0.85], [1.05, 1.05, 1.05], [0, 600 * MS, 300 * MS]
+    assert told(x, y, stamp) == cells(*((0.05 + 0.1 * k, 1.05) for k in range(17)))
+
+
+def test_what_is_off_the_grid_is_left_out_and_what_was_set_stays() -> None:
+    assert told([-1e6, 1e6, 0.05], [0.0, 0.0, 1.05], [0, 1, 2]) == cells((0.05, 1.05))
+    driven = np.zeros(GRID.shape, bool)
+    driven[3, 4] = True
+    mark_driven(np.zeros(0), np.zeros(0), np.zeros(0, np.int64), GRID, driven)
+    mark_driven(np.array([0.05]), np.array([1.05]), np.array([7]), GRID, driven)
+    assert {(int(r), int(c)) for r, c in np.argwhere(driven)} == {(3, 4)} | cells((0.05, 1.05))

@@ -1,0 +1,261 @@
+"""The map that follows the readings: nearly that of a batch, and no larger for readings that say the same."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+
+from conftest import PLAIN, random_readings
+from forward_grid_mapper.core import online_map
+from forward_grid_mapper.core.errors import InputError
+from forward_grid_mapper.core.evidence import Evidence
+from forward_grid_mapper.core.grid import Grid
+from forward_grid_mapper.core.mapping import Mapper
+from forward_grid_mapper.core.maps import part_of
+from forward_grid_mapper.core.online_map import MARGIN, OnlineMap
+from forward_grid_mapper.core.parameters import Parameters
+from forward_grid_mapper.core.prior import patterns
+from forward_grid_mapper.core.readings import Readings
+from forward_grid_mapper.simulation.drive import NOISY, Recording, corridor_drive, door_drive
+from forward_grid_mapper.simulation.score import score_map, visible_surface
+
+AREA = Grid(0.1, -5, 3, 40, 30)
+
+
+def in_sweeps(readings: Readings, parameters: Parameters, size: int = 24) -> OnlineMap:
+    online = OnlineMap(parameters)
+    for begin in range(0, len(readings), size):
+        online.add(readings.select(slice(begin, begin + size)))
+    return online
+
+
+def f1(recording: Recording, readings: Readings, grid: Grid, ml: np.ndarray) -> float:
+    return score_map(ml, grid, recording.world, visible_surface(recording.world, readings)).f1
+
+
+def some(seed: int = 0, count: int = 150) -> Readings:
+    readings = random_readings(np.random.default_rng(seed), AREA, count, z_max=2.0)
+    readings.half_angle[:] = 0.2
+    return readings
+
+
+def consistent(online: OnlineMap) -> bool:
+    """Whether all that is kept is as if built from the map at hand."""
+    evidence = online._evidence
+    maps = evidence.state.maps
+    told = [maps.evidence.copy(), maps.pattern.copy()]
+    likelihood = evidence.log_likelihood
+    evidence.rebuild()
+    return (
+        np.array_equal(told[0], maps.evidence)
+        and np.array_equal(told[1], patterns(maps.occupied, evidence.grid.shape))
+        and likelihood == evidence.log_likelihood
+    )
+
+
+@pytest.mark.parametrize('drive', ['door', 'corridor'])
+def test_readings_in_sweeps_give_nearly_the_map_of_a_batch(drive: str) -> None:
+    recording = door_drive(3, NOISY) if drive == 'door' else corridor_drive()
+    readings = recording.readings.select(slice(0, 2400))
+    parameters = Parameters()
+    maps = Mapper(parameters).run(readings)
+    online = in_sweeps(readings, parameters)
+    grid, ml, uncertainty = online.maps()
+    assert ml.shape == uncertainty.shape == grid.shape
+    assert (ml[np.isnan(uncertainty)] == -1).all()
+    whole, found = f1(recording, readings, maps.grid, maps.ml), f1(recording, readings, grid, ml)
+    assert found > whole - 0.03
+    assert consistent(online)
+
+
+def test_the_grid_is_that_of_a_batch() -> None:
+    maps = Mapper(Parameters()).run(some())
+    assert in_sweeps(some(), Parameters()).grid == maps.grid
+
+
+def test_a_grid_that_grows_in_the_middle_loses_nothing() -> None:
+    near = some()
+    away = dataclasses.replace(near, x=near.x + 25.0, y=near.y - 18.0, stamp=near.stamp + 10**12)
+    online = in_sweeps(near, Parameters())
+    grid, before = online.maps()[:2]
+    room = online._evidence.grid
+    driven = online._driven.copy()
+    online.add(away)
+    larger, ml = online.maps()[:2]
+    assert online._evidence.grid.size > room.size
+    assert larger.union(grid) == larger
+    assert np.array_equal(part_of(larger, ml, grid), before)
+    assert (ml == 1).sum() > (before == 1).sum()
+    assert len(online) == len(near) + len(away)
+    assert online._driven[online._evidence.grid.window(room)][driven].all()
+    assert consistent(online)
+    again = in_sweeps(near, Parameters())
+    assert again._evidence.grid == room
+    assert room.width >= grid.width + 2 * MARGIN
+
+
+@pytest.mark.parametrize('values', [PLAIN, {}], ids=['plain', 'whole'])
+def test_readings_that_say_the_same_add_weight_and_nothing_else(values: dict[str, float]) -> None:
+    readings = some()
+    online = in_sweeps(readings, Parameters.from_flat(values), 150)
+    count, taken = len(online), online._evidence.nbytes
+    for _ in range(3):
+        online.add(readings)
+    assert len(online) == count
+    assert online._evidence.nbytes == taken
+    evidence = online._evidence
+    weight = evidence.state.shares['weight'][:count]
+    assert weight.sum() == 4 * len(readings)
+    # as if each kept reading had come so many times
+    often = Evidence(evidence.grid, evidence._model, start=evidence.state.maps.occupied.reshape(evidence.grid.shape))
+    kept = np.array(sorted(set(online._kept.values())))
+    assert kept.tolist() == list(range(count))
+    first: dict[int, int] = {}
+    for i, key in enumerate(keys_of(online, readings)):
+        first.setdefault(online._kept[key], i)
+    often.extend(readings.select(np.repeat([first[k] for k in range(count)], weight)))
+    for name in ('evidence', 'seen', 'pattern'):
+        assert np.array_equal(getattr(often.state.maps, name), getattr(evidence.state.maps, name))
+    assert often.log_likelihood == evidence.log_likelihood
+    assert consistent(online)
+
+
+def keys_of(online: OnlineMap, readings: Readings) -> list[tuple[float, ...]]:
+    """The keys under which the readings are counted, one by one."""
+    out = []
+    for i in range(len(readings)):
+        fresh = OnlineMap(online._parameters)
+        fresh._sort_out(readings.select(slice(i, i + 1)))
+        out += fresh._kept
+    return out
+
+
+@pytest.mark.parametrize(
+    ('change', 'same'),
+    [
+        ({'x': 0.004}, True),
+        ({'x': 0.06}, False),
+        ({'yaw': 0.01}, True),
+        ({'yaw': 0.12}, False),
+        ({'z': 0.01}, True),
+        ({'z': 0.06}, False),
+        ({'z_max': 0.5}, False),
+        ({'half_angle': 0.01}, False),
+        ({'stamp': 10**12}, True),
+    ],
+    ids=str,
+)
+def test_what_says_the_same_is_near_in_every_way(change: dict[str, float], same: bool) -> None:
+    # in the middle of the steps that are taken for the same
+    at: dict[str, object] = {'x': 1.02, 'y': 1.02, 'yaw': 0.02, 'z': 1.02, 'z_max': 3.0, 'half_angle': 0.2, 'stamp': 0}
+    online = OnlineMap(Parameters())
+    for values in (at, at | {name: at[name] + step for name, step in change.items()}):
+        online.add(Readings.from_columns(**{k: [v] if k == 'z' else v for k, v in values.items()}))
+    assert len(online) == (1 if same else 2)
+
+
+def test_another_sensor_says_something_else() -> None:
+    reading = some(count=1)
+    online = OnlineMap(Parameters())
+    online.add(reading)
+    online.add(dataclasses.replace(reading, sensor=reading.sensor + 1, sensor_names=('left', 'right')))
+    assert len(online) == 2
+
+
+def test_a_map_can_be_adopted() -> None:
+    readings, parameters = some(), Parameters()
+    maps = Mapper(parameters).run(readings)
+    online = in_sweeps(readings, parameters)
+    online.adopt(maps.grid, maps.ml)
+    grid, ml, _ = online.maps()
+    occupied = online._evidence.state.maps.occupied.reshape(online._evidence.grid.shape)
+    window = online._evidence.grid.window(maps.grid)
+    assert np.array_equal(occupied[window] == 1, maps.ml == 1)
+    assert occupied.sum() == (maps.ml == 1).sum()
+    assert grid == maps.grid
+    assert (ml[maps.ml == 1] == 1).all()
+    assert consistent(online)
+    # only a part: the rest is free
+    corner = Grid(grid.resolution, grid.column, grid.row, 5, 4)
+    online.adopt(corner, np.ones(corner.shape, np.int8))
+    assert online._evidence.state.maps.occupied.sum() == 20
+    assert consistent(online)
+
+
+def test_before_the_first_reading_there_is_nothing() -> None:
+    online = OnlineMap(Parameters())
+    online.adopt(AREA, np.ones(AREA.shape, np.int8))
+    online.add(some(count=0))
+    grid, ml, uncertainty = online.maps()
+    assert (grid.size, ml.size, uncertainty.size, len(online)) == (0, 0, 0, 0)
+
+
+def same(a: OnlineMap, b: OnlineMap) -> bool:
+    return a.grid == b.grid and all(
+        np.array_equal(x, y, equal_nan=True) for x, y in zip(a.maps()[1:], b.maps()[1:], strict=True)
+    )
+
+
+def test_cleared_it_is_as_new_and_empty_adds_change_nothing() -> None:
+    online, fresh = in_sweeps(some(1), Parameters()), in_sweeps(some(2), Parameters())
+    online.clear()
+    assert (len(online), online.grid.size) == (0, 0)
+    for begin in range(0, 150, 24):
+        online.add(some(count=0))
+        online.add(some(2).select(slice(begin, begin + 24)))
+    assert same(online, fresh)
+
+
+def test_a_jump_is_not_driven_over() -> None:
+    readings = some(count=2)
+    readings.x[:], readings.y[:], readings.stamp[:] = [0.0, 12.0], [1.0, 1.0], [0, 10**8]
+    online = OnlineMap(Parameters())
+    for k in range(2):
+        online.add(readings.select(slice(k, k + 1)))
+    assert online._driven.sum() == 2
+    # the second drives on
+    near = dataclasses.replace(readings.select(slice(1, 2)), x=np.array([12.5]), stamp=np.array([2 * 10**8]))
+    online.add(near)
+    assert online._driven.sum() == 7
+    local = online._prior.local.reshape(online._evidence.grid.shape)
+    assert np.array_equal(local < local.max(), online._driven)
+
+
+def test_a_reading_too_far_away_is_refused_and_changes_nothing() -> None:
+    online = in_sweeps(some(), Parameters.from_flat({'max_cells': 100_000}))
+    count, before = len(online), [array.copy() for array in online.maps()[1:]]
+    far = dataclasses.replace(some(count=1), x=np.array([1e5]))
+    with pytest.raises(InputError, match='max_cells'):
+        online.add(far)
+    assert len(online) == count
+    for old, new in zip(before, online.maps()[1:], strict=True):
+        assert np.array_equal(old, new, equal_nan=True)
+
+
+def test_many_readings_at_once_are_searched_like_a_batch(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(online_map, 'MANY', 100)
+    values = {**PLAIN, 'resolution': 0.1}
+    readings = some(count=140)
+    online = OnlineMap(Parameters.from_flat(values))
+    online.add(readings)
+    assert len(online) == len(readings)
+    maps = Mapper(Parameters.from_flat(values)).run(readings)
+    grid, ml, uncertainty = online.maps()
+    assert grid == maps.grid
+    assert np.array_equal(ml, maps.ml)
+    np.testing.assert_allclose(uncertainty, maps.uncertainty, atol=1e-5)
+
+
+def test_it_is_searched_anew_from_time_to_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(online_map, 'REFINE_EVERY', 50)
+    often = in_sweeps(some(), Parameters())
+    assert often._count == 150 - 2 * 72
+    assert consistent(often)
+    monkeypatch.setattr(online_map, 'REFINE_EVERY', math.inf)
+    never = in_sweeps(some(), Parameters())
+    assert never._count == 150
+    heights = [online._evidence.log_likelihood for online in (often, never)]
+    assert heights[0] != heights[1]
