@@ -108,6 +108,21 @@ def flip_in_order(s: State, prior: Prior, least: Least, cells: NDArray[np.int64]
 
 
 @kernel
+def free_needless(s: State, prior: Prior, least: Least, cells: NDArray[np.int64]) -> tuple[int, float]:
+    """Free those of `cells`, occupied ones, that cost nothing to free but for rounding; return their number and gain."""
+    flips, total = 0, 0.0
+    for c in cells:
+        if s.stop[0]:
+            break
+        gain = gain_of(s, prior, c)
+        if s.maps.seen[c] and gain >= -least[1] * s.maps.seen[c]:
+            flip(s, c)
+            flips += 1
+            total += gain
+    return flips, total
+
+
+@kernel
 def unsettle(s: State, since: int, settled: Any) -> None:
     """Mark the cells of all readings that changed after the clock was `since` as not settled."""
     bench = s.bench

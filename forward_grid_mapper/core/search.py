@@ -4,7 +4,7 @@ First come rounds in which all cells flip at once that gain, and gain more than 
 too many occupied cells and thin them out, which leads to better maps than to add one cell at a time, and takes a few
 passes over the readings. When rounds no longer help, sweeps go over the cells that gain, most promising first, until
 no single flip gains anything; then occupied cells are moved to neighbours, and so on until neither gains. Ties keep
-the state.
+the state, but for occupied cells at the end that nothing needs: those are freed.
 
 All this happens twice: at first as if the cells of a map were independent, then, from the map found so, with what the
 prior says of walls (`prior`), and with bridges (`bridges`) when nothing else gains. In either part the objective
@@ -27,7 +27,17 @@ from .cones import Floats, check
 from .evidence import Evidence
 from .flips import State
 from .logs import QUANTUM
-from .moves import best_shifts, flip_in_order, highest, promising, see_any, shift_in_order, try_shifts, unsettle
+from .moves import (
+    best_shifts,
+    flip_in_order,
+    free_needless,
+    highest,
+    promising,
+    see_any,
+    shift_in_order,
+    try_shifts,
+    unsettle,
+)
 from .parameters import SearchParameters
 from .prior import Prior, local_prior, log_prior, prior_gains, shapes
 
@@ -171,7 +181,8 @@ class Search:
         while self._more():
             if self._sweep(watch) or (p.shift_moves and self._shift(watch)) or (p.bridges > 1 and self._bridge(watch)):
                 continue
-            return True
+            if not self._free(watch):
+                return True
         return False
 
     def _occupied(self) -> NDArray[np.int64]:
@@ -244,6 +255,14 @@ class Search:
         shifts, gain = shift_in_order(s, self._prior, LEAST, cells[order], targets[order])
         self._advance(0, shifts, gain, watch)
         return shifts
+
+    def _free(self, watch: Watch) -> int:
+        """Free cells that nothing needs, as rounds leave them where the prior does not speak against them."""
+        cells = self._occupied()
+        flips, gain = free_needless(self.evidence.state, self._prior, LEAST, cells)
+        if flips:
+            self._advance(flips, 0, max(gain, 0.0), watch)
+        return flips
 
     def _bridge(self, watch: Watch) -> int:
         s = self.evidence.state

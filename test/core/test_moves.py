@@ -20,6 +20,7 @@ from forward_grid_mapper.core.moves import (
     WORTH_WAITING,
     best_shifts,
     flip_in_order,
+    free_needless,
     highest,
     promising,
     see_any,
@@ -163,6 +164,22 @@ def test_flips_in_order_are_made_while_they_gain_and_what_they_gain_is_told(
             flip(twin.state, c)
             made, expected = made + 1, expected + now
     assert (flips, total) == (made, expected)
+    assert np.array_equal(evidence.state.maps.occupied, twin.state.maps.occupied)
+
+
+@settings(deadline=None)
+@given(seeds, st.sampled_from([0.0, 0.001, 0.1]))
+def test_occupied_cells_that_cost_nothing_to_free_are_freed_one_after_the_other(seed: int, tolerance: float) -> None:
+    evidence, _ = random_case(seed, filled=0.4)
+    twin, _ = random_case(seed, filled=0.4)
+    prior, occupied = prior_of('none'), np.flatnonzero(evidence.state.maps.occupied)
+    made, expected = 0, 0.0
+    for c in occupied.tolist():
+        now = gain(twin, prior, c)
+        if twin.state.maps.seen[c] and now >= -tolerance * twin.state.maps.seen[c]:
+            flip(twin.state, c)
+            made, expected = made + 1, expected + now
+    assert free_needless(evidence.state, prior, (1.0, tolerance), occupied) == (made, expected)
     assert np.array_equal(evidence.state.maps.occupied, twin.state.maps.occupied)
 
 

@@ -331,13 +331,14 @@ def test_a_move_leaves_a_place_that_no_single_flip_can() -> None:
     assert found(readings, model=model, start=start, prior=0.2, shift_moves=True) == [5]
 
 
-def test_the_search_starts_from_the_empty_map_since_a_full_one_ends_lower() -> None:
+def test_the_search_starts_from_the_empty_map_since_what_nobody_saw_stays_full() -> None:
     recording = door_drive(1, NOISY, seed=0)
     readings, grid = recording.readings, recording.world.grid
     assert not search(readings, grid).evidence.state.maps.occupied.any()
     empty, full = (search(readings, grid, start=start).run() for start in (None, np.ones(grid.shape, np.uint8)))
     heights = [log_likelihood(readings, grid, end.occupied.reshape(grid.shape), PAPER) for end in (empty, full)]
-    assert heights[0] > heights[1] + 10
+    assert heights[0] == pytest.approx(heights[1], abs=0.01 * abs(heights[0])), 'it finds its way from either'
+    assert full.progress.flips > 3 * empty.progress.flips
     unseen = prepare(readings, grid, PAPER).state.maps.seen == 0
     assert (empty.evidence[unseen] == 0).all()
     assert full.occupied[unseen].all(), 'nothing ever frees them'
