@@ -1,47 +1,229 @@
 #!/usr/bin/env python3
-"""Time and memory from placed readings to all three maps, warm, and ratios measured in the same run.
+"""Time and memory from placed readings to ML map and uncertainty map, warm, with ratios measured in the same run.
 
-usage: speed.py [--runs 5] [--large]
+usage: speed.py [--runs 5] [--patience 0] [--only jobs threads memory live table2]
 
-Worlds: one pass of the simulated corridor (12 000 readings at 10 cm); with --large also 17 passes (204 000). For each:
-medians over the runs of every stage, EM against building the standard map of the same readings, bytes a pair.
+jobs     four drives: medians of every stage against the time they should take; bytes a pair, stored and at the peak of
+         the process; EM against building the standard map; time per pair against reading the same bytes in one stream
+threads  one thread against two, whose maps must be equal
+memory   a bound on memory that the pairs do not fit, with which the maps must be equal
+live     readings a second that the standard map takes on one core
+table2   EM against the loops of the paper's Table 2, which cast every reading anew at each flip that they consider
 """
 
 from __future__ import annotations
 
 import argparse
+import dataclasses
+import math
 import os
-import platform
 import statistics
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
-import numba
 import numpy as np
+import table2
+from measuring import PATIENCE, PLAIN, PeakMemory, Timing, in_own_process, machine, stream_seconds, timed
 
+from forward_grid_mapper.core.evidence import Evidence
+from forward_grid_mapper.core.forward_model import log_likelihood
+from forward_grid_mapper.core.live_map import LiveMap
 from forward_grid_mapper.core.mapping import Mapper
+from forward_grid_mapper.core.maps import MapSet
 from forward_grid_mapper.core.parameters import Parameters
+from forward_grid_mapper.core.readings import Readings
+from forward_grid_mapper.core.threads import cores
 from forward_grid_mapper.core.warm_up import warm_up
-from forward_grid_mapper.simulation.drive import corridor_drive
+from forward_grid_mapper.simulation.drive import building_drive, corridor_drive
+from forward_grid_mapper.simulation.sonar import sonar_ring
+
+
+class Job(NamedTuple):
+    """A drive to map, and the seconds that it should take at most."""
+
+    name: str
+    drive: Callable[[], Readings]
+    resolution: float
+    target: float
+
+
+JOBS = (
+    Job('corridor', lambda: corridor_drive(0).readings, 0.1, 0.15),
+    Job('corridor, 2.5 cm', lambda: corridor_drive(0).readings, 0.025, 3.0),
+    Job('corridor, 17 passes', lambda: corridor_drive(0, passes=17).readings, 0.1, 3.0),
+    Job('building, 16 x 30 deg', lambda: building_drive(0).readings, 0.1, 4.0),
+)
+
+
+def measure_job(readings: Readings, resolution: float, runs: int) -> dict[str, float]:
+    """Return the figures of one job."""
+    warm_up()
+    parameters = Parameters.from_flat({'resolution': resolution})
+    peak = PeakMemory()
+    Mapper(parameters).run(readings)
+    growth = peak.growth
+    timing = Timing(parameters, readings, runs)
+    maps, pairs = timing.maps, timing.maps.statistics['pairs']
+    evidence = Evidence(maps.grid, parameters.model, threads=cores(), start=(maps.ml == 1).astype(np.uint8))
+    evidence.extend(readings)
+    stored = maps.statistics['bytes_per_pair'] * pairs
+    return {
+        **timing,
+        'others': timing.others,
+        'pairs': pairs,
+        'cells': maps.grid.size,
+        'stored': stored,
+        'own': evidence.state.pairs.cell.nbytes + evidence.state.tiles.chunks.nbytes,
+        'peak': growth,
+        'pass': timed(evidence.rebuild, runs),
+        'stream': stream_seconds(stored, runs),
+    }
+
+
+def jobs(runs: int) -> None:
+    """Print the table of jobs."""
+    print('\nFrom placed readings to ML map and uncertainty map; seconds')
+    print(
+        f'{"":22s}{"readings":>9s}{"cells":>9s}{"pairs":>12s}{"index":>8s}{"search":>8s}{"uncert.":>8s}'
+        f'{"total":>8s}{"target":>8s}{"live map":>10s}{"EM / live":>11s}{"others":>8s}'
+    )
+    found = []
+    for job in JOBS:
+        readings = job.drive()
+        f = in_own_process(measure_job, readings, job.resolution, runs)
+        found.append((job, len(readings), f))
+        print(
+            f'{job.name:22s}{len(readings):9d}{f["cells"]:9.0f}{f["pairs"]:12.0f}{f["index"]:8.3f}{f["search"]:8.3f}'
+            f'{f["uncertainty"]:8.3f}{f["total"]:8.3f}{job.target:8.2f}{f["live map"]:10.4f}'
+            f'{(f["index"] + f["search"]) / f["live map"]:9.1f} x{f["others"]:8.0%}',
+            flush=True,
+        )
+    print(
+        '\nMemory in bytes a pair: pairs alone, with what is kept for readings and cells, and growth of the process.\n'
+        'Time in ns a pair: one stream through the same bytes on one core, all readings explained once, all of EM.'
+    )
+    print(
+        f'{"":22s}{"pairs":>8s}{"kept":>8s}{"peak":>8s}{"peak MB":>9s}{"stream":>9s}{"once":>8s}{"EM":>8s}'
+        f'{"once / stream":>15s}{"EM / stream":>13s}'
+    )
+    for job, _, f in found:
+        n = f['pairs']
+        print(
+            f'{job.name:22s}{f["own"] / n:8.2f}{f["stored"] / n:8.2f}{f["peak"] / n:8.2f}{f["peak"] / 1e6:9.1f}'
+            f'{f["stream"] / n * 1e9:9.2f}{f["pass"] / n * 1e9:8.2f}{f["total"] / n * 1e9:8.1f}'
+            f'{f["pass"] / f["stream"]:13.1f} x{f["total"] / f["stream"]:11.0f} x'
+        )
+
+
+def assert_equal(one: MapSet, other: MapSet) -> None:
+    """Check that two runs came to the same, bit for bit."""
+    np.testing.assert_array_equal(one.ml, other.ml)
+    np.testing.assert_array_equal(one.uncertainty, other.uncertainty)
+    assert one.objective == other.objective
+
+
+def threads(runs: int) -> None:
+    """Compare one thread with two."""
+    print('\nOne thread and two; the maps are equal bit for bit')
+    print(f'{"":22s}{"one":>9s}{"two":>9s}{"ratio":>9s}{"others":>8s}')
+    for job in JOBS:
+        readings = job.drive()
+        one, two = (
+            Timing(Parameters.from_flat({'resolution': job.resolution, 'threads': n}), readings, runs) for n in (1, 2)
+        )
+        assert_equal(one.maps, two.maps)
+        ratio, others = one['total'] / two['total'], max(one.others, two.others)
+        print(f'{job.name:22s}{one["total"]:9.3f}{two["total"]:9.3f}{ratio:7.2f} x{others:8.0%}', flush=True)
+
+
+def bounded(readings: Readings, parameters: Parameters, runs: int) -> tuple[Timing, int]:
+    """Return times and peak memory."""
+    warm_up()
+    peak = PeakMemory()
+    Mapper(parameters).run(readings)
+    growth = peak.growth
+    return Timing(parameters, readings, runs), growth
+
+
+def memory(runs: int) -> None:
+    """Bound the memory for pairs."""
+    print('\nMemory for pairs bounded (parameter max_memory); the maps are equal bit for bit')
+    print(f'{"":22s}{"max_memory":>11s}{"not stored":>12s}{"total":>9s}{"ratio":>9s}{"peak MB":>9s}{"others":>8s}')
+    for job, bounds in ((JOBS[0], (4000, 4, 0)), (JOBS[2], (4000, 64, 0)), (JOBS[3], (4000, 64))):
+        readings = job.drive()
+        first: Timing | None = None
+        for bound in bounds:
+            parameters = Parameters.from_flat({'resolution': job.resolution, 'max_memory': bound})
+            timing, growth = in_own_process(bounded, readings, parameters, runs)
+            first = first or timing
+            assert_equal(first.maps, timing.maps)
+            print(
+                f'{job.name:22s}{bound:8d} MB{timing.maps.statistics["readings_not_stored"] / len(readings):12.1%}'
+                f'{timing["total"]:9.3f}{timing["total"] / first["total"]:7.2f} x{growth / 1e6:9.1f}'
+                f'{timing.others:8.0%}',
+                flush=True,
+            )
+
+
+def measure_live(readings: Readings, runs: int) -> float:
+    """Return the readings a second that a live map takes on one core."""
+    if hasattr(os, 'sched_setaffinity'):
+        os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
+    warm_up()
+    return len(readings) / timed(lambda: LiveMap(Parameters()).add(readings), runs)
+
+
+def live(runs: int) -> None:
+    """Measure the live map."""
+    print('\nLive map on one core: 10 cm, cones of 15 deg, up to 5 m; the grid grows from nothing')
+    print(f'{"":34s}{"readings":>9s}{"mean range":>12s}{"readings/s":>14s}')
+    logs = {
+        'corridor, 4 passes': corridor_drive(0, passes=4, sonars=sonar_ring(max_range=5.0)).readings,
+        'building, one lap': building_drive(0, laps=1, sonars=sonar_ring(max_range=5.0)).readings,
+    }
+    corridor = logs['corridor, 4 passes']
+    logs['the same corridor, never an echo'] = dataclasses.replace(corridor, z=corridor.z_max)
+    for name, readings in logs.items():
+        rate = in_own_process(measure_live, readings, runs)
+        print(f'{name:34s}{len(readings):9d}{readings.z.mean():10.2f} m{rate:14,.0f}', flush=True)
+
+
+def table_2(runs: int) -> None:
+    """Compare with the loops of the paper's Table 2, on as many readings as they can take."""
+    print("\nEM against the paper's Table 2, both from the empty map until no cell flips, on one thread, for J")
+    print('without what the defaults add: ' + ', '.join(PLAIN))
+    parameters = Parameters.from_flat({**PLAIN, 'threads': 1})
+    prior = math.log(parameters.search.prior / (1 - parameters.search.prior))
+    readings = corridor_drive(0).readings
+    timing = Timing(parameters, readings, runs)
+    loops = [table2.search(readings, parameters) for _ in range(runs)]
+    seconds, one = statistics.median(loop.seconds for loop in loops), loops[0]
+    objective = log_likelihood(readings, one.grid, one.occupied, parameters.model) + prior * int(one.occupied.sum())
+    print(f'{"":10s}{"seconds":>9s}{"sweeps":>8s}{"flips":>8s}{"casts":>12s}{"us a cast":>11s}{"objective":>11s}')
+    print(
+        f'{"Table 2":10s}{seconds:9.2f}{one.sweeps:8d}{one.flips:8d}{one.casts:12d}{seconds / one.casts * 1e6:11.2f}'
+        f'{objective:11.1f}'
+    )
+    s: dict[str, Any] = timing.maps.statistics
+    print(
+        f'{"EM":10s}{timing["total"]:9.3f}{s["sweeps"]:8d}{s["flips"]:8d}{"":23s}{timing.maps.objective:11.1f}'
+        f'\nratio {seconds / timing["total"]:.0f} x'
+    )
 
 
 def main() -> None:
     """Run the benchmark."""
+    parts = {'jobs': jobs, 'threads': threads, 'memory': memory, 'live': live, 'table2': table_2}
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument('--runs', type=int, default=5)
-    parser.add_argument('--large', action='store_true', help='also 204 000 readings, which takes a minute')
+    parser.add_argument('--only', nargs='+', choices=parts, default=list(parts))
+    parser.add_argument('--patience', type=float, default=0.0, help='seconds to repeat what others disturb (default 0)')
     options = parser.parse_args()
-    print(f'{platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}, ', end='')
-    print(f'numpy {np.__version__}, numba {numba.__version__}; medians of {options.runs} runs, seconds')
+    os.environ[PATIENCE] = str(options.patience)
+    print(f'{machine()}\nmedians of {options.runs} runs; others: what other processes used of the machine meanwhile')
     warm_up()
-    stages = ('index', 'search', 'live map', 'uncertainty')
-    print(f'{"readings":>9s}{"pairs":>12s}{"B/pair":>8s}', *(f'{s:>12s}' for s in stages), f'{"all":>8s}  EM/live')
-    for passes in (1, 17) if options.large else (1,):
-        readings = corridor_drive(0, passes=passes).readings
-        runs = [Mapper(Parameters()).run(readings).statistics for _ in range(options.runs)]
-        seconds = {stage: statistics.median(run['seconds'][stage] for run in runs) for stage in stages}
-        total = statistics.median(sum(run['seconds'].values()) for run in runs)
-        ratio = (seconds['index'] + seconds['search']) / seconds['live map']
-        print(f'{len(readings):9d}{runs[0]["pairs"]:12d}{runs[0]["bytes_per_pair"]:8.1f}', end=' ')
-        print(*(f'{seconds[stage]:12.3f}' for stage in stages), f'{total:8.3f}  {ratio:.1f} x')
+    for name in options.only:
+        parts[name](options.runs)
 
 
 if __name__ == '__main__':

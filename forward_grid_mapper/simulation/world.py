@@ -215,4 +215,62 @@ def rooms_world() -> World:
     return plan.world(inside=(30, 30))
 
 
-WORLDS: dict[str, Callable[[], World]] = {'door': door_world, 'corridor': corridor_world, 'rooms': rooms_world}
+# The rooms of `building_world` on each side of its corridor: first and last column, free cells of the door, and what
+# stands inside: boxes as two opposite corners.
+_SOUTH = (
+    (10, 76, (37, 43), (((38, 34), (48, 50)), ((20, 10), (66, 14)))),
+    (76, 142, (106, 114), (((98, 38), (120, 44)), ((138, 30), (142, 56)))),
+    (142, 222, (176, 183), (((166, 34), (172, 52)), ((194, 36), (200, 42)), ((150, 10), (180, 15)))),
+    (222, 300, (258, 265), (((246, 40), (252, 46)), ((268, 34), (278, 50)), ((240, 10), (256, 13)))),
+)
+_NORTH = (
+    (10, 100, (51, 58), (((34, 130), (40, 148)), ((62, 128), (78, 136)), ((20, 166), (50, 170)))),
+    (100, 170, (127, 133), (((124, 128), (146, 142)), ((100, 140), (104, 158)))),
+    (170, 235, (200, 208), (((196, 134), (200, 138)), ((208, 142), (212, 146)), ((190, 165), (225, 170)))),
+    (235, 300, (264, 271), (((260, 126), (272, 150)), ((296, 130), (300, 150)))),
+)
+
+
+def building_world() -> World:
+    """Return a building of 40 x 16 m: a corridor, four rooms on each side of it, and a hall with nine pillars.
+
+    Its doors are 0.7 to 0.9 m wide; tables, shelves and a slanting screen stand in the rooms.
+    """
+    plan = Floorplan('building', 420, 180)
+    plan.box((10, 10), (410, 170))
+    plan.wall('x', 78, (10, 300), doors=tuple(door for _, _, door, _ in _SOUTH))
+    plan.wall('x', 98, (10, 300), doors=tuple(door for _, _, door, _ in _NORTH))
+    plan.wall('y', 300, (10, 170), doors=((84, 92),))
+    for rooms, rows in ((_SOUTH, (10, 78)), (_NORTH, (98, 170))):
+        for _, side, _, boxes in rooms:
+            if side < 300:
+                plan.wall('y', side, rows)
+            for low, high in boxes:
+                plan.box(low, high)
+    plan.line((180, 30), (186, 46))
+    for column in (326, 354, 382):
+        for row in (42, 86, 130):
+            plan.box((column, row), (column + 3, row + 3))
+    return plan.world(inside=(20, 88))
+
+
+def building_tour() -> NDArray[np.float64]:
+    """Return a round through the corridor, all rooms and the hall of `building_world`, shape (P, 2), metres."""
+    cells: list[Cell] = [(20, 88)]
+    south = [(left, right, door, 62, 24) for left, right, door, _ in _SOUTH]
+    north = [(left, right, door, 114, 156) for left, right, door, _ in _NORTH]
+    for left, right, door, near, far in sorted(south + north, key=lambda room: room[2]):
+        middle, low, high = (door[0] + door[1]) // 2, left + 12, right - 12
+        cells += [(middle, 88), (middle, near), (low, near), (low, far), (high, far), (high, near)]
+        cells += [(middle, near), (middle, 88)]
+    hall = ((313, 88), (313, 25), (342, 25), (342, 150), (370, 150), (370, 25), (396, 25), (396, 150), (313, 150))
+    cells += [*hall, (313, 88), (20, 88)]
+    return (np.array(cells) + 0.5) * 0.1
+
+
+WORLDS: dict[str, Callable[[], World]] = {
+    'door': door_world,
+    'corridor': corridor_world,
+    'rooms': rooms_world,
+    'building': building_world,
+}

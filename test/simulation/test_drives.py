@@ -11,6 +11,7 @@ from forward_grid_mapper.simulation.drive import (
     NOISE_FREE,
     NOISY,
     START,
+    building_drive,
     corridor_drive,
     door_drive,
     drive,
@@ -69,7 +70,7 @@ def test_interpolated_odometry_places_every_reading_exactly(tour):
 
 
 def test_motion_never_passes_through_walls():
-    for recording in (door_drive(), corridor_drive(passes=2)):
+    for recording in (door_drive(), corridor_drive(passes=2), building_drive(laps=2)):
         poses = np.array([message.pose[:2] for message in recording.odometry])
         moved = np.r_[True, np.any(np.diff(poses, axis=0) != 0.0, axis=1)]
         assert not blocked(poses[moved], recording.world.segments)
@@ -109,6 +110,17 @@ def test_corridor_passes_go_to_and_fro():
     assert len(recording.readings) == 24_000
     assert recording.robot[:500, :2] == pytest.approx(recording.robot[:499:-1, :2], abs=1e-6)
     assert np.cos(recording.robot[500:, 2]) == pytest.approx(-1.0)
+
+
+def test_building_has_16_wide_sonars_and_laps_that_differ():
+    recording = building_drive(seed=3, laps=2, noise=NOISE_FREE)
+    readings = recording.readings
+    assert len(readings) == 56_000
+    assert len(recording.mounts) == 16
+    assert 2 * readings.half_angle == pytest.approx(math.radians(30.0))
+    first, second = recording.robot[:1750], recording.robot[1750:]
+    apart = np.hypot(*(first[:, None, :2] - second[None, ::7, :2]).T).min(axis=1)
+    assert 0.0 < np.median(apart) < apart.max() < 0.3
 
 
 def test_same_seed_same_recording():

@@ -2,10 +2,20 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
 
-from forward_grid_mapper.simulation.world import WORLDS, Floorplan, cells_along, corridor_world, door_world
+from forward_grid_mapper.simulation.world import (
+    WORLDS,
+    Floorplan,
+    building_tour,
+    building_world,
+    cells_along,
+    corridor_world,
+    door_world,
+)
 
 
 @pytest.mark.parametrize('name', WORLDS)
@@ -67,6 +77,26 @@ def test_slanting_wall_closes_off_its_corner():
     world = WORLDS['rooms']()
     assert world.reference[70, 9] == -1
     assert world.reference[63, 16] == 1
+
+
+def test_building_is_40_by_16_metres_and_its_tour_enters_every_room():
+    world, tour = building_world(), building_tour()
+    walls = world.segments.reshape(-1, 2)
+    assert walls.max(axis=0) - walls.min(axis=0) == pytest.approx([40.0, 16.0])
+    assert {door.width for door in world.doors} == {0.7, 0.8, 0.9}
+    for door in world.doors:
+        along, across = (0, 1) if door.axis == 'x' else (1, 0)
+        at, side = np.array([door.x, door.y])[[along, across]]
+        legs = np.stack([tour[:-1], tour[1:]], axis=1)
+        through = (legs[..., across].min(axis=1) < side) & (legs[..., across].max(axis=1) > side)
+        assert (np.abs(legs[..., along] - at).max(axis=1)[through] < 0.11).sum() == 2
+    # sonars 0.25 m from the centre of a robot that is 5 cm off pass everything
+    x, y = world.grid.centers()
+    rows, columns = np.nonzero(world.reference == 1)
+    for start, end in itertools.pairwise(tour):
+        points = start + np.linspace(0, 1, 50)[:, None] * (end - start)
+        apart = np.hypot(points[:, :1] - x[columns], points[:, 1:] - y[rows])
+        assert apart.min() > 0.3
 
 
 def test_cells_along_keep_their_order():

@@ -1,0 +1,210 @@
+#!/usr/bin/env python3
+"""Where the time of EM goes: steps of the search, and single kernels on the map that it found.
+
+usage: kernels.py [--runs 5] [--patience 0]
+
+All on one thread. A kernel's time is also given for the unit that its work is counted in.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numba
+import numpy as np
+from measuring import PATIENCE, machine, stream_seconds, timed
+
+from forward_grid_mapper.core.cones import grid_of
+from forward_grid_mapper.core.driven import driven_cells
+from forward_grid_mapper.core.evidence import Evidence
+from forward_grid_mapper.core.flips import State, _push_free, explain, find_seers, flip
+from forward_grid_mapper.core.live_map import arc_depth
+from forward_grid_mapper.core.mapping import in_canonical_order
+from forward_grid_mapper.core.moves import promising
+from forward_grid_mapper.core.pairs import WORDS_PER_RUN, make
+from forward_grid_mapper.core.parameters import Parameters
+from forward_grid_mapper.core.prior import Prior, local_prior, shapes
+from forward_grid_mapper.core.readings import Readings
+from forward_grid_mapper.core.search import LEAST, Search
+from forward_grid_mapper.core.tiles import CHUNK, SHIFT
+from forward_grid_mapper.core.warm_up import warm_up
+from forward_grid_mapper.simulation.drive import building_drive, corridor_drive
+
+loop = numba.njit(nogil=True, error_model='numpy')
+
+SAMPLE = 1000
+"""Occupied cells that are flipped, and flipped back."""
+
+
+@loop
+def _make_all(s: State) -> None:
+    for t in range(len(s.shares)):
+        make(s.cones, s.lattice, s.facing, t, s.bench.pairs, 0, s.bench)
+
+
+@loop
+def _explain_all(s: State) -> None:
+    for t in range(len(s.shares)):
+        explain(s.model, s.shares[t], s.maps.occupied, s.pairs, s.shares[t].at, s.ratios, s.bench.new)
+
+
+@loop
+def _push_bands(s: State, by: int) -> None:
+    for t in range(len(s.shares)):
+        m = np.uint64(s.shares[t].bands)
+        cell = np.uint64(s.shares[t].at + WORDS_PER_RUN * s.shares[t].runs)
+        for k in range(m):
+            s.maps.evidence[s.pairs.cell[cell + k]] += by
+            s.pairs.log[cell + m + m + k] += by
+
+
+@loop
+def _push_free_zones(s: State, by: int) -> None:
+    for t in range(len(s.shares)):
+        _push_free(s.shares[t], s.pairs, s.shares[t].at, s.maps, (by, by))
+
+
+@loop
+def _seers(s: State, cells: Any) -> int:
+    n = 0
+    for c in cells:
+        n += find_seers(s, c)
+    return n
+
+
+@loop
+def _flip_all(s: State, cells: Any) -> None:
+    for c in cells:
+        flip(s, c)
+
+
+@loop
+def _touched(s: State, cells: Any, sizes: Any) -> int:
+    """Return the pairs of all readings that see `cells`, each reading counted for each cell."""
+    n = 0
+    for c in cells:
+        for i in range(find_seers(s, c)):
+            n += sizes[s.seers[i, 0]]
+    return n
+
+
+class Steps(Search):
+    """A search that keeps the time of its steps."""
+
+    def __init__(self, *arguments: Any) -> None:
+        super().__init__(*arguments)
+        self.steps: dict[str, list[float]] = {}
+
+    def _timed(self, name: str, step: Callable[..., Any], watch: Any) -> Any:
+        begin = time.perf_counter()
+        before = self.progress.flips + self.progress.shifts
+        done = step(watch)
+        row = self.steps.setdefault(name, [0.0, 0.0, 0.0])
+        made = self.progress.flips + self.progress.shifts - before
+        row[:] = row[0] + time.perf_counter() - begin, row[1] + 1, row[2] + made
+        return done
+
+    def _round(self, watch: Any) -> Any:
+        return self._timed('rounds', super()._round, watch)
+
+    def _sweep(self, watch: Any) -> Any:
+        return self._timed('sweeps', super()._sweep, watch)
+
+    def _shift(self, watch: Any) -> Any:
+        return self._timed('shifts', super()._shift, watch)
+
+    def _bridge(self, watch: Any) -> Any:
+        return self._timed('bridges', super()._bridge, watch)
+
+
+def profile(name: str, readings: Readings, runs: int) -> None:
+    """Print the profile of one job."""
+    p = Parameters()
+    readings = in_canonical_order(readings)
+    grid = grid_of(readings, p.model, p.grid, beyond=arc_depth(p))
+    driven = driven_cells(readings, grid)
+    begin = time.perf_counter()
+    evidence = Evidence(grid, p.model)
+    evidence.extend(readings)
+    built = time.perf_counter() - begin
+    search = Steps(evidence, p.search, driven.ravel())
+    begin = time.perf_counter()
+    search.run()
+    searched = time.perf_counter() - begin
+    s, pairs = evidence.state, evidence.pairs
+    s = s._replace(shares=s.shares[: len(evidence)], cones=s.cones[: len(evidence)])
+    bands = int(s.shares['bands'].sum())
+    free = pairs - bands
+    print(
+        f'\n{name}: {len(readings)} readings, {pairs} pairs, of which {bands / pairs:.0%} are in bands; '
+        f'{evidence.nbytes / pairs:.2f} bytes a pair\n'
+        f'evidence built in {built:.3f} s, search in {searched:.3f} s:'
+    )
+    for step, (seconds, count, made) in search.steps.items():
+        share = seconds / searched
+        print(f'  {step:10s}{seconds:9.3f} s {share:6.0%}{count:6.0f} times{made:9.0f} flips or moves')
+    cells = np.flatnonzero(s.maps.occupied == 1)
+    cells = np.random.default_rng(0).permutation(cells)[:SAMPLE]
+    seers = _seers(s, cells)
+    sizes = s.shares['bands'].astype(np.int64)
+    for k in range(len(sizes)):
+        words = s.pairs.cell[s.shares['at'][k] :][: 2 * s.shares['runs'][k]].astype(np.int64)
+        sizes[k] += int((words[1::2] - words[::2] + 1).sum())
+    touched = _touched(s, cells, sizes)
+    scanned = _scanned(s, cells)
+    room, gains = np.empty(grid.size, np.int64), np.empty(grid.size)
+    window = (0, grid.height, 0, grid.width)
+    prior = Prior(local_prior(p.search, np.zeros(grid.size, np.bool_)), shapes(p.search))
+    n = len(readings)
+    kernels: tuple[tuple[str, Callable[[], Any], tuple[tuple[int, str], ...]], ...] = (
+        ('make pairs', lambda: _make_all(s), ((n, 'reading'), (pairs, 'pair'))),
+        ('explain', lambda: _explain_all(s), ((n, 'reading'), (bands, 'band pair'))),
+        ('push to bands', lambda: _push_bands(s, 0), ((bands, 'band pair'),)),
+        ('push to free zones', lambda: _push_free_zones(s, 0), ((free, 'free pair'),)),
+        ('all readings anew', evidence.rebuild, ((n, 'reading'), (pairs, 'pair'))),
+        ('find seers', lambda: _seers(s, cells), ((len(cells), 'cell'), (scanned, 'candidate'), (seers, 'seer'))),
+        ('flip', lambda: _flip_all(s, cells), ((len(cells), 'flip'), (seers, 'seer'), (touched, 'pair touched'))),
+        ('look for gains', lambda: promising(s, prior, LEAST, window, room, gains), ((grid.size, 'cell'),)),
+    )
+    print(f'  a flip has {scanned / len(cells):.0f} candidates, {seers / len(cells):.0f} readings that see the cell')
+    for kernel, work, units in kernels:
+        work()
+        seconds = timed(work, runs)
+        each = ', '.join(f'{seconds / max(count, 1) * 1e9:,.1f} ns a {unit}' for count, unit in units)
+        print(f'  {kernel:20s}{seconds:9.4f} s   {each}')
+    print(f'  {"stream of the bytes":20s}{stream_seconds(evidence.nbytes, runs):9.4f} s')
+
+
+def _scanned(s: State, cells: Any) -> int:
+    """Return how many readings are in the lists of the cells' tiles."""
+    total = 0
+    for c in cells:
+        row, column = divmod(int(c), s.lattice.width)
+        tile = (row >> SHIFT) * s.tiles.across + (column >> SHIFT)
+        chunk, fill = s.tiles.head[tile], int(s.tiles.fill[tile])
+        while chunk >= 0:
+            total += fill
+            chunk, fill = s.tiles.chunks[chunk, CHUNK], CHUNK
+    return total
+
+
+def main() -> None:
+    """Run the benchmark."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument('--runs', type=int, default=5)
+    parser.add_argument('--patience', type=float, default=0.0, help='seconds to repeat what others disturb (default 0)')
+    options = parser.parse_args()
+    os.environ[PATIENCE] = str(options.patience)
+    print(f'{machine()}\nkernels: medians of {options.runs} runs; search: one run')
+    warm_up()
+    profile('corridor', corridor_drive(0).readings, options.runs)
+    profile('corridor, 17 passes', corridor_drive(0, passes=17).readings, options.runs)
+    profile('building, 16 x 30 deg', building_drive(0).readings, options.runs)
+
+
+if __name__ == '__main__':
+    main()
