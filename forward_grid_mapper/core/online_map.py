@@ -91,9 +91,10 @@ class OnlineMap:
         if p.search.driven_cost > 0:
             self._drive(readings, evidence.grid)
         new, known = self._sort_out(readings)
+        evidence.extend(readings.select(new))
+        # after the new ones, which may be what others of the same call say too
         if len(known):
             evidence.weigh(known)
-        evidence.extend(readings.select(new))
         if len(new) > MANY:
             Search(evidence, p.search, self._driven.ravel()).run()
         else:

@@ -259,3 +259,18 @@ def test_it_is_searched_anew_from_time_to_time(monkeypatch: pytest.MonkeyPatch) 
     assert never._count == 150
     heights = [online._evidence.log_likelihood for online in (often, never)]
     assert heights[0] != heights[1]
+
+
+def test_readings_that_say_the_same_may_come_in_one_call() -> None:
+    readings = door_drive(1, NOISY, seed=0).readings.select(slice(0, 48))
+    twice = readings.select(np.repeat(np.arange(len(readings)), 2))
+    together, apart = OnlineMap(Parameters()), OnlineMap(Parameters())
+    together.add(twice)
+    apart.add(readings)
+    kept = len(apart)
+    apart.add(readings)
+    assert len(together) == len(apart) == kept
+    states = [online._evidence.state for online in (together, apart) if online._evidence is not None]
+    weights = [state.shares['weight'][:kept].tolist() for state in states]
+    assert weights[0] == weights[1]
+    assert sum(weights[0]) == len(twice)
