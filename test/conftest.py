@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import signal
 import sys
 from pathlib import Path
 from typing import Any
@@ -70,3 +71,12 @@ def random_readings(rng: np.random.Generator, grid: Grid, count: int, z_max: flo
         sigma=np.where(rng.random(count) < 0.5, 0.0, rng.uniform(0.02, 0.2, count)),
         stamp=np.arange(count),
     )
+
+
+def pytest_configure() -> None:
+    """Hear Ctrl-C, here and in the processes that tests start, even where the shell runs the tests in the background.
+
+    A shell without job control has background commands ignore it, which processes hand down.
+    """
+    if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
