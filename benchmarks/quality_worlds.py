@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from forward_grid_mapper.commands.offline import read_drive
-from forward_grid_mapper.core.cones import cone_table, grid_of, walk_with_room
+from forward_grid_mapper.core.cones import cone_table, grid_of, offset_of, walk_with_room
 from forward_grid_mapper.core.grid import Grid
 from forward_grid_mapper.core.parameters import Parameters
 from forward_grid_mapper.core.readings import Readings
@@ -212,7 +212,7 @@ def drawn(group: str, recording: Recording, model: dict[str, float], seed: int =
     cells, distances = np.empty(4096, np.int32), np.empty(4096)
     for t in range(len(old)):
         n, cells, distances = walk_with_room(table, t, grid.shape, False, cells, distances)
-        hits = np.sort(distances[:n][occupied[cells[:n]]]) * grid.resolution
+        hits = (np.sort(distances[:n][occupied[cells[:n]]]) - offset_of(p.model)) * grid.resolution
         cause, z_max = rng.random(), old.z_max[t]
         if cause < p.model.p_rand:
             z[t] = rng.random() * z_max

@@ -17,8 +17,8 @@ from forward_grid_mapper.core.readings import Readings
 
 sys.path.insert(0, str(Path(__file__).parent))
 
-PLAIN_MODEL: dict[str, Any] = {'grazing_angle': math.pi / 2}
-"""Every cone whole."""
+PLAIN_MODEL: dict[str, Any] = {'grazing_angle': math.pi / 2, 'surface_offset': 0.0}
+"""Every cone whole, and obstacles at the centres of their cells."""
 
 PLAIN_SEARCH: dict[str, Any] = {
     'driven_cost': 0.0,

@@ -124,11 +124,28 @@ def reach(readings: Readings, t: int, grid: Grid, model: ModelParameters) -> flo
     return end if end < readings.z_max[t] else readings.z_max[t]
 
 
+def surface(grid: Grid, model: ModelParameters) -> float:
+    """How far the surface of an obstacle lies before what the distance to its cell is measured to, in metres."""
+    return 0.0 if model.cell_distance == 'nearest' else model.surface_offset * grid.resolution
+
+
 def cells_of(readings: Readings, t: int, grid: Grid, model: ModelParameters, slack: float = 0.0) -> dict[int, float]:
-    """The cells that reading t sees, and their distances in metres."""
+    """The cells that reading t sees, and the distances of their surfaces in metres."""
     pose = (readings.x[t], readings.y[t], readings.yaw[t])
-    nearest = model.cell_distance == 'nearest'
-    return cone_cells(pose, readings.half_angle[t], reach(readings, t, grid, model), grid, nearest, slack)
+    before, nearest = surface(grid, model), model.cell_distance == 'nearest'
+    end = reach(readings, t, grid, model) + before
+    cells = cone_cells(pose, readings.half_angle[t], end, grid, nearest, slack)
+    return {c: d - before for c, d in cells.items()}
+
+
+def strength(readings: Readings, t: int, grid: Grid, c: int) -> float:
+    """How much of the beam of reading t there is at cell c: 1 on the axis, 0 at the edge and beyond."""
+    xs, ys = grid.centers()
+    dx, dy = xs[c % grid.width] - readings.x[t], ys[c // grid.width] - readings.y[t]
+    off_axis = math.sin(math.atan2(dy, dx) - readings.yaw[t])
+    # half the cone is at least three quarters of a cell wide where the cell's centre is
+    edge = max(math.sin(readings.half_angle[t]), 0.75 * grid.resolution / max(math.hypot(dx, dy), 1e-9))
+    return max(0.0, 1 - (off_axis / edge) ** 2)
 
 
 def live_log_odds(
@@ -136,16 +153,11 @@ def live_log_odds(
 ) -> np.ndarray:
     """The standard map; `logits` of occupied, free, and free without echo."""
     out = np.full(grid.size, np.nan)
-    xs, ys = grid.centers()
     for t in range(len(readings)):
         x, y, yaw, z = readings.x[t], readings.y[t], readings.yaw[t], readings.z[t]
         echo = z < readings.z_max[t]
         for c, d in cone_cells((x, y, yaw), readings.half_angle[t], z + depth, grid, nearest).items():
-            dx, dy = xs[c % grid.width] - x, ys[c // grid.width] - y
-            off_axis = math.sin(math.atan2(dy, dx) - yaw)
-            # half the cone is at least three quarters of a cell wide where the cell's centre is
-            edge = max(math.sin(readings.half_angle[t]), 0.75 * grid.resolution / max(math.hypot(dx, dy), 1e-9))
-            weight = max(0.0, 1 - (off_axis / edge) ** 2)
+            weight = strength(readings, t, grid, c)
             if d < (z - depth if echo else z):
                 out[c] = np.nansum([out[c], weight * logits[1 if echo else 2]])
             elif echo:
@@ -268,8 +280,8 @@ def normals(readings: Readings, grid: Grid, model: ModelParameters) -> tuple[np.
         for c in cells_of(readings, t, grid, model):
             row, column = divmod(c, grid.width)
             dx, dy = xs[column] - readings.x[t], ys[row] - readings.y[t]
-            d, bearing = math.hypot(dx, dy), math.atan2(dy, dx)
-            if d > max(readings.z[t] - 4 * sigma, 0.0):
+            d, bearing = math.hypot(dx, dy) - surface(grid, model), math.atan2(dy, dx)
+            if d > readings.z[t] - 4 * sigma:
                 w = math.exp(-0.5 * ((d - readings.z[t]) / sigma) ** 2)
                 sums[:, row, column] += w * math.cos(2 * bearing), w * math.sin(2 * bearing), w
     return sums[0], sums[1], sums[2]
@@ -301,5 +313,5 @@ def passed(
                 blocking = [at for at, _ in met if at <= free_end]
                 behind = bool(blocking) and d > min(blocking)
                 p += chance / total * ((1 - model.p_hit) ** len(blocking) if behind else 1.0)
-            out[c] += p * (1 if weight is None else weight[t])
+            out[c] += p * strength(readings, t, grid, c) * (1 if weight is None else weight[t])
     return out

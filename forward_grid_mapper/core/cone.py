@@ -14,6 +14,9 @@ from typing import NamedTuple
 
 from .jit import kernel
 
+HALF_WIDTH = 0.75
+"""Least half width in cells that a cone is taken to have when its strength is asked for."""
+
 
 class Cone(NamedTuple):
     """A circular sector: apex `x`, `y`, radius `reach`, unit vectors of its axis and its two edges, row limits."""
@@ -140,3 +143,16 @@ def distance(du: float, dv: float, nearest: bool) -> float:
         du = max(abs(du) - 0.5, 0.0)
         dv = max(abs(dv) - 0.5, 0.0)
     return math.sqrt(du * du + dv * dv)
+
+
+@kernel
+def strength(axis_x: float, axis_y: float, sine2: float, du: float, dv: float) -> float:
+    """Return how much of a beam there is (du, dv) from its apex: 1 on the axis, 0 at the edge and beyond.
+
+    With φ the angle off the axis and β the half angle it is 1 − (sin φ / sin β)² (after Moravec and Elfes 1985, who
+    have the angles themselves). β is taken as large enough for the cone to be one and a half cells wide there, since a
+    thin beam fills the cells it crosses. `sine2` is the square of sin β.
+    """
+    across = axis_x * dv - axis_y * du
+    width2 = max(sine2 * (du * du + dv * dv), HALF_WIDTH * HALF_WIDTH)
+    return max(1.0 - across * across / width2, 0.0)

@@ -4,6 +4,10 @@ A reading of range z splits its cone. In the *free zone*, up to z − cut·σ, t
 there acts only by standing in the way, so its distance does not matter. In the *band* around z lie the cells that can
 explain the reading. Cells beyond the band cannot matter, unless z is near z_max: then all cells up to z_max stand in
 the way of the max-range cause.
+
+Distances are to the centres of cells, but it is a surface that echoes, and that lies before the centre: anywhere
+between it and the near side, as far as the map knows. So lengths along a cone are longer by `surface_offset` cells
+here than what the sensor reports.
 """
 
 from __future__ import annotations
@@ -29,7 +33,8 @@ CONE = np.dtype([(name, np.float64) for name in _FIELDS], align=True)
 """The cone of a reading on a grid, in cells; what the kernels need to walk it.
 
 Apex; unit vector of the axis; sine and cosine of the half angle; range, largest range and σ; `free`, the end of the
-free zone; `reach`, beyond which no cell matters. One record a reading, since kernels come upon readings at random.
+free zone; `reach`, beyond which no cell matters: all four lengths to the centres of cells. One record a reading, since
+kernels come upon readings at random.
 """
 
 Cones = NDArray[np.void]
@@ -40,8 +45,13 @@ def effective_sigma(readings: Readings, model: ModelParameters, resolution: floa
     return np.maximum(np.where(readings.sigma > 0, readings.sigma, model.sigma), resolution / 2)
 
 
+def offset_of(model: ModelParameters) -> float:
+    """Return how many cells the centre of an obstacle lies behind its surface."""
+    return 0.0 if model.cell_distance == 'nearest' else model.surface_offset
+
+
 def reach_of(readings: Readings, sigma: Floats, cut: float) -> Floats:
-    """Return the distance in metres beyond which no cell of each cone matters, shape (N,).
+    """Return the distance in metres beyond which no surface in each cone matters, shape (N,).
 
     Short of z_max − cut·σ the max-range cause has no density, and only cells up to z + cut·σ count.
     """
@@ -64,6 +74,7 @@ def grid_of(
     if not len(readings):
         raise InputError('no reading was accepted, so there is nothing to map; the counts of rejected readings say why')
     reach = reach_of(readings, effective_sigma(readings, model, grid.resolution), model.cut)
+    reach = reach + offset_of(model) * grid.resolution
     reach = np.maximum(reach, readings.z + beyond if beyond else 0.0)
     if model.cell_distance == 'nearest':
         # a cell may be within reach though its centre is not
@@ -84,14 +95,15 @@ def grid_of(
 def cone_table(readings: Readings, grid: Grid, model: ModelParameters) -> Cones:
     """Return the readings' cones in cells of `grid`, records of `CONE`, shape (N,)."""
     sigma = effective_sigma(readings, model, grid.resolution)
-    scale = 1.0 / grid.resolution
+    scale, offset = 1.0 / grid.resolution, offset_of(model)
     table = np.empty(len(readings), CONE)
     table['x'], table['y'] = readings.x * scale - grid.column, readings.y * scale - grid.row
     table['axis_x'], table['axis_y'] = np.cos(readings.yaw), np.sin(readings.yaw)
     table['sine'], table['cosine'] = np.sin(readings.half_angle), np.cos(readings.half_angle)
-    table['z'], table['z_max'], table['sigma'] = readings.z * scale, readings.z_max * scale, sigma * scale
-    table['free'] = (readings.z - model.cut * sigma) * scale
-    table['reach'] = reach_of(readings, sigma, model.cut) * scale
+    table['z'], table['z_max'] = readings.z * scale + offset, readings.z_max * scale + offset
+    table['sigma'] = sigma * scale
+    table['free'] = (readings.z - model.cut * sigma) * scale + offset
+    table['reach'] = reach_of(readings, sigma, model.cut) * scale + offset
     return table
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .cone import row_runs, within
-from .cones import CONE, Floats, check, cone_of, cone_table
+from .cones import CONE, Floats, check, cone_of, cone_table, offset_of
 from .facing import facing_of, gather, no_facing
 from .flips import SHARE, Maps, Model, State, enter_all, weigh
 from .grid import Grid
@@ -184,7 +184,8 @@ class Evidence:
     @property
     def z_max(self) -> Floats:
         """The largest range of every reading in metres, shape (N,)."""
-        out: Floats = self.state.cones['z_max'][: self._size] * self.grid.resolution
+        far = self.state.cones['z_max'][: self._size] - offset_of(self._model)
+        out: Floats = far * self.grid.resolution
         return out
 
     @property

@@ -8,10 +8,13 @@ at distance d, with A the share of T from occupied cells up to d,
 
 and in the free zone T / (c + T), plus chance (e_*) for a reading with an echo too short to be the largest range:
 something that the map lacks may have been there. Chance counts (1 − p_hit) for each obstacle that it had to get by in
-the free zone. A cell through which less than about one reading passed is not known to be free.
+the free zone. A reading counts by the strength of its beam at the cell, since what stands at the edge of a cone is
+easily missed. A cell through which less than about one reading passed is not known to be free.
 
 Where a straight wall ends in the open and the cells ahead have nothing against them, it goes on for a few cells: a wall
 is more likely to leave the view than to end there.
+
+Obstacles that touch no free space are unknown: nothing was seen in front of them. Mirror images beyond walls are such.
 """
 
 from __future__ import annotations
@@ -22,14 +25,21 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .cone import row_runs, within
+from .cone import row_runs, strength, within
 from .cones import Floats, cone_of
 from .evidence import Evidence
 from .flips import State
 from .jit import kernel
+from .logs import QUANTUM
 
 STRAIGHT_RUN = 4
 """Cells in a row that make a straight wall."""
+
+MOST_AGAINST = 0.05
+"""Nats that may speak against a cell by which a wall goes on."""
+
+TOUCHING = 2
+"""Rows and columns, at most, from an obstacle to free space that it touches."""
 
 MOST_OBSTACLES = 4096
 """Occupied cells in one band that are told apart."""
@@ -93,9 +103,10 @@ def count_passed(s: State, begin: int, end: int, random: Floats, occupied: Any, 
         n, blocking, near = _obstacles(s, t, occupied, squares, left)
         scale = share.weight / ((share.floor + left[0]) * UNIT)
         chance = random[t] * scale if share.no_echo == 0.0 else 0.0
-        in_front = int(left[0] * scale + chance)
-        hidden = int(left[0] * scale + chance * (1.0 - s.model.p_hit) ** blocking)
+        in_front = left[0] * scale + chance
+        hidden = left[0] * scale + chance * (1.0 - s.model.p_hit) ** blocking
         cone = cone_of(reading, s.lattice.nearest)
+        axis_x, axis_y, sine2 = reading.axis_x, reading.axis_y, reading.sine**2
         for row in range(max(cone.bottom, 0), min(cone.top, s.lattice.height - 1) + 1):
             a, b, c, d = row_runs(cone, row, reading.reach, s.lattice.width, s.lattice.nearest)
             v = row + 0.5 - cone.y
@@ -103,18 +114,16 @@ def count_passed(s: State, begin: int, end: int, random: Floats, occupied: Any, 
             line = passed[row * s.lattice.width : (row + 1) * s.lattice.width]
             for start, stop in ((a, b), (c, d)):
                 for column in range(start, stop + 1):
-                    if first <= column <= last and not blocking:
-                        line[column] += in_front
-                        continue
                     u = column + 0.5 - cone.x
                     square = u * u + v * v
+                    weight = strength(axis_x, axis_y, sine2, u, v)
                     if first <= column <= last:
-                        line[column] += hidden if square > near else in_front
+                        line[column] += int(weight * (hidden if blocking and square > near else in_front))
                     else:
                         k = 0
                         while k < n and squares[k] <= square:
                             k += 1
-                        line[column] += int(left[k] * scale)
+                        line[column] += int(weight * left[k] * scale)
 
 
 def passed_readings(evidence: Evidence, p_rand: float, occupied: NDArray[np.uint8]) -> Floats:
@@ -165,9 +174,34 @@ def extend(s: State, steps: int, out: Any) -> None:
             if straight:
                 for n in range(1, steps + 1):
                     o = _ahead(c, k, height, width, n)
-                    if o < 0 or occupied[o] or not seen[o] or evidence[o] < 0:
+                    if o < 0 or occupied[o] or not seen[o] or evidence[o] * QUANTUM < -MOST_AGAINST:
                         break
                     out[o] = 1
+
+
+@kernel
+def keep_touching(cells: Any, near: Any) -> None:
+    """Clear in `cells` (uint8, shape (height, width)) each connected group that has no cell in `near` (the same)."""
+    height, width = cells.shape
+    reached = np.zeros((height, width), np.uint8)
+    front = np.empty((height * width, 2), np.int32)
+    n = 0
+    for row in range(height):
+        for column in range(width):
+            if cells[row, column] and near[row, column]:
+                reached[row, column] = 1
+                front[n, 0], front[n, 1] = row, column
+                n += 1
+    while n:
+        n -= 1
+        row, column = front[n]
+        for y in range(max(row - 1, 0), min(row + 2, height)):
+            for x in range(max(column - 1, 0), min(column + 2, width)):
+                if cells[y, x] and not reached[y, x]:
+                    reached[y, x] = 1
+                    front[n, 0], front[n, 1] = y, x
+                    n += 1
+    cells[:] = reached
 
 
 def _grown(cells: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -189,7 +223,8 @@ def finish(
     steps : int
         Cells by which to draw walls out.
     least_passed : float
-        Readings that must have passed a cell, or one beside it, for it to be free; 0 takes all cells that were seen.
+        Readings that must have passed a cell, or one beside it, for it to be free; 0 takes all cells that were seen,
+        and all obstacles.
     p_rand : float
     driven : bool, shape `grid.shape`
         Cells that are known to be free.
@@ -203,4 +238,10 @@ def finish(
         passed = passed_readings(evidence, p_rand, (ml == 1).astype(np.uint8).ravel())
         known = ((passed.reshape(ml.shape) >= least_passed) | driven) & (ml == 0)
         ml[(ml == 0) & ~_grown(known)] = -1
+        near = ml == 0
+        for _ in range(TOUCHING):
+            near = _grown(near)
+        touching = (ml == 1).astype(np.uint8)
+        keep_touching(touching, near.astype(np.uint8))
+        ml[(ml == 1) & (touching == 0)] = -1
     return ml

@@ -1,9 +1,7 @@
 """The standard log-odds map (eq 1-4 of the paper), updated reading by reading.
 
-Inverse sensor model. Let φ be a cell's angle off the axis, β the half angle and d its distance. A reading adds to the
-cells of its cone, weighted by 1 − (sin φ / sin β)² so that the edge of the cone says little (after Moravec and Elfes
-1985, who have the angles themselves); β is taken as large enough for the cone to be one and a half cells wide there,
-since a thin beam fills the cells it crosses:
+Inverse sensor model. A reading adds to the cells of its cone, weighted by the strength of the beam there
+(`cone.strength`), so that the edge of the cone says little. With d the distance of a cell:
 
     d < z − depth                  logit(live_p_free), or logit(live_p_free_no_echo) for a reading without echo
     z − depth ≤ d ≤ z + depth      logit(live_p_occupied); nothing for a reading without echo
@@ -14,13 +12,14 @@ readings, and the node's is the offline tool's cell for cell.
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .cone import row_runs, within
+from .cone import row_runs, strength, within
 from .cones import Cones, Floats, cone_of, cone_table, grid_of
 from .grid import Grid
 from .jit import kernel
@@ -28,9 +27,6 @@ from .parameters import Parameters
 from .readings import Readings
 
 QUANTUM = 2.0**-20
-HALF_WIDTH = 0.75
-"""Least half width of a cone in cells."""
-
 MARGIN = 64
 """Cells by which the array outgrows what is needed, so that a driving robot rarely makes it grow again."""
 
@@ -57,9 +53,7 @@ def _add_run(
     scale = gain / QUANTUM
     for column in range(np.uint64(first), np.uint64(last + 1)):
         du = u + column
-        across = axis_x * v - axis_y * du
-        width2 = max(sine2 * (du * du + v * v), HALF_WIDTH * HALF_WIDTH)
-        step = math.floor(max(1.0 - across * across / width2, 0.0) * scale + 0.5) * QUANTUM
+        step = math.floor(strength(axis_x, axis_y, sine2, du, v) * scale + 0.5) * QUANTUM
         known = row[column]
         row[column] = (0.0 if math.isnan(known) else known) + step
 
@@ -123,7 +117,7 @@ class LiveMap:
         depth = arc_depth(p)
         self.grid = grid_of(readings, p.model, p.grid, within=self.grid, beyond=depth)
         self._grow()
-        table = cone_table(readings, self._stored, p.model)
+        table = cone_table(readings, self._stored, dataclasses.replace(p.model, surface_offset=0.0))
         depth /= p.grid.resolution
         table['free'] = np.where(readings.echo, table['z'] - depth, table['z'])
         table['reach'] = table['z'] + depth

@@ -24,7 +24,7 @@ from .readings import Readings
 from .search import Progress, Search, SearchResult
 from .threads import cores
 from .transient import transient_echoes
-from .uncertainty import marginals
+from .uncertainty import uncertainty_map
 
 Watch = Callable[[str, Progress | None], None]
 """Hears the name of each stage as it begins, and of every sweep of the search."""
@@ -128,14 +128,12 @@ class Mapper:
         search, grid = parameters.search, evidence.grid
         driven = self._driven(readings, grid, search)
         ml = finish(evidence, search.extend, search.least_passed, parameters.model.p_rand, driven)
-        probability = marginals(result.evidence, result.neighbours, search)
-        uncertainty = np.where(evidence.state.maps.seen > 0, probability, np.float32(np.nan)).reshape(ml.shape)
         unexplained = parameters.model.p_rand / readings.z_max > 0.5 * evidence.likelihoods
         return MapSet(
             grid=grid,
             live=live_map,
             ml=ml,
-            uncertainty=uncertainty,
+            uncertainty=uncertainty_map(result.evidence, result.neighbours, ml, search),
             readings=readings,
             unexplained=unexplained,
             transient=transient_echoes(readings, unexplained, grid, ml, parameters.model),

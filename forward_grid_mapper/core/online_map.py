@@ -32,7 +32,7 @@ from .prior import Prior, local_prior, prior_gains, shapes
 from .readings import Readings
 from .search import LEAST, Search, Window
 from .threads import cores
-from .uncertainty import marginals
+from .uncertainty import uncertainty_map
 
 SAME_PLACE = 0.5
 """Cells, and share of the half angle, by which poses may differ."""
@@ -216,9 +216,8 @@ class OnlineMap:
         evidence, search = self._evidence, self._parameters.search
         window = evidence.grid.window(self.grid)
         ml = finish(evidence, search.extend, search.least_passed, self._parameters.model.p_rand, self._driven)
-        maps, shape = evidence.state.maps, evidence.grid.shape
-        gains = prior_gains(self._prior, maps.occupied, maps.pattern, maps.seen, shape[1])
+        maps = evidence.state.maps
+        gains = prior_gains(self._prior, maps.occupied, maps.pattern, maps.seen, evidence.grid.width)
         sign = np.where(maps.occupied == 1, -1.0, 1.0)
-        probability = marginals(np.asarray(sign * maps.evidence * QUANTUM), sign * gains, search)
-        uncertainty = np.where(maps.seen > 0, probability, np.float32(np.nan))
-        return self.grid, ml[window], uncertainty.reshape(shape)[window]
+        uncertainty = uncertainty_map(np.asarray(sign * maps.evidence * QUANTUM), sign * gains, ml, search)
+        return self.grid, ml[window], uncertainty[window]

@@ -111,7 +111,7 @@ class ModelParameters:
     )
     p_rand: float = _param(0.4, 'Probability that a reading is random, whatever the map.', 'probability', 1e-4, 0.95)
     p_lost: float = _param(
-        0.4,
+        0.42,
         "Probability that no echo is heard, whatever the map, as off smooth walls; 0 is the paper's model.",
         'probability',
         0.0,
@@ -137,6 +137,13 @@ class ModelParameters:
         'Distance from the sensor to a cell: to its center or to its nearest point.',
         choices=('center', 'nearest'),
         read_only=True,
+    )
+    surface_offset: float = _param(
+        0.3,
+        'How far before the center of its cell the surface of an obstacle is taken to lie; 0 is the paper.',
+        'cells',
+        0.0,
+        0.5,
     )
 
     def __post_init__(self) -> None:
@@ -172,7 +179,7 @@ class SearchParameters:
         0.0,
         10.0,
     )
-    end_cost: float = _param(1.0, 'What the end of a wall costs, or a corner; 0 is the paper.', 'nats', 0.0, 100.0)
+    end_cost: float = _param(1.4, 'What the end of a wall costs, or a corner; 0 is the paper.', 'nats', 0.0, 100.0)
     isolated_cost: float = _param(
         2.0, 'What an occupied cell without occupied neighbour costs; 0 is the paper.', 'nats', 0.0, 100.0
     )
@@ -180,10 +187,10 @@ class SearchParameters:
         10, 'Longest gap between two ends of walls that is tried to be closed at once.', 'cells', 0, 50
     )
     extend: int = _param(
-        3, 'Cells by which walls are drawn out at their ends where no reading speaks against it.', 'cells', 0, 20
+        6, 'Cells by which walls are drawn out at their ends where no reading speaks against it.', 'cells', 0, 20
     )
     least_passed: float = _param(
-        0.9,
+        1.0,
         'Readings that are expected to have passed through a cell for it to be known as free; 0 takes all cells seen.',
         'readings',
         0.0,

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import naive
-from conftest import random_readings
+from conftest import plain_model, random_readings
 from forward_grid_mapper.core.cone import axis_run, distance, row_runs, within
 from forward_grid_mapper.core.cones import cone_of, cone_table, effective_sigma, grid_of, reach_of, walk, walk_with_room
 from forward_grid_mapper.core.grid import Grid, cone_boxes
@@ -27,7 +27,7 @@ SOME = [naive.awkward_readings, random_readings]
 
 
 def model_of(nearest: bool) -> ModelParameters:
-    return ModelParameters(cell_distance='nearest' if nearest else 'center')
+    return ModelParameters(cell_distance='nearest' if nearest else 'center', surface_offset=0.3)
 
 
 def walked(table: np.ndarray, t: int, grid: Grid, nearest: bool) -> dict[int, float]:
@@ -50,7 +50,7 @@ def test_cone_has_the_cells_within_the_angle_and_those_on_the_axis(make: Make, n
         smaller, larger = (naive.cells_of(readings, t, grid, model, slack) for slack in (-1e-9, 1e-9))
         assert set(smaller) <= set(found) <= set(larger)
         for cell, d in found.items():
-            assert d * grid.resolution == pytest.approx(larger[cell], abs=1e-12)
+            assert d * grid.resolution == pytest.approx(larger[cell] + naive.surface(grid, model), abs=1e-12)
 
 
 @pytest.mark.parametrize('make', SOME)
@@ -113,7 +113,7 @@ def test_a_cone_of_nearly_half_a_turn_is_all_that_is_ahead(half_angle: float) ->
     for _ in range(20):
         x, y, yaw = rng.uniform(-0.5, 0.5), rng.uniform(-0.5, 0.5), rng.uniform(-4, 4)
         readings = Readings.from_columns(x=x, y=y, yaw=yaw, z=2.0, z_max=2.0, half_angle=half_angle)
-        found = set(walked(cone_table(readings, grid, ModelParameters()), 0, grid, False))
+        found = set(walked(cone_table(readings, grid, plain_model()), 0, grid, False))
         xs, ys = grid.centers()
         du, dv = np.meshgrid(xs - x, ys - y)
         ahead = du * math.cos(yaw) + dv * math.sin(yaw)
@@ -152,8 +152,9 @@ def test_the_grid_of_readings_cuts_off_no_cell(make: Make, nearest: bool) -> Non
     assert grid_of(readings, model, parameters, within=Grid(0.1, 900, 900, 2, 2)).column <= GRID.column
 
 
-def test_cones_are_those_of_the_readings_in_cells() -> None:
-    readings, model = random_readings(np.random.default_rng(6), GRID, 30), ModelParameters(cut=4.0)
+@pytest.mark.parametrize('offset', [0.0, 0.3])
+def test_cones_are_those_of_the_readings_in_cells(offset: float) -> None:
+    readings, model = random_readings(np.random.default_rng(6), GRID, 30), ModelParameters(surface_offset=offset)
     table = cone_table(readings, GRID, model)
     sigma = effective_sigma(readings, model, GRID.resolution)
     reach = reach_of(readings, sigma, model.cut)
@@ -164,8 +165,17 @@ def test_cones_are_those_of_the_readings_in_cells() -> None:
         assert cone['y'] == pytest.approx(readings.y[t] / 0.1 - 12)
         assert math.atan2(cone['axis_y'], cone['axis_x']) == pytest.approx(math.remainder(readings.yaw[t], 2 * math.pi))
         assert math.atan2(cone['sine'], cone['cosine']) == pytest.approx(readings.half_angle[t])
-        lengths = [readings.z[t], readings.z_max[t], sigma[t], naive.free_end(readings, t, GRID, model), reach[t]]
-        assert [cone[k] for k in ('z', 'z_max', 'sigma', 'free', 'reach')] == pytest.approx([v / 0.1 for v in lengths])
+        lengths = [readings.z[t], readings.z_max[t], naive.free_end(readings, t, GRID, model), reach[t]]
+        # a surface so far away is that of an obstacle whose centre is farther by the offset
+        expected = pytest.approx([v / 0.1 + offset for v in lengths])
+        assert [cone[k] for k in ('z', 'z_max', 'free', 'reach')] == expected
+        assert cone['sigma'] == pytest.approx(sigma[t] / 0.1)
+
+
+def test_the_nearest_point_of_a_cell_is_its_surface() -> None:
+    readings = random_readings(np.random.default_rng(6), GRID, 30)
+    near = [ModelParameters(cell_distance='nearest', surface_offset=offset) for offset in (0.0, 0.5)]
+    assert np.array_equal(*(cone_table(readings, GRID, model) for model in near))
 
 
 def test_a_thin_cone_has_no_holes() -> None:

@@ -118,7 +118,8 @@ def left_out(evidence: Evidence, readings: Readings, t: int, model: ModelParamet
     for c in naive.cells_of(readings, t, GRID, model):
         dx, dy = xs[c % GRID.width] - readings.x[t], ys[c // GRID.width] - readings.y[t]
         d = math.hypot(dx, dy)
-        if facing.known[c] and d < readings.z[t] - THROUGH * naive.sigma_of(readings, t, GRID, model):
+        before = naive.surface(GRID, model)
+        if facing.known[c] and d - before < readings.z[t] - THROUGH * naive.sigma_of(readings, t, GRID, model):
             slant = abs(facing.x[c] * dx + facing.y[c] * dy) / d
             if slant < math.cos(model.grazing_angle):
                 out.add(c)

@@ -12,8 +12,17 @@ import naive
 from conftest import plain_model, random_readings
 from forward_grid_mapper.core import threads
 from forward_grid_mapper.core.evidence import Evidence
-from forward_grid_mapper.core.finishing import STRAIGHT_RUN, extend, finish, passed_readings
+from forward_grid_mapper.core.finishing import (
+    MOST_AGAINST,
+    STRAIGHT_RUN,
+    TOUCHING,
+    extend,
+    finish,
+    keep_touching,
+    passed_readings,
+)
 from forward_grid_mapper.core.grid import Grid
+from forward_grid_mapper.core.logs import QUANTUM
 from forward_grid_mapper.core.parameters import ModelParameters
 from forward_grid_mapper.core.readings import Readings
 
@@ -42,7 +51,11 @@ def test_readings_that_passed_are_those_of_the_twin(seed: int, filled: float) ->
     rng = np.random.default_rng(seed)
     readings = off_the_lattice(seed)
     model = plain_model(
-        p_hit=rng.choice([0.05, 0.6, 0.98]), p_rand=rng.choice([0.01, 0.4]), p_lost=rng.choice([0.0, 0.3]), sigma=0.06
+        p_hit=rng.choice([0.05, 0.6, 0.98]),
+        p_rand=rng.choice([0.01, 0.4]),
+        p_lost=rng.choice([0.0, 0.3]),
+        sigma=0.06,
+        surface_offset=rng.choice([0.0, 0.3]),
     )
     occupied = (rng.random(GRID.size) < filled).astype(np.uint8)
     evidence = made(readings, model, occupied)
@@ -69,7 +82,7 @@ def test_the_map_asked_about_may_be_another_and_weights_count() -> None:
 def test_neither_threads_nor_what_is_grazed_change_who_passed(monkeypatch: pytest.MonkeyPatch) -> None:
     readings = random_readings(np.random.default_rng(5), GRID, 300)
     occupied = (np.random.default_rng(1).random(GRID.size) < 0.1).astype(np.uint8)
-    whole, slanted = plain_model(), ModelParameters(grazing_angle=0.5)
+    whole, slanted = plain_model(), plain_model(grazing_angle=0.5)
     one = passed_readings(made(readings, whole, occupied), 0.4, occupied)
     monkeypatch.setattr(threads, 'LEAST_PART', 20)
     assert np.array_equal(passed_readings(made(readings, whole, occupied, threads=3), 0.4, occupied), one)
@@ -100,7 +113,7 @@ def drawn_out(evidence: Evidence, steps: int) -> np.ndarray:
                 u, v = x + n * dx, y + n * dy
                 if not (0 <= u < GRID.width and 0 <= v < GRID.height):
                     break
-                if occupied[v, u] or not seen[v, u] or told[v, u] < 0:
+                if occupied[v, u] or not seen[v, u] or told[v, u] * QUANTUM < -MOST_AGAINST:
                     break
                 out[v, u] = 1
     return out
@@ -117,7 +130,7 @@ def test_walls_go_on_where_the_twin_has_it(seed: int) -> None:
             if 0 <= u < GRID.width and 0 <= v < GRID.height:
                 occupied[v, u] = 1
     evidence = made(random_readings(rng, GRID, 15), plain_model(), occupied)
-    evidence.state.maps.evidence[:] = rng.integers(-2, 6, GRID.size)
+    evidence.state.maps.evidence[:] = rng.uniform(-2 * MOST_AGAINST, 6 * MOST_AGAINST, GRID.size) / QUANTUM
     for steps in (1, 3):
         out = np.zeros(GRID.size, np.uint8)
         extend(evidence.state, steps, out)
@@ -140,13 +153,58 @@ def test_finish_draws_walls_out_by_so_many_cells_and_no_farther_than_something_s
     evidence = seen_by_all(wall_at(5, 4, 8))
     assert np.array_equal(finish(evidence, 0, 0.0, 0.4, NOWHERE) == 1, wall_at(5, 4, 8) == 1)
     assert np.array_equal(finish(evidence, 2, 0.0, 0.4, NOWHERE) == 1, wall_at(5, 2, 10) == 1)
-    evidence.state.maps.evidence.reshape(GRID.shape)[5, 10] = -1
+    evidence.state.maps.evidence.reshape(GRID.shape)[5, 10] = round(-1.1 * MOST_AGAINST / QUANTUM)
+    evidence.state.maps.evidence.reshape(GRID.shape)[5, 2] = round(-0.9 * MOST_AGAINST / QUANTUM)
     assert np.array_equal(finish(evidence, 3, 0.0, 0.4, NOWHERE) == 1, wall_at(5, 1, 9) == 1)
     assert np.array_equal(evidence.observed() == 1, wall_at(5, 4, 8) == 1), 'the search goes on from its own map'
 
 
 def test_three_cells_are_no_straight_wall() -> None:
     assert np.array_equal(finish(seen_by_all(wall_at(5, 4, 6)), 3, 0.0, 0.4, NOWHERE) == 1, wall_at(5, 4, 6) == 1)
+
+
+def groups_near(cells: np.ndarray, free: np.ndarray) -> np.ndarray:
+    """The cells whose group, connected along sides and corners, has one at most `TOUCHING` rows and columns off."""
+    out = np.zeros_like(cells)
+    left = {(int(y), int(x)) for y, x in np.argwhere(cells)}
+    while left:
+        front, group = [left.pop()], []
+        while front:
+            y, x = front.pop()
+            group.append((y, x))
+            beside = {(y + v, x + u) for u, v in STEPS} & left
+            left -= beside
+            front += beside
+        window = [
+            free[max(y - TOUCHING, 0) : y + TOUCHING + 1, max(x - TOUCHING, 0) : x + TOUCHING + 1] for y, x in group
+        ]
+        if any(part.any() for part in window):
+            for y, x in group:
+                out[y, x] = True
+    return out
+
+
+@pytest.mark.parametrize('seed', range(20))
+def test_groups_of_cells_are_kept_whole_where_one_of_them_touches(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    cells = (rng.random((13, 17)) < rng.choice([0.1, 0.25, 0.4])).astype(np.uint8)
+    free = rng.random(cells.shape) < 0.01
+    near = free.copy()
+    for _ in range(TOUCHING):
+        near = naive.box_sum(near.astype(int)) > 0
+    kept = cells.copy()
+    keep_touching(kept, near.astype(np.uint8))
+    assert np.array_equal(kept == 1, groups_near(cells == 1, free))
+
+
+def test_an_obstacle_that_touches_no_free_space_is_unknown() -> None:
+    # a wall 0.6 m ahead, and a mirror image beyond
+    z = np.append(np.full(50, 0.6), 1.1)
+    readings = Readings.from_columns(x=0.05, y=0.55, yaw=0.0, z=z, z_max=1.3, half_angle=0.02)
+    occupied = wall_at(5, 6, 6) + wall_at(5, 11, 11)
+    evidence = made(readings, dataclasses.replace(plain_model(), sigma=0.05), occupied)
+    assert finish(evidence, 0, 1.0, 0.4, NOWHERE)[5].tolist() == [0] * 6 + [1] + [-1] * 7
+    assert (finish(evidence, 0, 0.0, 0.4, NOWHERE) == 1).sum() == 2, 'where all that was seen is known, so are both'
 
 
 @pytest.mark.parametrize('seed', range(6))
@@ -162,7 +220,9 @@ def test_cells_through_which_nobody_passed_are_unknown(seed: int) -> None:
         told = finish(evidence, 0, least, model.p_rand, driven)
         known = ((passed >= least) | driven) & (plain == 0)
         beside = naive.box_sum(known.astype(int)) > 0
-        assert np.array_equal(told, np.where((plain == 0) & ~beside, -1, plain))
+        expected = np.where((plain == 0) & ~beside, -1, plain)
+        expected[(plain == 1) & ~groups_near(plain == 1, expected == 0)] = -1
+        assert np.array_equal(told, expected)
     assert (finish(evidence, 0, 100.0, model.p_rand, NOWHERE) != 0).all()
 
 

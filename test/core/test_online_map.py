@@ -59,7 +59,7 @@ def consistent(online: OnlineMap) -> bool:
 @pytest.mark.parametrize('drive', ['door', 'corridor'])
 def test_readings_in_sweeps_give_nearly_the_map_of_a_batch(drive: str) -> None:
     recording = door_drive(3, NOISY) if drive == 'door' else corridor_drive()
-    readings = recording.readings.select(slice(0, 2400))
+    readings = recording.readings
     parameters = Parameters()
     maps = Mapper(parameters).run(readings)
     online = in_sweeps(readings, parameters)

@@ -23,7 +23,7 @@ from forward_grid_mapper.core.parameters import ModelParameters, SearchParameter
 from forward_grid_mapper.core.prior import Prior, local_prior, shapes
 from forward_grid_mapper.core.readings import Readings
 from forward_grid_mapper.core.search import FEW, LEAST, Progress, Search
-from forward_grid_mapper.core.uncertainty import marginals
+from forward_grid_mapper.core.uncertainty import LEAST_EVIDENCE, marginals, uncertainty_map
 
 GRID = Grid(0.1, 0, 0, 12, 9)
 MODEL = plain_model(p_hit=0.6, p_rand=0.1, p_lost=0.1, sigma=0.06)
@@ -58,7 +58,9 @@ def objective(
 @pytest.mark.parametrize('cell_distance', ['center', 'nearest'])
 def test_every_gain_is_the_difference_of_two_evaluations(p_hit: float, cell_distance: str) -> None:
     rng = np.random.default_rng(round(p_hit * 100))
-    model = plain_model(p_hit=p_hit, p_rand=0.02, p_lost=0.1, sigma=0.06, cell_distance=cell_distance)
+    model = plain_model(
+        p_hit=p_hit, p_rand=0.02, p_lost=0.1, sigma=0.06, cell_distance=cell_distance, surface_offset=0.3
+    )
     readings = random_readings(rng, GRID, 300)
     start = rng.random(GRID.size) < 0.15
     state = make(readings, model=model, start=start).evidence.state
@@ -426,3 +428,13 @@ def test_uncertainty_mixes_evidence_neighbours_and_prior(weight: float) -> None:
     assert told == pytest.approx(odds / (1 + odds), abs=1e-6)
     far = marginals(np.array([-1e9, 1e9]), np.zeros(2), parameters)
     assert far.tolist() == [pytest.approx(0.0), 1.0]
+
+
+def test_the_uncertainty_map_says_nothing_where_the_readings_do_not() -> None:
+    ml = np.array([[1, 0, -1, -1], [1, 0, -1, -1]], np.int8)
+    evidence = np.array([0.0, 0.0, 0.0, 0.9, 2.0, -2.0, -0.9, 1.1]) * LEAST_EVIDENCE
+    told = uncertainty_map(evidence, np.zeros(8), ml, SearchParameters())
+    assert told.dtype == np.float32
+    assert np.isnan(told).tolist() == [[False, False, True, True], [False, False, True, False]]
+    expected = marginals(evidence, np.zeros(8), SearchParameters()).reshape(ml.shape)
+    assert np.array_equal(told[~np.isnan(told)], expected[~np.isnan(told)])
