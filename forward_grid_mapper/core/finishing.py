@@ -11,8 +11,8 @@ something that the map lacks may have been there. Chance counts (1 − p_hit) fo
 the free zone. A reading counts by the strength of its beam at the cell, since what stands at the edge of a cone is
 easily missed. A cell through which less than about one reading passed is not known to be free.
 
-Where a straight wall ends in the open and the cells ahead have nothing against them, it goes on for a few cells: a wall
-is more likely to leave the view than to end there.
+Where a straight wall ends in the open, the cells ahead have nothing against them and are not known to be free, it goes
+on for a few cells: a wall is more likely to leave the view than to end there.
 
 Obstacles that touch no free space are unknown: nothing was seen in front of them. Mirror images beyond walls are such.
 """
@@ -155,8 +155,8 @@ def _ahead(c: int, k: int, height: int, width: int, n: int) -> int:
 
 
 @kernel
-def extend(s: State, steps: int, out: Any) -> None:
-    """Set in `out` (uint8) the cells by which straight walls go on at their ends."""
+def extend(s: State, steps: int, barred: Any, out: Any) -> None:
+    """Set in `out` (uint8) the cells by which straight walls go on at their ends, up to what is `barred` (uint8)."""
     height, width = s.lattice.height, s.lattice.width
     occupied, evidence, seen = s.maps.occupied, s.maps.evidence, s.maps.seen
     for c in range(len(occupied)):
@@ -174,7 +174,7 @@ def extend(s: State, steps: int, out: Any) -> None:
             if straight:
                 for n in range(1, steps + 1):
                     o = _ahead(c, k, height, width, n)
-                    if o < 0 or occupied[o] or not seen[o] or evidence[o] * QUANTUM < -MOST_AGAINST:
+                    if o < 0 or occupied[o] or not seen[o] or barred[o] or evidence[o] * QUANTUM < -MOST_AGAINST:
                         break
                     out[o] = 1
 
@@ -230,13 +230,15 @@ def finish(
         Cells that are known to be free.
     """
     ml = evidence.observed()
-    if steps:
-        ahead = np.zeros(evidence.grid.size, np.uint8)
-        extend(evidence.state, steps, ahead)
-        ml[ahead.reshape(ml.shape) == 1] = 1
+    known = driven & (ml == 0)
     if least_passed > 0:
-        passed = passed_readings(evidence, p_rand, (ml == 1).astype(np.uint8).ravel())
-        known = ((passed.reshape(ml.shape) >= least_passed) | driven) & (ml == 0)
+        passed = passed_readings(evidence, p_rand, evidence.state.maps.occupied).reshape(ml.shape)
+        known |= (passed >= least_passed) & (ml == 0)
+    if steps:
+        ahead = np.zeros(ml.shape, np.uint8)
+        extend(evidence.state, steps, known.astype(np.uint8).ravel(), ahead.ravel())
+        ml[ahead == 1] = 1
+    if least_passed > 0:
         ml[(ml == 0) & ~_grown(known)] = -1
         near = ml == 0
         for _ in range(TOUCHING):

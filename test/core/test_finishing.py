@@ -94,7 +94,7 @@ def test_neither_threads_nor_what_is_grazed_change_who_passed(monkeypatch: pytes
 STEPS = [(1, 0), (1, 1), (0, 1), (-1, 1), (-1, 0), (-1, -1), (0, -1), (1, -1)]
 
 
-def drawn_out(evidence: Evidence, steps: int) -> np.ndarray:
+def drawn_out(evidence: Evidence, steps: int, barred: np.ndarray) -> np.ndarray:
     """The twin of `extend`, from its docstring."""
     maps = evidence.state.maps
     occupied, told, seen = (a.reshape(GRID.shape) for a in (maps.occupied, maps.evidence, maps.seen))
@@ -113,7 +113,7 @@ def drawn_out(evidence: Evidence, steps: int) -> np.ndarray:
                 u, v = x + n * dx, y + n * dy
                 if not (0 <= u < GRID.width and 0 <= v < GRID.height):
                     break
-                if occupied[v, u] or not seen[v, u] or told[v, u] * QUANTUM < -MOST_AGAINST:
+                if barred[v, u] or occupied[v, u] or not seen[v, u] or told[v, u] * QUANTUM < -MOST_AGAINST:
                     break
                 out[v, u] = 1
     return out
@@ -131,10 +131,11 @@ def test_walls_go_on_where_the_twin_has_it(seed: int) -> None:
                 occupied[v, u] = 1
     evidence = made(random_readings(rng, GRID, 15), plain_model(), occupied)
     evidence.state.maps.evidence[:] = rng.uniform(-2 * MOST_AGAINST, 6 * MOST_AGAINST, GRID.size) / QUANTUM
+    barred = (rng.random(GRID.shape) < 0.1).astype(np.uint8)
     for steps in (1, 3):
         out = np.zeros(GRID.size, np.uint8)
-        extend(evidence.state, steps, out)
-        assert np.array_equal(out.reshape(GRID.shape), drawn_out(evidence, steps))
+        extend(evidence.state, steps, barred.ravel(), out)
+        assert np.array_equal(out.reshape(GRID.shape), drawn_out(evidence, steps, barred))
 
 
 def wall_at(row: int, first: int, last: int) -> np.ndarray:
@@ -157,6 +158,21 @@ def test_finish_draws_walls_out_by_so_many_cells_and_no_farther_than_something_s
     evidence.state.maps.evidence.reshape(GRID.shape)[5, 2] = round(-0.9 * MOST_AGAINST / QUANTUM)
     assert np.array_equal(finish(evidence, 3, 0.0, 0.4, NOWHERE) == 1, wall_at(5, 1, 9) == 1)
     assert np.array_equal(evidence.observed() == 1, wall_at(5, 4, 8) == 1), 'the search goes on from its own map'
+
+
+def test_no_wall_is_drawn_out_over_where_the_robot_was_or_readings_passed() -> None:
+    driven = NOWHERE.copy()
+    driven[5, 10] = True
+    evidence = seen_by_all(wall_at(5, 4, 8))
+    assert np.array_equal(finish(evidence, 3, 0.0, 0.4, driven) == 1, wall_at(5, 1, 9) == 1)
+    # ten readings that went through a gap
+    readings = Readings.from_columns(x=1.15, y=0.05, yaw=math.pi / 2, z=np.full(10, 1.0), z_max=1.3, half_angle=0.02)
+    evidence = made(readings, plain_model(sigma=0.05), wall_at(5, 4, 8))
+    evidence.state.maps.seen[:], evidence.state.maps.evidence[:] = 1, 1
+    assert np.array_equal(finish(evidence, 6, 0.0, 0.4, NOWHERE)[5] == 1, np.arange(14) <= 13)
+    told = finish(evidence, 6, 1.0, 0.4, NOWHERE)
+    assert told[5, 11] == 0
+    assert (told[5, 9:11] == 1).all(), 'up to what is known'
 
 
 def test_three_cells_are_no_straight_wall() -> None:
