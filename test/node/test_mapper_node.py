@@ -139,7 +139,8 @@ def test_node_and_offline_agree_on_a_simulated_drive(start: Any, robot: Robot, d
 
 
 def test_the_grid_lies_where_the_world_does(start: Any, robot: Robot, tmp_path: Path) -> None:
-    # two walls at different distances, seen from a place off the origin: left 1 m, ahead 2 m
+    # two walls, seen from a place off the origin; their surfaces lie a little before the centres of their cells, which
+    # are 1 m to the left and 2 m ahead
     start(*RELIABLE, '-p', 'sensors.left.pose:=[0.0, 0.0, 1.5707963]', '-p', 'sensors.front.pose:=[0.0, 0.0, 0.0]')
     robot.meet()
     messages: list[Any] = []
@@ -147,8 +148,8 @@ def test_the_grid_lies_where_the_world_does(start: Any, robot: Robot, tmp_path: 
         stamp = 10 * NANOSECONDS + k * NANOSECONDS // 20
         pose = Pose2(5.05, -3.05 + 0.01 * (k % 5), 0.0)
         messages.append(OdometryMessage(stamp, 'world', 'base', pose))
-        messages.append(RangeMessage(stamp, 'left', 1.0 - 0.01 * (k % 5), 0.1, 3.0, 0.2))
-        messages.append(RangeMessage(stamp, 'front', 2.0, 0.1, 3.0, 0.2))
+        messages.append(RangeMessage(stamp, 'left', 0.97 - 0.01 * (k % 5), 0.1, 3.0, 0.2))
+        messages.append(RangeMessage(stamp, 'front', 1.97, 0.1, 3.0, 0.2))
     robot.play(messages)
     assert robot.call('run_em').success
     message = robot.get_map('ml_map')
