@@ -42,8 +42,11 @@ from quality_scores import (
     score,
     together,
 )
-from quality_worlds import Case, drawn_cases, recorded_cases, scoring_tool, simulated_cases
+from quality_worlds import Case, drawn_cases, on_grid, recorded_cases, scoring_tool, simulated_cases
 
+from forward_grid_mapper.core.cones import grid_of
+from forward_grid_mapper.core.evidence import Evidence
+from forward_grid_mapper.core.logs import QUANTUM
 from forward_grid_mapper.core.mapping import Mapper
 from forward_grid_mapper.core.parameters import Parameters
 from forward_grid_mapper.core.warm_up import warm_up
@@ -200,10 +203,25 @@ def print_ablations(groups: dict[str, list[Case]], base: dict[str, Any], whole: 
         print(row + f'{mean(r, own + doors + hall, "loss"):9.3f}', flush=True)
 
 
+def with_true_rest(case: Case, model: dict[str, Any], known: Any) -> float:
+    """Return the log loss at the cells `known` of eq 43 given all other cells of the true map, at its best prior."""
+    assert case.world is not None
+    p = Parameters.from_flat({**model, 'grazing_angle': math.pi / 2})
+    grid = grid_of(case.readings, p.model, p.grid)
+    walls = on_grid(case.world, grid)
+    evidence = Evidence(grid, p.model, start=walls.astype(np.uint8))
+    evidence.extend(case.readings)
+    gains = evidence.state.maps.evidence.reshape(grid.shape) * QUANTUM
+    odds = np.nan_to_num(on_truth(np.where(walls, -gains, gains), grid, case, None))[known].clip(-50, 50)
+    occupied = case.truth[known] > 0.5
+    return min(Belief(1 / (1 + np.exp(-odds - prior)), occupied).loss for prior in np.arange(-3.0, 1.1, 0.5))
+
+
 def print_drawn(base: dict[str, Any], quick: bool) -> None:
     """Print log losses on readings drawn from the forward model, with the default's and with the true parameters."""
     print('\nReadings drawn from the forward model on the true map: log loss, nats a cell')
-    print(f'{"drawn with":38s}{"world":16s}{"constant":>9s}{"standard":>9s}{"default":>9s}{"told":>8s}{"mapped":>8s}')
+    print(f'{"drawn with":38s}{"world":16s}{"constant":>9s}{"standard":>9s}{"default":>9s}', end='')
+    print(f'{"told":>8s}{"mapped":>8s}{"rest":>7s}')
     for title, model in DRAWN.items():
         for case in drawn_cases(model, quick):
             losses = []
@@ -216,10 +234,12 @@ def print_drawn(base: dict[str, Any], quick: bool) -> None:
                     mapped = belief(np.where(on_truth(maps.ml, maps.grid, case, None) >= 0, uncertainty, np.nan), case)
             standard = least_loss([Standard(case, None)], [known_cells(uncertainty, case)])
             print(f'{title:38s}{case.group:16s}{said.base:9.3f}{standard:9.3f}{losses[0]:9.3f}', end='')
-            print(f'{losses[1]:8.3f}{mapped.loss:8.3f}')
+            rest = with_true_rest(case, {**base, **model}, known_cells(uncertainty, case))
+            print(f'{losses[1]:8.3f}{mapped.loss:8.3f}{rest:7.3f}')
     print('constant: the share of occupied cells everywhere; standard: the standard map at its best gains and scale;')
     print('told: the default but with the parameters of the sensor model that the readings were drawn with;')
-    print('mapped: the default, over cells that its ML map knows as free or occupied')
+    print('mapped: the default, over cells that its ML map knows as free or occupied; rest: eq 43 with these parameters,')
+    print('the best prior, and every cell but the one asked for taken from the true map')
 
 
 def print_cost(base: dict[str, Any], paper: dict[str, Any], runs: int) -> None:

@@ -179,7 +179,7 @@ class SearchParameters:
         0.0,
         10.0,
     )
-    end_cost: float = _param(1.4, 'What the end of a wall costs, or a corner; 0 is the paper.', 'nats', 0.0, 100.0)
+    end_cost: float = _param(1.2, 'What the end of a wall costs, or a corner; 0 is the paper.', 'nats', 0.0, 100.0)
     isolated_cost: float = _param(
         2.0, 'What an occupied cell without occupied neighbour costs; 0 is the paper.', 'nats', 0.0, 100.0
     )
@@ -190,7 +190,7 @@ class SearchParameters:
         6, 'Cells by which walls are drawn out at their ends where no reading speaks against it.', 'cells', 0, 20
     )
     least_passed: float = _param(
-        1.0,
+        0.85,
         'Readings that are expected to have passed through a cell for it to be known as free; 0 takes all cells seen.',
         'readings',
         0.0,
