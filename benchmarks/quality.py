@@ -238,8 +238,8 @@ def print_drawn(base: dict[str, Any], quick: bool) -> None:
             print(f'{losses[1]:8.3f}{mapped.loss:8.3f}{rest:7.3f}')
     print('constant: the share of occupied cells everywhere; standard: the standard map at its best gains and scale;')
     print('told: the default but with the parameters of the sensor model that the readings were drawn with;')
-    print('mapped: the default, over cells that its ML map knows as free or occupied; rest: eq 43 with these parameters,')
-    print('the best prior, and every cell but the one asked for taken from the true map')
+    print('mapped: the default, over cells that its ML map knows as free or occupied; rest: eq 43 with these')
+    print('parameters, the best prior, and every cell but the one asked for taken from the true map')
 
 
 def print_cost(base: dict[str, Any], paper: dict[str, Any], runs: int) -> None:
