@@ -67,6 +67,11 @@ def normal(z: float, mean: float, sigma: float, cut: float) -> float:
     return math.exp(-0.5 * error * error) / (math.sqrt(2 * math.pi) * sigma) if abs(error) <= cut else 0.0
 
 
+def lost(z: float, z_max: float, sigma: float, model: ModelParameters) -> float:
+    """Density of a lost echo, which is no echo and so of the largest range."""
+    return model.p_lost * normal(z, z_max, sigma, model.cut) if z >= z_max else 0.0
+
+
 def causes(z: float, z_max: float, sigma: float, distances: list[float], model: ModelParameters) -> list[float]:
     """Density of the reading together with each cause: chance, lost echo, no obstacle, first obstacle, second, …
 
@@ -75,7 +80,7 @@ def causes(z: float, z_max: float, sigma: float, distances: list[float], model: 
     """
     distances = sorted(distances)
     share = 1 - model.p_rand - model.p_lost
-    out = [model.p_rand / z_max, model.p_lost * normal(z, z_max, sigma, model.cut)] + [0.0] * (len(distances) + 1)
+    out = [model.p_rand / z_max, lost(z, z_max, sigma, model)] + [0.0] * (len(distances) + 1)
     for pattern in itertools.product((True, False), repeat=len(distances)):
         p = share * math.prod(model.p_hit if answers else 1 - model.p_hit for answers in pattern)
         if any(pattern):
@@ -98,7 +103,7 @@ def obstacles(readings: Readings, t: int, grid: Grid, occupied: np.ndarray, mode
 def likelihood(z: float, z_max: float, sigma: float, distances: list[float], model: ModelParameters) -> float:
     """The density of a reading as the sum over its causes, from near to far."""
     share = 1 - model.p_rand - model.p_lost
-    total = model.p_rand / z_max + model.p_lost * normal(z, z_max, sigma, model.cut)
+    total = model.p_rand / z_max + lost(z, z_max, sigma, model)
     for d in sorted(distances):
         total += share * model.p_hit * normal(z, d, sigma, model.cut)
         share *= 1 - model.p_hit
@@ -252,7 +257,8 @@ def log_likelihoods(readings: Readings, grid: Grid, maps: np.ndarray, model: Mod
     for t in range(len(readings)):
         z, z_max, sigma = readings.z[t], readings.z_max[t], sigma_of(readings, t, grid, model)
         no_echo = normal(z, z_max, sigma, model.cut)
-        likelihood, left = np.full(len(maps), model.p_rand / z_max + model.p_lost * no_echo), np.full(len(maps), share)
+        unmapped = model.p_rand / z_max + lost(z, z_max, sigma, model)
+        likelihood, left = np.full(len(maps), unmapped), np.full(len(maps), share)
         for c, d in sorted(cells_of(readings, t, grid, model).items(), key=lambda pair: pair[1]):
             answers = model.p_hit * maps[:, c]
             likelihood += left * answers * normal(z, d, sigma, model.cut)
@@ -308,7 +314,7 @@ def passed(
         for c, d in away.items():
             before = sum(term for at, term in terms if at <= d)
             p = (whole - before) / total
-            if d <= free_end and no_echo == 0.0:
+            if d <= free_end and z < z_max:
                 # by chance it came through what lies in the free zone before the cell, if all of that let it
                 blocking = [at for at, _ in met if at <= free_end]
                 behind = bool(blocking) and d > min(blocking)

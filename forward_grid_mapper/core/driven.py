@@ -1,4 +1,7 @@
-"""Cells that a robot drove over: where its sensors were, and between, nothing stands."""
+"""Cells that a robot drove over: where its sensors were, and between, nothing stands.
+
+Lines between sensors across the robot fill its middle, also before it has moved.
+"""
 
 from __future__ import annotations
 
@@ -20,26 +23,36 @@ LONGEST_STEP = 0.8
 """Metres between the sensors of two readings: sensors of one robot are no farther apart, nor does it drive farther."""
 
 
+STRIDES = (0, 1, 2, 4, 8, 16)
+"""How many readings later the sensor is to which a line is drawn: itself, the next one, and others across the robot."""
+
+
 @kernel
-def _mark(x: Any, y: Any, joined: Any, out: Any) -> None:
-    """Set the cells of each point (in cells), and those on the segment from it to the next where they are joined."""
+def _mark(x: Any, y: Any, stamp: Any, longest: float, out: Any) -> None:
+    """Set the cells of each point, and those on the lines from it to the points `STRIDES` later that are near enough.
+
+    `x`, `y` and `longest` are in cells, `stamp` is in order.
+    """
     height, width = out.shape
     for i in range(len(x)):
-        steps = 1
-        if joined[i]:
-            steps = 2 + int(4.0 * math.hypot(x[i + 1] - x[i], y[i + 1] - y[i]))
-        for k in range(steps):
-            u, v = x[i], y[i]
-            if k:
-                u += (x[i + 1] - x[i]) * k / (steps - 1)
-                v += (y[i + 1] - y[i]) * k / (steps - 1)
-            column, row = int(math.floor(u)), int(math.floor(v))
-            if 0 <= row < height and 0 <= column < width:
-                out[row, column] = 1
+        for stride in STRIDES:
+            j = i + stride
+            if j >= len(x):
+                break
+            length = math.hypot(x[j] - x[i], y[j] - y[i])
+            if stamp[j] - stamp[i] > LONGEST_PAUSE or length > longest:
+                continue
+            steps = 1 + int(4.0 * length)
+            for k in range(steps + 1):
+                u = x[i] + (x[j] - x[i]) * k / steps
+                v = y[i] + (y[j] - y[i]) * k / steps
+                column, row = int(math.floor(u)), int(math.floor(v))
+                if 0 <= row < height and 0 <= column < width:
+                    out[row, column] = 1
 
 
 def mark_driven(x: Floats, y: Floats, stamp: NDArray[np.int64], grid: Grid, driven: NDArray[np.bool_]) -> None:
-    """Set in `driven` the cells where sensors were, and those between where they were one after the other.
+    """Set in `driven` the cells where sensors were, and those between where they were at about the same time.
 
     Parameters
     ----------
@@ -51,14 +64,12 @@ def mark_driven(x: Floats, y: Floats, stamp: NDArray[np.int64], grid: Grid, driv
     driven : bool, shape `grid.shape`
     """
     order = np.argsort(stamp, kind='stable')
-    x, y, stamp = x[order], y[order], stamp[order]
-    joined = np.zeros(len(order), np.bool_)
-    joined[:-1] = (np.diff(stamp) <= LONGEST_PAUSE) & (np.hypot(np.diff(x), np.diff(y)) <= LONGEST_STEP)
-    _mark(x / grid.resolution - grid.column, y / grid.resolution - grid.row, joined, driven.view(np.uint8))
+    u, v = x[order] / grid.resolution - grid.column, y[order] / grid.resolution - grid.row
+    _mark(u, v, stamp[order], LONGEST_STEP / grid.resolution, driven.view(np.uint8))
 
 
 def driven_cells(readings: Readings, grid: Grid) -> NDArray[np.bool_]:
-    """Return which cells lie where sensors were, or between where they were one after the other, shape `grid.shape`."""
+    """Return which cells lie where sensors were, or between where they were about then, shape `grid.shape`."""
     out = np.zeros(grid.shape, np.bool_)
     mark_driven(readings.x, readings.y, readings.stamp, grid, out)
     return out

@@ -89,7 +89,7 @@ def share_table(readings: Readings, sigma: Floats, model: ModelParameters) -> ND
     shares = np.zeros(len(readings), SHARE)
     error = (readings.z_max - readings.z) / sigma
     density = np.where(error <= model.cut, np.exp(-0.5 * error**2) / (math.sqrt(2 * math.pi) * sigma), 0.0)
-    shares['floor'] = model.p_rand / readings.z_max + model.p_lost * density
+    shares['floor'] = model.p_rand / readings.z_max + np.where(readings.echo, 0.0, model.p_lost * density)
     shares['no_echo'] = density
     shares['weight'] = 1
     return shares
@@ -108,6 +108,7 @@ class Evidence:
     Attributes
     ----------
     grid : Grid
+    model : ModelParameters
     state : State
         What the kernels work on; arrays that grow are replaced, so it must not be kept.
     """
@@ -135,7 +136,7 @@ class Evidence:
         stop : uint8, shape (1,), optional
             Set to 1 from any thread to cancel.
         """
-        self.grid, self._model, self._threads = grid, model, threads
+        self.grid, self.model, self._threads = grid, model, threads
         self._words = int(min(memory / WORD, 2.0**60))
         self._totals = np.zeros(5, np.int64)
         self._size = 0
@@ -181,10 +182,19 @@ class Evidence:
         shares = self.state.shares[: self._size]
         return float((shares['likelihood'].astype(np.int64) * shares['weight']).sum() * QUANTUM)
 
+    def of_occupancy(self) -> Floats:
+        """Return log p(Z | cell occupied, rest of the map) − log p(Z | cell free, rest of the map) in nats.
+
+        Shape (cells,); 0 where no reading sees the cell.
+        """
+        maps = self.state.maps
+        out: Floats = np.where(maps.occupied == 1, -QUANTUM, QUANTUM) * maps.evidence
+        return out
+
     @property
     def z_max(self) -> Floats:
         """The largest range of every reading in metres, shape (N,)."""
-        far = self.state.cones['z_max'][: self._size] - offset_of(self._model)
+        far = self.state.cones['z_max'][: self._size] - offset_of(self.model)
         out: Floats = far * self.grid.resolution
         return out
 
@@ -208,8 +218,8 @@ class Evidence:
             If `stop` was set.
         """
         begin, end = self._size, self._size + len(readings)
-        cones = cone_table(readings, self.grid, self._model)
-        shares = share_table(readings, cones['sigma'] * self.grid.resolution, self._model)
+        cones = cone_table(readings, self.grid, self.model)
+        shares = share_table(readings, cones['sigma'] * self.grid.resolution, self.model)
         self._reserve(end)
         s = self.state
         s.cones[begin:end], s.shares[begin:end] = cones, shares
@@ -277,7 +287,7 @@ class Evidence:
 
     def _take_in(self, begin: int, end: int) -> None:
         """Index readings whose cones are in place, and add what they say to the evidence."""
-        if not begin and self._model.grazing_angle < STRAIGHT:
+        if not begin and self.model.grazing_angle < STRAIGHT:
             self._face(end)
         done = begin
         while done < end:
@@ -299,7 +309,7 @@ class Evidence:
             gather(s.cones, self.grid.shape, s.lattice.nearest, (first, last), sums[-1], s.stop)
 
         self.each(0, end, work)
-        facing = facing_of(np.sum(sums, axis=0), self.grid.shape, self._model.grazing_angle)
+        facing = facing_of(np.sum(sums, axis=0), self.grid.shape, self.model.grazing_angle)
         self.state = self.state._replace(facing=facing)
 
     def _reserve(self, size: int) -> None:

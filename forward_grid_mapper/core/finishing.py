@@ -6,15 +6,14 @@ at distance d, with A the share of T from occupied cells up to d,
 
     p(passed) = (T − A) / (c + T)
 
-and in the free zone T / (c + T), plus chance (e_*) for a reading with an echo too short to be the largest range:
-something that the map lacks may have been there. Chance counts (1 − p_hit) for each obstacle that it had to get by in
-the free zone. A reading counts by the strength of its beam at the cell, since what stands at the edge of a cone is
-easily missed. A cell through which less than about one reading passed is not known to be free.
+and in the free zone T / (c + T), plus that of chance for an echo: something that the map lacks may have been there.
+Chance counts (1 − p_hit) for each obstacle that it had to get by in the free zone. Here c holds p_lost · N(z; z_max, σ)
+of every reading, so that an echo from nearly z_max frees little more than no echo. A reading counts by the strength of
+its beam at the cell, since what stands at the edge of a cone is easily missed. A cell through which less than about
+one reading passed is not known to be free.
 
 Where a straight wall ends in the open, the cells ahead have nothing against them and are not known to be free, it goes
 on for a few cells: a wall is more likely to leave the view than to end there.
-
-Obstacles that touch no free space are unknown: nothing was seen in front of them. Mirror images beyond walls are such.
 """
 
 from __future__ import annotations
@@ -37,9 +36,6 @@ STRAIGHT_RUN = 4
 
 MOST_AGAINST = 0.05
 """Nats that may speak against a cell by which a wall goes on."""
-
-TOUCHING = 2
-"""Rows and columns, at most, from an obstacle to free space that it touches."""
 
 MOST_OBSTACLES = 4096
 """Occupied cells in one band that are told apart."""
@@ -90,10 +86,11 @@ def _obstacles(s: State, t: int, occupied: Any, squares: Any, left: Any) -> tupl
 
 
 @kernel
-def count_passed(s: State, begin: int, end: int, random: Floats, occupied: Any, passed: Any) -> None:
+def count_passed(s: State, begin: int, end: int, random: Floats, lost: Floats, occupied: Any, passed: Any) -> None:
     """Add to `passed` (int64, in units of UNIT) how likely the readings `begin` to `end` passed each of their cells.
 
-    This looks at whole cones, what they graze included. `random` are the densities p_rand / z_max in 1/m.
+    This looks at whole cones, what they graze included. `random` and `lost` are the densities p_rand / z_max and
+    p_lost · N(z; z_max, σ) of all readings in 1/m.
     """
     squares, left = np.empty(MOST_OBSTACLES), np.empty(MOST_OBSTACLES + 1)
     for t in range(begin, end):
@@ -101,8 +98,8 @@ def count_passed(s: State, begin: int, end: int, random: Floats, occupied: Any, 
             break
         reading, share = s.cones[t], s.shares[t]
         n, blocking, near = _obstacles(s, t, occupied, squares, left)
-        scale = share.weight / ((share.floor + left[0]) * UNIT)
-        chance = random[t] * scale if share.no_echo == 0.0 else 0.0
+        scale = share.weight / ((random[t] + lost[t] + left[0]) * UNIT)
+        chance = random[t] * scale if reading.z < reading.z_max else 0.0
         in_front = left[0] * scale + chance
         hidden = left[0] * scale + chance * (1.0 - s.model.p_hit) ** blocking
         cone = cone_of(reading, s.lattice.nearest)
@@ -126,14 +123,17 @@ def count_passed(s: State, begin: int, end: int, random: Floats, occupied: Any, 
                         line[column] += int(weight * left[k] * scale)
 
 
-def passed_readings(evidence: Evidence, p_rand: float, occupied: NDArray[np.uint8]) -> Floats:
+def passed_readings(evidence: Evidence, occupied: NDArray[np.uint8]) -> Floats:
     """Return how many readings are expected to have passed each cell of a map, shape (cells,)."""
-    random = p_rand / evidence.z_max
+    model = evidence.model
+    random = model.p_rand / evidence.z_max
+    # of an echo from almost as far as z_max too, so that it frees little more than a reading without any
+    lost = model.p_lost * evidence.state.shares['no_echo'][: len(evidence)]
     sums: list[NDArray[np.int64]] = []
 
     def work(s: State, begin: int, end: int) -> None:
         sums.append(np.zeros(evidence.grid.size, np.int64))
-        count_passed(s, begin, end, random, occupied, sums[-1])
+        count_passed(s, begin, end, random, lost, occupied, sums[-1])
 
     evidence.each(0, len(evidence), work)
     total: Floats = np.sum(sums, axis=0) * UNIT
@@ -179,31 +179,6 @@ def extend(s: State, steps: int, barred: Any, out: Any) -> None:
                     out[o] = 1
 
 
-@kernel
-def keep_touching(cells: Any, near: Any) -> None:
-    """Clear in `cells` (uint8, shape (height, width)) each connected group that has no cell in `near` (the same)."""
-    height, width = cells.shape
-    reached = np.zeros((height, width), np.uint8)
-    front = np.empty((height * width, 2), np.int32)
-    n = 0
-    for row in range(height):
-        for column in range(width):
-            if cells[row, column] and near[row, column]:
-                reached[row, column] = 1
-                front[n, 0], front[n, 1] = row, column
-                n += 1
-    while n:
-        n -= 1
-        row, column = front[n]
-        for y in range(max(row - 1, 0), min(row + 2, height)):
-            for x in range(max(column - 1, 0), min(column + 2, width)):
-                if cells[y, x] and not reached[y, x]:
-                    reached[y, x] = 1
-                    front[n, 0], front[n, 1] = y, x
-                    n += 1
-    cells[:] = reached
-
-
 def _grown(cells: NDArray[np.bool_]) -> NDArray[np.bool_]:
     wide = np.pad(cells, 1)
     rows = wide[:-2] | wide[1:-1] | wide[2:]
@@ -211,9 +186,7 @@ def _grown(cells: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return out
 
 
-def finish(
-    evidence: Evidence, steps: int, least_passed: float, p_rand: float, driven: NDArray[np.bool_]
-) -> NDArray[np.int8]:
+def finish(evidence: Evidence, steps: int, least_passed: float, driven: NDArray[np.bool_]) -> NDArray[np.int8]:
     """Return the ML map that is handed out, shape `grid.shape`: 1 occupied, 0 free, -1 not observed.
 
     Parameters
@@ -223,16 +196,14 @@ def finish(
     steps : int
         Cells by which to draw walls out.
     least_passed : float
-        Readings that must have passed a cell, or one beside it, for it to be free; 0 takes all cells that were seen,
-        and all obstacles.
-    p_rand : float
+        Readings that must have passed a cell, or one beside it, for it to be free; 0 takes all cells that were seen.
     driven : bool, shape `grid.shape`
         Cells that are known to be free.
     """
     ml = evidence.observed()
     known = driven & (ml == 0)
     if least_passed > 0:
-        passed = passed_readings(evidence, p_rand, evidence.state.maps.occupied).reshape(ml.shape)
+        passed = passed_readings(evidence, evidence.state.maps.occupied).reshape(ml.shape)
         known |= (passed >= least_passed) & (ml == 0)
     if steps:
         ahead = np.zeros(ml.shape, np.uint8)
@@ -240,10 +211,4 @@ def finish(
         ml[ahead == 1] = 1
     if least_passed > 0:
         ml[(ml == 0) & ~_grown(known)] = -1
-        near = ml == 0
-        for _ in range(TOUCHING):
-            near = _grown(near)
-        touching = (ml == 1).astype(np.uint8)
-        keep_touching(touching, near.astype(np.uint8))
-        ml[(ml == 1) & (touching == 0)] = -1
     return ml

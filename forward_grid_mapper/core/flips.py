@@ -59,7 +59,8 @@ SHARE = np.dtype(
 """What is kept for a reading beside its cone.
 
 floor, no_echo
-    The densities p_rand / z_max + p_lost · N(z; z_max, σ) and N(z; z_max, σ) in 1/m, which no map changes.
+    The densities p_rand / z_max, with p_lost · N(z; z_max, σ) where there is no echo, and N(z; z_max, σ) in 1/m, which
+    no map changes.
 blocking, through
     Occupied cells in the free zone, and the share of the reading that they leave to the band,
     (1 − p_rand − p_lost) (1 − p_hit)^blocking.

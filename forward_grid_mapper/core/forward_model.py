@@ -1,7 +1,7 @@
 """The forward sensor model: how likely a reading is, given a whole map, and which cause explains it.
 
     p(z | m) =  p_rand / z_max                                                        chance (*)
-             +  p_lost · N(z; z_max, σ)                                               a lost echo
+             +  p_lost · N(z; z_max, σ) if there is no echo, z ≥ z_max                a lost echo
              +  (1 − p_rand − p_lost) · Σ_k (1 − p_hit)^(k−1) p_hit N(z; d_k, σ)      the k-th obstacle, k = 1 … K
              +  (1 − p_rand − p_lost) · (1 − p_hit)^K N(z; z_max, σ)                  nothing hit, max range (0)
 
@@ -36,7 +36,7 @@ class Causes(NamedTuple):
     p_hit, share : float
         Share is 1 − p_rand − p_lost.
     random, lost : float64, shape (N,)
-        The densities p_rand / z_max and p_lost · N(z; z_max, σ) in 1/m.
+        The densities p_rand / z_max and, where there is no echo, p_lost · N(z; z_max, σ) in 1/m.
     no_echo : float64, shape (N,)
         N(z; z_max, σ) in 1/m.
     """
@@ -71,7 +71,8 @@ def causes_of(readings: Readings, sigma: Floats, model: ModelParameters) -> Caus
     share = 1.0 - model.p_rand - model.p_lost
     error = (readings.z_max - readings.z) / sigma
     density = np.where(error <= model.cut, np.exp(-0.5 * error**2) / (math.sqrt(2 * math.pi) * sigma), 0.0)
-    return Causes(model.p_hit, share, model.p_rand / readings.z_max, model.p_lost * density, density)
+    lost = np.where(readings.echo, 0.0, model.p_lost * density)
+    return Causes(model.p_hit, share, model.p_rand / readings.z_max, lost, density)
 
 
 @kernel

@@ -20,6 +20,7 @@ from .learning import learn
 from .live_map import LiveMap, arc_depth
 from .maps import MapSet, part_of
 from .parameters import Parameters, SearchParameters
+from .prior import odds_given_neighbours
 from .readings import Readings
 from .search import Progress, Search, SearchResult
 from .threads import cores
@@ -127,13 +128,14 @@ class Mapper:
     ) -> MapSet:
         search, grid = parameters.search, evidence.grid
         driven = self._driven(readings, grid, search)
-        ml = finish(evidence, search.extend, search.least_passed, parameters.model.p_rand, driven)
+        ml = finish(evidence, search.extend, search.least_passed, driven)
+        neighbours = odds_given_neighbours(result.prior, ml == 1, evidence.state.maps.seen)
         unexplained = parameters.model.p_rand / readings.z_max > 0.5 * evidence.likelihoods
         return MapSet(
             grid=grid,
             live=live_map,
             ml=ml,
-            uncertainty=uncertainty_map(result.evidence, result.neighbours, ml, search),
+            uncertainty=uncertainty_map(result.evidence, neighbours, ml, search),
             readings=readings,
             unexplained=unexplained,
             transient=transient_echoes(readings, unexplained, grid, ml, parameters.model),

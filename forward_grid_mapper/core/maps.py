@@ -42,7 +42,7 @@ class MapSet:
     ml : int8
         Maximum likelihood map: 0 free, 1 occupied, -1 not observed.
     uncertainty : float32
-        The α-mixed marginals of eq 45, NaN where no reading's cone is; it also tells of cells that `ml` calls unknown.
+        The α-mixed marginals of eq 45; NaN where `ml` is unknown and the readings say next to nothing.
     readings : Readings
         The readings that the maps explain.
     unexplained : bool, shape (N,)

@@ -18,17 +18,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .cones import effective_sigma, grid_of
-from .driven import mark_driven
+from .driven import STRIDES, mark_driven
 from .evidence import Evidence
 from .finishing import finish
 from .footprint import memory_for_pairs
 from .grid import Grid
 from .live_map import arc_depth
-from .logs import QUANTUM
 from .maps import part_of
 from .moves import flip_in_order, promising
 from .parameters import Parameters
-from .prior import Prior, local_prior, prior_gains, shapes
+from .prior import Prior, local_prior, odds_given_neighbours, shapes
 from .readings import Readings
 from .search import LEAST, Search, Window
 from .threads import cores
@@ -130,7 +129,8 @@ class OnlineMap:
         rows, columns = rows.clip(0, grid.height - 1), columns.clip(0, grid.width - 1)
         near = (slice(rows.min(), rows.max() + 1), slice(columns.min(), columns.max() + 1))
         self._prior.local.reshape(grid.shape)[near] = local_prior(self._parameters.search, self._driven[near])
-        self._last = x[-1:], y[-1:], stamp[-1:]
+        n = STRIDES[-1]
+        self._last = x[-n:], y[-n:], stamp[-n:]
 
     def _sort_out(self, readings: Readings) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Return which readings are new, and for the others which kept reading says the same."""
@@ -210,14 +210,12 @@ class OnlineMap:
             flip_in_order(evidence.state, prior, LEAST, cells[order], gains[order])
 
     def maps(self) -> tuple[Grid, NDArray[np.int8], NDArray[np.float32]]:
-        """Return the grid, the ML map (1 occupied, 0 free, -1 not observed) and the uncertainty map (NaN likewise)."""
+        """Return the grid, the ML map (1 occupied, 0 free, -1 not observed) and the uncertainty map, as in `MapSet`."""
         if self._evidence is None:
             return self.grid, np.zeros((0, 0), np.int8), np.zeros((0, 0), np.float32)
         evidence, search = self._evidence, self._parameters.search
         window = evidence.grid.window(self.grid)
-        ml = finish(evidence, search.extend, search.least_passed, self._parameters.model.p_rand, self._driven)
-        maps = evidence.state.maps
-        gains = prior_gains(self._prior, maps.occupied, maps.pattern, maps.seen, evidence.grid.width)
-        sign = np.where(maps.occupied == 1, -1.0, 1.0)
-        uncertainty = uncertainty_map(np.asarray(sign * maps.evidence * QUANTUM), sign * gains, ml, search)
+        ml = finish(evidence, search.extend, search.least_passed, self._driven)
+        neighbours = odds_given_neighbours(self._prior, ml == 1, evidence.state.maps.seen)
+        uncertainty = uncertainty_map(evidence.of_occupancy(), neighbours, ml, search)
         return self.grid, ml[window], uncertainty[window]

@@ -122,6 +122,22 @@ def patterns(occupied: NDArray[np.uint8], shape: tuple[int, int]) -> NDArray[np.
     return out.ravel()
 
 
+def odds_given_neighbours(prior: Prior, occupied: NDArray[np.bool_], seen: NDArray[np.int32]) -> Floats:
+    """Return the log prior odds of each cell given the rest of a map, in nats, 0 where unseen, shape (cells,).
+
+    Parameters
+    ----------
+    prior : Prior
+    occupied : bool, shape (height, width)
+    seen : int32, shape (cells,)
+        Number of readings that see each cell.
+    """
+    filled = occupied.ravel().astype(np.uint8)
+    gains = prior_gains(prior, filled, patterns(filled, occupied.shape), seen, occupied.shape[1])
+    out: Floats = np.where(occupied.ravel(), -gains, gains)
+    return out
+
+
 def log_prior(prior: Prior, occupied: NDArray[np.uint8], pattern: NDArray[np.uint8]) -> float:
     """Return the log prior of a map, up to a constant."""
     cells = np.flatnonzero(occupied)

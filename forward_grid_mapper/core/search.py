@@ -26,7 +26,6 @@ from .bridges import build_bridges
 from .cones import Floats, check
 from .evidence import Evidence
 from .flips import State
-from .logs import QUANTUM
 from .moves import (
     best_shifts,
     flip_in_order,
@@ -39,7 +38,7 @@ from .moves import (
     unsettle,
 )
 from .parameters import SearchParameters
-from .prior import Prior, local_prior, log_prior, prior_gains, shapes
+from .prior import Prior, local_prior, log_prior, shapes
 
 LEAST_GAIN = 1e-4
 """Nats that a flip must gain."""
@@ -78,8 +77,8 @@ class SearchResult:
         1 occupied, 0 free; cells that no reading touches are 0.
     evidence : float64, shape (cells,)
         log p(Z | cell occupied, rest of the map) − log p(Z | cell free, rest of the map) in nats, 0 where untouched.
-    neighbours : float64, shape (cells,)
-        The prior log odds of each cell, given the rest of the map, in nats, 0 where untouched.
+    prior : Prior
+        That which the map was found with.
     log_prior : float
         That of the map, up to a constant.
     progress : Progress
@@ -89,7 +88,7 @@ class SearchResult:
 
     occupied: NDArray[np.uint8]
     evidence: Floats
-    neighbours: Floats
+    prior: Prior
     log_prior: float
     progress: Progress
     converged: bool
@@ -163,13 +162,11 @@ class Search:
             self._prior = self._whole
             self._settled[:] = 0
             converged = self._climb(watch)
-        maps, width = self.evidence.state.maps, self.evidence.grid.width
-        sign = np.where(maps.occupied == 1, -1.0, 1.0)
-        gains = prior_gains(self._prior, maps.occupied, maps.pattern, maps.seen, width)
+        maps = self.evidence.state.maps
         return SearchResult(
             maps.occupied,
-            np.asarray(sign * maps.evidence * QUANTUM),
-            np.asarray(sign * gains),
+            self.evidence.of_occupancy(),
+            self._prior,
             log_prior(self._prior, maps.occupied, maps.pattern),
             self.progress,
             converged,

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from forward_grid_mapper.core.driven import LONGEST_PAUSE, LONGEST_STEP, driven_cells, mark_driven
+from forward_grid_mapper.core.driven import LONGEST_PAUSE, LONGEST_STEP, STRIDES, driven_cells, mark_driven
 from forward_grid_mapper.core.grid import Grid
 from forward_grid_mapper.core.readings import Readings
 
@@ -41,21 +41,29 @@ def test_the_cells_are_those_of_the_points_and_of_the_way_between(seed: int, cou
     expected = cells(*zip(x, y, strict=True))
     assert expected <= found
     near = set(expected)
-    for i in range(count - 1):
-        step = math.hypot(x[i + 1] - x[i], y[i + 1] - y[i])
-        if stamp[i + 1] - stamp[i] <= LONGEST_PAUSE and step <= LONGEST_STEP:
-            way = [(x[i] + f * (x[i + 1] - x[i]), y[i] + f * (y[i + 1] - y[i])) for f in np.linspace(0, 1, 400)]
+    for i, j in ((i, i + stride) for i in range(count) for stride in STRIDES if i + stride < count):
+        step = math.hypot(x[j] - x[i], y[j] - y[i])
+        if stamp[j] - stamp[i] <= LONGEST_PAUSE and step <= LONGEST_STEP:
+            way = [(x[i] + f * (x[j] - x[i]), y[i] + f * (y[j] - y[i])) for f in np.linspace(0, 1, 400)]
             near |= cells(*way)
             # no more than a quarter of a cell lies between the points that are set
             coarse = int(step / 0.1 * 4.0) + 2
             expected |= cells(
-                *(
-                    (x[i] + f * (x[i + 1] - x[i]), y[i] + f * (y[i + 1] - y[i]))
-                    for f in np.arange(coarse) / (coarse - 1)
-                )
+                *((x[i] + f * (x[j] - x[i]), y[i] + f * (y[j] - y[i])) for f in np.arange(coarse) / (coarse - 1))
             )
     assert found <= near | expected
     assert len(found ^ expected) <= 2, 'but for rounding'
+
+
+@pytest.mark.parametrize('count', [8, 12, 16, 24])
+def test_the_middle_of_a_ring_of_sonars_is_driven_over_before_it_moves(count: int) -> None:
+    yaw = np.arange(2 * count) * 2 * math.pi / count
+    x, y = 0.52 + 0.25 * np.cos(yaw), 1.97 + 0.25 * np.sin(yaw)
+    found = told(x, y, np.arange(2 * count) * 10 * MS)
+    inside = cells(*((0.52 + u, 1.97 + v) for u in (-0.1, 0.0, 0.1) for v in (-0.1, 0.0, 0.1)))
+    # what is free reaches a cell beyond what was driven over
+    beside = {(row + v, column + u) for row, column in found for u in (-1, 0, 1) for v in (-1, 0, 1)}
+    assert inside <= beside
 
 
 @pytest.mark.parametrize(

@@ -10,6 +10,7 @@ import pytest
 
 import naive
 from conftest import PLAIN, PLAIN_MODEL, random_readings
+from forward_grid_mapper.core.driven import driven_cells
 from forward_grid_mapper.core.errors import Cancelled, InputError
 from forward_grid_mapper.core.forward_model import expectations, log_likelihood
 from forward_grid_mapper.core.grid import Grid
@@ -106,15 +107,14 @@ def test_with_all_that_makes_maps_better_they_still_know_the_same_grid(values: d
     assert ((plain.ml != -1) & ~said).any()
 
 
-@pytest.mark.parametrize('driven_cost', [0.0, 2.0])
+@pytest.mark.parametrize('driven_cost', [0.0, 20.0])
 def test_the_objective_is_the_likelihood_and_the_prior_of_the_map_that_was_found(driven_cost: float) -> None:
     # as it is before walls are drawn out and free told from unknown; the likelihood is that of whole cones
     whole = {**PLAIN_MODEL, 'extend': 0, 'least_passed': 0.0, 'driven_cost': driven_cost}
     maps = run(some(), **whole)
     likelihood = log_likelihood(maps.readings, maps.grid, maps.ml, maps.parameters.model)
     assert maps.log_likelihood == pytest.approx(likelihood, abs=ROUNDING * len(maps.readings))
-    driven = np.zeros(maps.grid.shape, bool)
-    driven[maps.grid.cells_of(maps.readings.x, maps.readings.y)] = True
+    driven = driven_cells(maps.readings, maps.grid)
     search = maps.parameters.search
     prior = Prior(local_prior(search, driven & (driven_cost > 0)).ravel(), shapes(search))
     told = naive.log_prior(prior, maps.ml == 1, maps.grid.shape)

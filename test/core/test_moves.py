@@ -61,7 +61,7 @@ def random_case(
 
 
 def model_of(evidence: Evidence) -> ModelParameters:
-    return evidence._model
+    return evidence.model
 
 
 def prior_of(name: str) -> Prior:

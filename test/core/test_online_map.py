@@ -110,7 +110,7 @@ def test_readings_that_say_the_same_add_weight_and_nothing_else(values: dict[str
     weight = evidence.state.shares['weight'][:count]
     assert weight.sum() == 4 * len(readings)
     # as if each kept reading had come so many times
-    often = Evidence(evidence.grid, evidence._model, start=evidence.state.maps.occupied.reshape(evidence.grid.shape))
+    often = Evidence(evidence.grid, evidence.model, start=evidence.state.maps.occupied.reshape(evidence.grid.shape))
     kept = np.array(sorted(set(online._kept.values())))
     assert kept.tolist() == list(range(count))
     first: dict[int, int] = {}

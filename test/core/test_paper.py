@@ -353,7 +353,7 @@ def test_the_mixed_marginal_is_that_of_eq_42_to_45_with_the_prior_counted_once()
     result = search(readings, prior=0.3).run()
     occupied = result.occupied.reshape(LINE.shape)
     alpha, prior = 0.6, 0.2
-    q = marginals(result.evidence, result.neighbours, plain_search(alpha=alpha, uncertainty_prior=prior))
+    q = marginals(result.evidence, np.zeros(LINE.size), plain_search(alpha=alpha, uncertainty_prior=prior))
     for c in range(LINE.size):
         both = [occupied.copy(), occupied.copy()]
         both[0][0, c], both[1][0, c] = 0, 1

@@ -88,7 +88,6 @@ def test_neither_threads_nor_memory_change_a_bit_of_the_search(
         assert (less.unstored > 0) == (memory < np.inf)
         assert np.array_equal(other.occupied, first.occupied)
         assert np.array_equal(other.evidence, first.evidence)
-        assert np.array_equal(other.neighbours, first.neighbours)
         assert other.log_prior == first.log_prior
         assert other.progress == first.progress
         assert less.log_likelihood == evidence.log_likelihood
