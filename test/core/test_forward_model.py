@@ -90,6 +90,14 @@ def test_p_lost_of_zero_is_the_papers_model() -> None:
     assert (expectations(readings, GRID, occupied, ModelParameters(p_lost=0.0)).lost == 0).all()
 
 
+def test_a_lost_echo_is_a_cause_of_readings_without_echo_alone() -> None:
+    readings = random_readings(np.random.default_rng(7), GRID, 40)
+    readings.z[:10] = readings.z_max[:10] - 0.01
+    readings.z[10:20] = readings.z_max[10:20]
+    lost = expectations(readings, GRID, np.zeros(GRID.shape, np.int8), ModelParameters()).lost
+    assert np.array_equal(lost > 0, ~readings.echo)
+
+
 def sample(rng: np.random.Generator, readings, grid, occupied, model):
     """Draw the ranges of `readings` from the model itself."""
     z = []

@@ -450,6 +450,17 @@ def test_echoes_that_may_be_lost_do_not_wipe_out_a_smooth_wall() -> None:
     assert found(readings, model=ours) == [5]
 
 
+def test_walls_near_the_largest_range_are_no_lost_echoes() -> None:
+    # a robot passes a wall 0.15 m within the largest range and hears it all the way
+    readings = Readings.from_columns(
+        x=0.2 * np.arange(40), y=0.05, yaw=math.pi / 2, z=np.full(40, 2.85), z_max=3.0, half_angle=0.2
+    )
+    maps = Mapper(Parameters()).run(readings)
+    rows, columns = np.nonzero(maps.ml == 1)
+    assert len(set(columns.tolist())) > 70
+    assert set((rows + maps.grid.row).tolist()) <= {28, 29}
+
+
 @pytest.mark.parametrize('seed', range(3))
 def test_the_tails_of_the_noise_cost_work_and_change_no_map(seed: int) -> None:
     readings = random_readings(np.random.default_rng(seed), AREA, 100)
@@ -479,6 +490,16 @@ def test_distance_to_the_face_or_to_the_centre_is_a_choice() -> None:
     for choice, error in (('center', 0.05), ('nearest', 0.0)):
         e = expectations(readings, LINE, line(5), replace(PAPER, cell_distance=choice))
         assert math.sqrt(e.squared_error[0] / e.hit[0]) == pytest.approx(error, abs=1e-7)
+
+
+def test_a_surface_may_lie_before_the_centre_of_its_cell() -> None:
+    # a wall that fills cell 5 is met at its near face, or anywhere up to its centre
+    for offset in (0.0, 0.3, 0.5):
+        e = expectations(along(0.55 - 0.1 * offset), LINE, line(5), replace(PAPER, surface_offset=offset))
+        assert math.sqrt(e.squared_error[0] / e.hit[0]) == pytest.approx(0.0, abs=1e-7)
+    near_face = along(*[0.49] * 3)
+    assert found(near_face, prior=0.3) == [4], 'to the centre, a face that is heard a hair short is of the cell before'
+    assert found(near_face, prior=0.3, model=replace(PAPER, surface_offset=0.3)) == [5]
 
 
 def test_a_prior_spares_the_dot_of_a_single_stray_reading_and_keeps_the_wall() -> None:
