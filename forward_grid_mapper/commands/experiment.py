@@ -40,6 +40,7 @@ PAPER = {
     'p_rand': 0.05,
     'p_lost': 0.0,
     'sigma': 0.05,
+    'surface_offset': 0.0,
     'prior': 0.5,
     'grazing_angle': math.pi / 2,
     **dict.fromkeys(('driven_cost', 'line_bonus', 'end_cost', 'isolated_cost', 'least_passed'), 0.0),

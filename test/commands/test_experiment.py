@@ -9,6 +9,7 @@ import pytest
 from drive_samples import code_of, everything_in
 
 from forward_grid_mapper.commands import demo, experiment
+from forward_grid_mapper.files.parameter_file import load_parameters
 
 
 @pytest.fixture(autouse=True)
@@ -56,6 +57,13 @@ def test_parameters_count(tmp_path: Path, capsys: pytest.CaptureFixture[str]) ->
     forward, paper = ([[row[k] for row in table] for table in tables] for k in (0, 1))
     assert forward[0] != forward[1]
     assert paper[0] == paper[1]
+
+
+def test_as_in_the_paper_is_what_the_parameter_file_says() -> None:
+    values = load_parameters(Path(__file__).parents[2] / 'config' / 'paper.yaml').values
+    uncertainty = {'alpha', 'uncertainty_prior', 'neighbour_weight'}
+    told = {name: value for name, value in values.items() if name not in uncertainty}
+    assert {name: pytest.approx(value, abs=1e-4) for name, value in experiment.PAPER.items()} == told
 
 
 @pytest.mark.parametrize(
