@@ -198,9 +198,11 @@ def finish(evidence: Evidence, steps: int, least_passed: float, driven: NDArray[
     least_passed : float
         Readings that must have passed a cell, or one beside it, for it to be free; 0 takes all cells that were seen.
     driven : bool, shape `grid.shape`
-        Cells that are known to be free.
+        Cells that are known to be free, though no reading may see them.
     """
     ml = evidence.observed()
+    # no cone holds the middle of the robot
+    ml[driven & (ml < 0)] = 0
     known = driven & (ml == 0)
     if least_passed > 0:
         passed = passed_readings(evidence, evidence.state.maps.occupied).reshape(ml.shape)

@@ -129,7 +129,7 @@ class Mapper:
         search, grid = parameters.search, evidence.grid
         driven = self._driven(readings, grid, search)
         ml = finish(evidence, search.extend, search.least_passed, driven)
-        neighbours = odds_given_neighbours(result.prior, ml == 1, evidence.state.maps.seen)
+        neighbours = odds_given_neighbours(result.prior, ml == 1)
         unexplained = parameters.model.p_rand / readings.z_max > 0.5 * evidence.likelihoods
         return MapSet(
             grid=grid,

@@ -216,6 +216,6 @@ class OnlineMap:
         evidence, search = self._evidence, self._parameters.search
         window = evidence.grid.window(self.grid)
         ml = finish(evidence, search.extend, search.least_passed, self._driven)
-        neighbours = odds_given_neighbours(self._prior, ml == 1, evidence.state.maps.seen)
+        neighbours = odds_given_neighbours(self._prior, ml == 1)
         uncertainty = uncertainty_map(evidence.of_occupancy(), neighbours, ml, search)
         return self.grid, ml[window], uncertainty[window]

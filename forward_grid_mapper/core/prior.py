@@ -90,14 +90,11 @@ def prior_gain(prior: Prior, occupied: NDArray[np.uint8], pattern: NDArray[np.ui
 
 
 @kernel
-def prior_gains(
-    prior: Prior, occupied: NDArray[np.uint8], pattern: NDArray[np.uint8], seen: NDArray[np.int32], width: int
-) -> Floats:
-    """Return `prior_gain` of all cells that readings see, 0 of others, shape (cells,)."""
+def prior_gains(prior: Prior, occupied: NDArray[np.uint8], pattern: NDArray[np.uint8], width: int) -> Floats:
+    """Return `prior_gain` of all cells, shape (cells,)."""
     out = np.zeros(len(occupied))
     for c in range(len(out)):
-        if seen[c]:
-            out[c] = prior_gain(prior, occupied, pattern, c, width)
+        out[c] = prior_gain(prior, occupied, pattern, c, width)
     return out
 
 
@@ -122,18 +119,16 @@ def patterns(occupied: NDArray[np.uint8], shape: tuple[int, int]) -> NDArray[np.
     return out.ravel()
 
 
-def odds_given_neighbours(prior: Prior, occupied: NDArray[np.bool_], seen: NDArray[np.int32]) -> Floats:
-    """Return the log prior odds of each cell given the rest of a map, in nats, 0 where unseen, shape (cells,).
+def odds_given_neighbours(prior: Prior, occupied: NDArray[np.bool_]) -> Floats:
+    """Return the log prior odds of each cell given the rest of a map, in nats, shape (cells,).
 
     Parameters
     ----------
     prior : Prior
     occupied : bool, shape (height, width)
-    seen : int32, shape (cells,)
-        Number of readings that see each cell.
     """
     filled = occupied.ravel().astype(np.uint8)
-    gains = prior_gains(prior, filled, patterns(filled, occupied.shape), seen, occupied.shape[1])
+    gains = prior_gains(prior, filled, patterns(filled, occupied.shape), occupied.shape[1])
     out: Floats = np.where(occupied.ravel(), -gains, gains)
     return out
 

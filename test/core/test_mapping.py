@@ -101,10 +101,31 @@ def test_with_all_that_makes_maps_better_they_still_know_the_same_grid(values: d
     maps, plain = run(some(), **values), run(some(), **PLAIN)
     assert maps.live.shape == maps.ml.shape == maps.uncertainty.shape == maps.grid.shape
     said = ~np.isnan(maps.uncertainty)
-    assert not (said & (plain.ml == -1)).any(), 'what nobody saw is unknown'
+    driven = driven_cells(maps.readings, maps.grid) & (maps.parameters.search.driven_cost > 0)
+    assert not (said & (plain.ml == -1) & ~driven).any(), 'what nobody saw is unknown'
     assert not (maps.ml[~said] != -1).any(), 'and so is what the readings say nothing about'
     assert (maps.ml[said] == -1).any(), 'of what was seen, but not gone through, they may say something'
     assert ((plain.ml != -1) & ~said).any()
+
+
+def test_where_the_robot_stands_is_free_before_it_moves() -> None:
+    # a ring of 16 sonars around a hole that none of them sees, three sweeps in a square room
+    yaw = np.tile(np.arange(16) * math.pi / 8, 3)
+    wall = 1.5 / np.maximum(np.abs(np.cos(yaw)), np.abs(np.sin(yaw)))
+    readings = Readings.from_columns(
+        x=0.03 + 0.25 * np.cos(yaw),
+        y=0.02 + 0.25 * np.sin(yaw),
+        yaw=yaw,
+        z=wall - 0.25,
+        z_max=4.0,
+        half_angle=0.13,
+        stamp=np.arange(48) * 10_000_000,
+    )
+    maps = run(readings)
+    row, column = -maps.grid.row, -maps.grid.column
+    place = (slice(row - 2, row + 3), slice(column - 2, column + 3))
+    assert (maps.ml[place] == 0).all()
+    assert maps.uncertainty[place].max() < 0.1
 
 
 @pytest.mark.parametrize('driven_cost', [0.0, 20.0])

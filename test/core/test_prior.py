@@ -26,6 +26,7 @@ from forward_grid_mapper.core.prior import (
     log_prior,
     neighbour,
     note_flip,
+    odds_given_neighbours,
     patterns,
     prior_gain,
     prior_gains,
@@ -82,8 +83,8 @@ def test_the_log_prior_is_the_sum_over_occupied_cells_and_gains_are_its_differen
     prior, pattern = random_prior(seed, occupied.size), patterns(occupied, shape)
     before = naive.log_prior(prior, occupied, shape)
     assert log_prior(prior, flat, pattern) == pytest.approx(before, abs=1e-9)
-    seen = (np.arange(occupied.size) % 3).astype(np.int32)
-    gains = prior_gains(prior, flat, pattern, seen, shape[1])
+    gains = prior_gains(prior, flat, pattern, shape[1])
+    odds = odds_given_neighbours(prior, occupied == 1)
     for c in range(occupied.size):
         changed = occupied.copy()
         changed.ravel()[c] ^= 1
@@ -91,7 +92,8 @@ def test_the_log_prior_is_the_sum_over_occupied_cells_and_gains_are_its_differen
         told = prior_gain(prior, flat, pattern, c, shape[1])
         assert told == pytest.approx(exact, abs=1e-9)
         assert naive.prior_gain(prior, occupied, c, shape) == pytest.approx(exact, abs=1e-9)
-        assert gains[c] == (told if seen[c] else 0.0)
+        assert gains[c] == told
+        assert odds[c] == (-told if flat[c] else told)
 
 
 PARAMETERS = [

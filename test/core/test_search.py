@@ -361,12 +361,12 @@ def test_with_shapes_the_objective_of_either_stage_never_falls_and_ends_at_an_op
     assert result.log_prior == pytest.approx(naive.log_prior(whole, result.occupied, grid.shape), abs=1e-9)
     end = now(whole)
     state = search.evidence.state
-    neighbours = odds_given_neighbours(result.prior, maps.occupied.reshape(grid.shape) == 1, maps.seen)
+    neighbours = odds_given_neighbours(result.prior, maps.occupied.reshape(grid.shape) == 1)
     for c in range(grid.size):
         told = gain_of(state, whole, c)
         assert not maps.seen[c] or told <= LEAST[0] + LEAST[1] * maps.seen[c]
         sign = -1 if maps.occupied[c] else 1
-        odds = sign * naive.prior_gain(whole, maps.occupied, c, grid.shape) if maps.seen[c] else 0.0
+        odds = sign * naive.prior_gain(whole, maps.occupied, c, grid.shape)
         assert neighbours[c] == pytest.approx(odds, abs=1e-9)
     for c in rng.permutation(grid.size)[:60]:
         maps.occupied[c] ^= 1
