@@ -140,7 +140,8 @@ class ModelParameters:
     )
     surface_offset: float = _param(
         0.3,
-        'How far before the center of its cell the surface of an obstacle is taken to lie; 0 is the paper.',
+        'How far before the center of its cell the surface of an obstacle lies, unless cell_distance is nearest; 0 is '
+        'the paper.',
         'cells',
         0.0,
         0.5,
