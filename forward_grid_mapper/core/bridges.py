@@ -3,7 +3,8 @@
 Each cell of a gap costs more than it gains, as long as the next one is missing, so single flips never close it. A
 bridge is a straight run of free cells between two occupied ones through which no wall passes yet. It leaves each of
 them away from the neighbours that it has; and no cell of it may have more against it than a nat, nor all together more
-than a few. Doors have much against them: the readings that went through.
+than a few. Doors have much against them: the readings that went through. Where a gap is so wide that a robot might
+go, a few such readings are enough.
 """
 
 from __future__ import annotations
@@ -25,6 +26,12 @@ MOST_AGAINST_CELL = 1.0
 
 MOST_AGAINST_BRIDGE = 4.0
 """Nats."""
+
+MOST_AGAINST_PASSAGE = 1.5
+"""Nats, over a gap that is wide enough to drive through."""
+
+PASSAGE = 0.35
+"""Metres of a gap from where on a robot might drive through."""
 
 AWAY = -0.35
 """Largest cosine between the direction of a bridge and that of the neighbours that its end has."""
@@ -55,7 +62,8 @@ def _path(s: State, c: int, dx: int, dy: int, path: Any) -> bool:
             return False
         against -= data
         path[i - 1] = o
-    return against <= MOST_AGAINST_BRIDGE
+    passage = (n - 1) * s.lattice.resolution > PASSAGE
+    return against <= (MOST_AGAINST_PASSAGE if passage else MOST_AGAINST_BRIDGE)
 
 
 @kernel

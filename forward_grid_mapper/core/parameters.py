@@ -191,7 +191,7 @@ class SearchParameters:
         6, 'Cells by which walls are drawn out at their ends where no reading speaks against it.', 'cells', 0, 20
     )
     least_passed: float = _param(
-        0.85,
+        0.88,
         'Readings that are expected to have passed through a cell for it to be known as free; 0 takes all cells seen.',
         'readings',
         0.0,

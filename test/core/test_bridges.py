@@ -2,12 +2,20 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 
 import naive
 from conftest import plain_model, plain_search, random_readings
-from forward_grid_mapper.core.bridges import MOST_AGAINST_BRIDGE, MOST_AGAINST_CELL, build_bridges
+from forward_grid_mapper.core.bridges import (
+    MOST_AGAINST_BRIDGE,
+    MOST_AGAINST_CELL,
+    MOST_AGAINST_PASSAGE,
+    PASSAGE,
+    build_bridges,
+)
 from forward_grid_mapper.core.evidence import Evidence
 from forward_grid_mapper.core.forward_model import log_likelihood
 from forward_grid_mapper.core.grid import Grid
@@ -140,12 +148,25 @@ def test_what_bridges_gain_is_told_and_they_stand_where_they_may(seed: int) -> N
 
 
 @pytest.mark.parametrize(
-    ('gap', 'against', 'stands'),
-    [(4, 0.99, True), (4, 1.01, False), (5, 0.79, True), (5, 0.81, False), (1, 0.99, True), (1, 1.01, False)],
+    ('gap', 'against', 'resolution', 'stands'),
+    [
+        (1, 0.99, 0.1, True),
+        (1, 1.01, 0.1, False),
+        (3, 0.99, 0.1, True),
+        (3, 1.01, 0.1, False),
+        # 0.25 m
+        (5, 0.79, 0.05, True),
+        (5, 0.81, 0.05, False),
+        # 0.5 m, through which a robot may go
+        (5, 0.29, 0.1, True),
+        (5, 0.31, 0.1, False),
+    ],
 )
-def test_no_cell_may_have_much_against_it_nor_all_together(gap: int, against: float, stands: bool) -> None:
-    assert (MOST_AGAINST_CELL, MOST_AGAINST_BRIDGE) == (1.0, 4.0)
-    evidence = Evidence(GRID, MODEL)
+def test_no_cell_may_have_much_against_it_nor_all_together(
+    gap: int, against: float, resolution: float, stands: bool
+) -> None:
+    assert (MOST_AGAINST_CELL, MOST_AGAINST_BRIDGE, MOST_AGAINST_PASSAGE, PASSAGE) == (1.0, 4.0, 1.5, 0.35)
+    evidence = Evidence(dataclasses.replace(GRID, resolution=resolution), MODEL)
     maps = evidence.state.maps
     occupied = np.zeros(GRID.shape, np.uint8)
     occupied[5, 2 : 15 + gap] = 1
