@@ -24,6 +24,7 @@ from forward_grid_mapper.core.readings import Readings
 T = TypeVar('T')
 
 PLAIN: dict[str, float] = {
+    'surface_offset': 0.0,
     'grazing_angle': 1.5708,
     'driven_cost': 0.0,
     'line_bonus': 0.0,
