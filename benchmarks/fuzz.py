@@ -32,9 +32,9 @@ from rclpy.exceptions import ParameterNotDeclaredException
 from rclpy.parameter import Parameter
 from std_srvs.srv import SetBool, Trigger
 
-from forward_grid_mapper.core.errors import MapperError
+from forward_grid_mapper.core.common.errors import MapperError
+from forward_grid_mapper.core.common.parameters import TABLE
 from forward_grid_mapper.core.mapping import Mapper
-from forward_grid_mapper.core.parameters import TABLE
 from forward_grid_mapper.node import frames
 from forward_grid_mapper.node.mapper_node import MAPS, MapperNode
 

@@ -12,7 +12,7 @@ from rclpy.parameter import Parameter
 from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import Range
 
-from forward_grid_mapper.core.parameters import TABLE
+from forward_grid_mapper.core.common.parameters import TABLE
 
 FRAMES = ('sonar_left', 'sonar_right', 'tf_good', 'tf_late', 'tf_wild')
 ODD_NAMES = (

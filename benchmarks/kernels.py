@@ -18,19 +18,19 @@ import numba
 import numpy as np
 from measuring import PATIENCE, machine, stream_seconds, timed
 
-from forward_grid_mapper.core.cones import grid_of
-from forward_grid_mapper.core.driven import driven_cells
-from forward_grid_mapper.core.evidence import Evidence
-from forward_grid_mapper.core.flips import State, _push_free, explain, find_seers, flip
-from forward_grid_mapper.core.live_map import arc_depth
-from forward_grid_mapper.core.mapping import in_canonical_order
-from forward_grid_mapper.core.moves import promising
-from forward_grid_mapper.core.pairs import WORDS_PER_RUN, make
-from forward_grid_mapper.core.parameters import Parameters
-from forward_grid_mapper.core.prior import Prior, local_prior, shapes
-from forward_grid_mapper.core.readings import Readings
-from forward_grid_mapper.core.search import LEAST, Search
-from forward_grid_mapper.core.tiles import CHUNK, SHIFT
+from forward_grid_mapper.core.common.parameters import Parameters
+from forward_grid_mapper.core.common.readings import Readings, in_canonical_order
+from forward_grid_mapper.core.evidence.evidence import Evidence
+from forward_grid_mapper.core.evidence.pairs import WORDS_PER_RUN, make
+from forward_grid_mapper.core.evidence.state import State
+from forward_grid_mapper.core.evidence.tile_index import CHUNK, SHIFT
+from forward_grid_mapper.core.evidence.updates import _push_free, explain, find_seers, flip
+from forward_grid_mapper.core.maps.log_odds_map import arc_depth
+from forward_grid_mapper.core.maps.traversed import driven_cells
+from forward_grid_mapper.core.search.moves import promising
+from forward_grid_mapper.core.search.prior import Prior, local_prior, shapes
+from forward_grid_mapper.core.search.search import LEAST, Search
+from forward_grid_mapper.core.sensor.cone_table import grid_of
 from forward_grid_mapper.core.warm_up import warm_up
 from forward_grid_mapper.simulation.drive import building_drive, corridor_drive
 

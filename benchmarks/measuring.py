@@ -16,10 +16,10 @@ from typing import Any, TypeVar
 import numba
 import numpy as np
 
+from forward_grid_mapper.core.common.parameters import Parameters
+from forward_grid_mapper.core.common.readings import Readings
 from forward_grid_mapper.core.mapping import Mapper
-from forward_grid_mapper.core.maps import MapSet
-from forward_grid_mapper.core.parameters import Parameters
-from forward_grid_mapper.core.readings import Readings
+from forward_grid_mapper.core.maps.map_set import MapSet
 
 T = TypeVar('T')
 

@@ -28,10 +28,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 import forward_grid_mapper
-from forward_grid_mapper.core.grid import Grid
+from forward_grid_mapper.core.common.grid import Grid
+from forward_grid_mapper.core.common.parameters import TABLE, Parameters
+from forward_grid_mapper.core.common.readings import Readings
 from forward_grid_mapper.core.mapping import Mapper
-from forward_grid_mapper.core.parameters import TABLE, Parameters
-from forward_grid_mapper.core.readings import Readings
 from forward_grid_mapper.core.warm_up import warm_up
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -112,8 +112,8 @@ def compare(options: argparse.Namespace) -> None:
     from measuring import PLAIN, machine
 
     from forward_grid_mapper.commands.demo import SURFACE_DEPTH
-    from forward_grid_mapper.commands.offline import read_drive
-    from forward_grid_mapper.core.forward_model import log_likelihood
+    from forward_grid_mapper.core.sensor.forward_model import log_likelihood
+    from forward_grid_mapper.recordings.read_drive import read_drive
     from forward_grid_mapper.simulation import drive
     from forward_grid_mapper.simulation.score import score_map, visible_surface
     from forward_grid_mapper.simulation.sonar import NOISY

@@ -22,11 +22,11 @@ from numpy.typing import NDArray
 
 from forward_grid_mapper.commands.demo import SURFACE_DEPTH
 from forward_grid_mapper.core import online_map
-from forward_grid_mapper.core.forward_model import log_likelihood
+from forward_grid_mapper.core.common.parameters import Parameters
+from forward_grid_mapper.core.common.readings import Readings
 from forward_grid_mapper.core.mapping import Mapper
 from forward_grid_mapper.core.online_map import OnlineMap
-from forward_grid_mapper.core.parameters import Parameters
-from forward_grid_mapper.core.readings import Readings
+from forward_grid_mapper.core.sensor.forward_model import log_likelihood
 from forward_grid_mapper.core.warm_up import warm_up
 from forward_grid_mapper.simulation.drive import Recording, building_drive, corridor_drive
 from forward_grid_mapper.simulation.score import score_map, visible_surface

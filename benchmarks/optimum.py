@@ -14,12 +14,12 @@ import math
 
 import numpy as np
 
-from forward_grid_mapper.core.evidence import Evidence
-from forward_grid_mapper.core.forward_model import log_likelihood
-from forward_grid_mapper.core.grid import Grid
-from forward_grid_mapper.core.parameters import ModelParameters, SearchParameters
-from forward_grid_mapper.core.readings import Readings
-from forward_grid_mapper.core.search import Search
+from forward_grid_mapper.core.common.grid import Grid
+from forward_grid_mapper.core.common.parameters import ModelParameters, SearchParameters
+from forward_grid_mapper.core.common.readings import Readings
+from forward_grid_mapper.core.evidence.evidence import Evidence
+from forward_grid_mapper.core.search.search import Search
+from forward_grid_mapper.core.sensor.forward_model import log_likelihood
 
 INDEPENDENT = {'line_bonus': 0.0, 'end_cost': 0.0, 'isolated_cost': 0.0}
 """Cells that know nothing of each other, as in the sum over all maps here."""

@@ -44,11 +44,11 @@ from quality_scores import (
 )
 from quality_worlds import Case, drawn_cases, on_grid, recorded_cases, scoring_tool, simulated_cases
 
-from forward_grid_mapper.core.cones import grid_of
-from forward_grid_mapper.core.evidence import Evidence
-from forward_grid_mapper.core.logs import QUANTUM
+from forward_grid_mapper.core.common.parameters import Parameters
+from forward_grid_mapper.core.evidence.evidence import Evidence
+from forward_grid_mapper.core.evidence.fixed_point import QUANTUM
 from forward_grid_mapper.core.mapping import Mapper
-from forward_grid_mapper.core.parameters import Parameters
+from forward_grid_mapper.core.sensor.cone_table import grid_of
 from forward_grid_mapper.core.warm_up import warm_up
 from forward_grid_mapper.files.parameter_file import load_parameters, parse_setting
 from forward_grid_mapper.simulation.drive import corridor_drive

@@ -11,9 +11,9 @@ from quality_scores import Figures, Standard, score
 from quality_worlds import Case
 
 from forward_grid_mapper.commands.experiment import GAINS
-from forward_grid_mapper.core.grid import Grid
+from forward_grid_mapper.core.common.grid import Grid
+from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.mapping import Mapper
-from forward_grid_mapper.core.parameters import Parameters
 from forward_grid_mapper.files.figure import Tile, write_figure
 
 SHOWN = ('corridor 15°', 'office 15°', 'clutter 30°', 'office_a', 'office_b')

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from quality_worlds import Case
 
 from forward_grid_mapper.commands.experiment import GAINS
-from forward_grid_mapper.core.grid import Grid
-from forward_grid_mapper.core.live_map import LiveMap
-from forward_grid_mapper.core.parameters import Parameters
+from forward_grid_mapper.core.common.grid import Grid
+from forward_grid_mapper.core.common.parameters import Parameters
+from forward_grid_mapper.core.maps.log_odds_map import LiveMap
 from forward_grid_mapper.simulation.score import score_map
 
 Floats = NDArray[np.float64]

@@ -14,11 +14,11 @@ from types import ModuleType
 import numpy as np
 from numpy.typing import NDArray
 
-from forward_grid_mapper.commands.offline import read_drive
-from forward_grid_mapper.core.cones import cone_table, grid_of, offset_of, walk_with_room
-from forward_grid_mapper.core.grid import Grid
-from forward_grid_mapper.core.parameters import Parameters
-from forward_grid_mapper.core.readings import Readings
+from forward_grid_mapper.core.common.grid import Grid
+from forward_grid_mapper.core.common.parameters import Parameters
+from forward_grid_mapper.core.common.readings import Readings
+from forward_grid_mapper.core.sensor.cone_table import cone_table, grid_of, offset_of, walk_with_room
+from forward_grid_mapper.recordings.read_drive import read_drive
 from forward_grid_mapper.simulation.drive import Recording, corridor_drive, door_drive, drive
 from forward_grid_mapper.simulation.rays import NOTHING, cast
 from forward_grid_mapper.simulation.score import VISIBLE_RAYS

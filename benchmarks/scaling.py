@@ -18,9 +18,9 @@ from typing import NamedTuple
 import numpy as np
 from measuring import PATIENCE, PeakMemory, Timing, in_own_process, machine
 
+from forward_grid_mapper.core.common.parameters import Parameters
+from forward_grid_mapper.core.common.readings import Readings
 from forward_grid_mapper.core.mapping import Mapper
-from forward_grid_mapper.core.parameters import Parameters
-from forward_grid_mapper.core.readings import Readings
 from forward_grid_mapper.core.warm_up import warm_up
 from forward_grid_mapper.simulation.drive import corridor_drive
 

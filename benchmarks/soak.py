@@ -32,7 +32,7 @@ from rclpy.parameter import Parameter
 from sensor_msgs.msg import Range
 
 from forward_grid_mapper.core.mapping import Mapper
-from forward_grid_mapper.core.messages import NANOSECONDS, OdometryMessage, RangeMessage
+from forward_grid_mapper.core.messages.message_types import NANOSECONDS, OdometryMessage, RangeMessage
 from forward_grid_mapper.core.warm_up import warm_up
 from forward_grid_mapper.node.mapper_node import MapperNode
 from forward_grid_mapper.simulation.drive import corridor_drive

@@ -25,14 +25,14 @@ import numpy as np
 import table2
 from measuring import PATIENCE, PLAIN, PeakMemory, Timing, in_own_process, machine, stream_seconds, timed
 
-from forward_grid_mapper.core.evidence import Evidence
-from forward_grid_mapper.core.forward_model import log_likelihood
-from forward_grid_mapper.core.live_map import LiveMap
+from forward_grid_mapper.core.common.parameters import Parameters
+from forward_grid_mapper.core.common.readings import Readings
+from forward_grid_mapper.core.evidence.evidence import Evidence
 from forward_grid_mapper.core.mapping import Mapper
-from forward_grid_mapper.core.maps import MapSet
-from forward_grid_mapper.core.parameters import Parameters
-from forward_grid_mapper.core.readings import Readings
-from forward_grid_mapper.core.threads import cores
+from forward_grid_mapper.core.maps.log_odds_map import LiveMap
+from forward_grid_mapper.core.maps.map_set import MapSet
+from forward_grid_mapper.core.runtime.threads import cores
+from forward_grid_mapper.core.sensor.forward_model import log_likelihood
 from forward_grid_mapper.core.warm_up import warm_up
 from forward_grid_mapper.simulation.drive import building_drive, corridor_drive
 from forward_grid_mapper.simulation.sonar import sonar_ring

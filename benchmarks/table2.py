@@ -17,13 +17,13 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from forward_grid_mapper.core.cones import cone_table, grid_of, walk
-from forward_grid_mapper.core.forward_model import causes_of
-from forward_grid_mapper.core.grid import Grid
-from forward_grid_mapper.core.live_map import arc_depth
-from forward_grid_mapper.core.parameters import Parameters
-from forward_grid_mapper.core.readings import Readings
-from forward_grid_mapper.core.search import LEAST_GAIN
+from forward_grid_mapper.core.common.grid import Grid
+from forward_grid_mapper.core.common.parameters import Parameters
+from forward_grid_mapper.core.common.readings import Readings
+from forward_grid_mapper.core.maps.log_odds_map import arc_depth
+from forward_grid_mapper.core.search.search import LEAST_GAIN
+from forward_grid_mapper.core.sensor.cone_table import cone_table, grid_of, walk
+from forward_grid_mapper.core.sensor.forward_model import causes_of
 
 LARGEST = 100_000
 """Cells of the largest cone."""

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from forward_grid_mapper.core.grid import Grid
-from forward_grid_mapper.core.parameters import ModelParameters, SearchParameters
-from forward_grid_mapper.core.readings import Readings
+from forward_grid_mapper.core.common.grid import Grid
+from forward_grid_mapper.core.common.parameters import ModelParameters, SearchParameters
+from forward_grid_mapper.core.common.readings import Readings
 
 sys.path.insert(0, str(Path(__file__).parent))
 

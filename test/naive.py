@@ -7,12 +7,12 @@ import math
 
 import numpy as np
 
-from forward_grid_mapper.core.flips import State
-from forward_grid_mapper.core.grid import Grid
-from forward_grid_mapper.core.parameters import ModelParameters
-from forward_grid_mapper.core.prior import Prior
-from forward_grid_mapper.core.readings import Readings
-from forward_grid_mapper.core.tiles import Tiles
+from forward_grid_mapper.core.common.grid import Grid
+from forward_grid_mapper.core.common.parameters import ModelParameters
+from forward_grid_mapper.core.common.readings import Readings
+from forward_grid_mapper.core.evidence.state import State
+from forward_grid_mapper.core.evidence.tile_index import Tiles
+from forward_grid_mapper.core.search.prior import Prior
 
 
 def axis_crosses(x: float, y: float, yaw: float, length: float, left: float, bottom: float, size: float) -> bool:

@@ -16,7 +16,7 @@ import setuptools
 import yaml
 
 import forward_grid_mapper
-from forward_grid_mapper.core.parameters import Parameters
+from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.files.parameter_file import load_parameters
 from forward_grid_mapper.files.parameter_text import dump_parameters, parameters_markdown
 from forward_grid_mapper.simulation.sonar import SonarArray, front_array, sonar_ring

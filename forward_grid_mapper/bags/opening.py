@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 from rosbags import rosbag1, rosbag2
 
-from ..core.errors import BagError
+from ..core.common.errors import BagError
 from . import scan_mcap, scan_rosbag1, scan_sqlite3
 from .salvage import Scan
 from .scan_sqlite3 import has_log, is_cut

@@ -8,8 +8,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-from ..core.errors import BagError, InputError
-from ..core.messages import OdometryMessage, RangeMessage, odometry_message, range_message
+from ..core.common.errors import BagError, InputError
+from ..core.messages.message_types import OdometryMessage, RangeMessage, odometry_message, range_message
 from .choice import ODOMETRY, RANGE, Topics, choose_topics
 from .decoder import TF_MESSAGE, decoder_of
 from .opening import open_sources, repair_hint

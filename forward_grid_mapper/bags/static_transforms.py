@@ -8,8 +8,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.errors import InputError
-from ..core.messages import Pose2
+from ..core.common.errors import InputError
+from ..core.messages.message_types import Pose2
 
 _STEEPEST = math.radians(60.0)
 Transform = NDArray[np.float64]  # homogeneous, shape (4, 4)

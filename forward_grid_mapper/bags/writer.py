@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from rosbags import rosbag1, rosbag2
 from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
 
-from ..core.errors import OutputError
-from ..core.grid import Grid
-from ..core.messages import NANOSECONDS, OdometryMessage, Pose2, RangeMessage
+from ..core.common.errors import OutputError
+from ..core.common.grid import Grid
+from ..core.messages.message_types import NANOSECONDS, OdometryMessage, Pose2, RangeMessage
 from .choice import ODOMETRY, RANGE
 from .decoder import TF_MESSAGE, default_stores
 from .source import one_line

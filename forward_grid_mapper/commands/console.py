@@ -14,8 +14,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import TextIO
 
-from ..core.errors import MapperError
-from ..core.search import Progress
+from ..core.common.errors import MapperError
+from ..core.search.search import Progress
 
 PATIENCE = 1.0
 """Seconds of work before progress is shown."""

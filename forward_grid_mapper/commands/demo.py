@@ -7,17 +7,17 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from ..core.errors import MapperError, ParameterError
+from ..core.common.errors import MapperError, ParameterError
+from ..core.common.parameters import Parameters
 from ..core.mapping import Mapper
-from ..core.parameters import Parameters
 from ..files.figure import Tile, write_figure
 from ..files.map_archive import MapArchive, read_npz
 from ..files.output_folder import free_name, output_errors, output_folder
 from ..files.results import write_results
+from ..recordings.read_drive import read_drive
 from ..simulation.drive import Recording
 from ..simulation.score import Scores, score_map, threshold, visible_surface
 from .console import Ticker, readable, run
-from .offline import read_drive
 from .options import add_mapping_options, chosen_parameters
 from .simulate import SONARS, record, write_recording
 

@@ -12,10 +12,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..core.errors import ParameterError
-from ..core.live_map import LiveMap
+from ..core.common.errors import ParameterError
+from ..core.common.parameters import Parameters
 from ..core.mapping import Mapper
-from ..core.parameters import Parameters
+from ..core.maps.log_odds_map import LiveMap
 from ..files.figure import Tile, write_figure
 from ..files.output_folder import free_name, output_errors, output_folder
 from ..simulation.drive import Recording, corridor_drive, door_drive

@@ -9,13 +9,13 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from ..core.errors import OutputError, ParameterError
-from ..core.health import health_warning, sensor_health
-from ..core.joint_learning import learn_jointly
+from ..core.common.errors import OutputError, ParameterError
+from ..core.learning.joint_learning import learn_jointly
+from ..core.learning.sensor_health import health_warning, sensor_health
 from ..files.learned_text import learned_text, parameter_file_text, write_new_file
 from ..files.parameter_file import load_parameters, parse_sensor
+from ..recordings.read_drive import read_drive
 from .console import Ticker, readable, run
-from .offline import read_drive
 from .options import add_bag_options, add_mapping_options, chosen_parameters
 
 COMMAND = 'learn'

@@ -12,9 +12,9 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-from ..core.errors import MapperError
-from ..core.messages import Pose2
-from ..core.parameters import Parameters
+from ..core.common.errors import MapperError
+from ..core.common.parameters import Parameters
+from ..core.messages.message_types import Pose2
 from ..files.parameter_text import dump_parameters
 
 NODE = '/forward_grid_mapper'

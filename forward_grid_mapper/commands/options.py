@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import argparse
 
-from ..core.errors import ParameterError
-from ..core.messages import Pose2
-from ..core.parameters import Parameters, find
+from ..core.common.errors import ParameterError
+from ..core.common.parameters import Parameters, find
+from ..core.messages.message_types import Pose2
 from ..files.parameter_file import load_parameters, parse_setting
 from ..files.parameter_text import dump_parameters
 

@@ -8,16 +8,17 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from ..core.errors import ParameterError
+from ..core.common.errors import ParameterError
 from ..core.mapping import Mapper
-from ..core.maps import MapSet
+from ..core.maps.map_set import MapSet
 from ..files.map_files import occupancy_values
 from ..files.output_folder import free_name, output_folder
 from ..files.parameter_file import parse_sensor
-from ..files.report import report_text
+from ..files.report_text import report_text
 from ..files.results import write_results
+from ..recordings.drive import Drive
+from ..recordings.read_drive import read_drive
 from .console import Ticker, readable, run
-from .offline import Drive, read_drive
 from .options import add_bag_options, add_mapping_options, chosen_parameters
 
 COMMAND = 'process_bag'

@@ -13,12 +13,12 @@ from typing import Any
 from ..bags.choice import ODOMETRY, RANGE
 from ..bags.decoder import TF_MESSAGE
 from ..bags.reader import Bag
-from ..core.errors import MapperError
+from ..core.common.errors import MapperError
+from ..replay.player import CLOCK, Player
+from ..replay.publishers import Publishers, renamed
+from ..replay.ros_messages import MISFITS, message_class, static_transforms
+from ..replay.stop_signal import StopSignal
 from .console import Ticker, run
-from .player import CLOCK, Player
-from .publishers import Publishers, renamed
-from .ros_messages import MISFITS, message_class, static_transforms
-from .stop_signal import StopSignal
 
 COMMAND = 'replay_bag'
 CLOCK_TYPE = 'rosgraph_msgs/msg/Clock'

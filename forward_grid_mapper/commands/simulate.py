@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ..core.errors import ParameterError
-from ..core.messages import OdometryMessage, RangeMessage
+from ..core.common.errors import ParameterError
+from ..core.messages.message_types import OdometryMessage, RangeMessage
 from ..files.map_files import write_trinary
 from ..files.output_folder import output_errors, output_folder
 from ..simulation.drive import BASE_FRAME, START, Recording, corridor_drive, door_drive

@@ -10,36 +10,26 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .cones import check, grid_of
-from .driven import driven_cells
-from .evidence import Evidence
-from .finishing import finish
-from .footprint import memory_for_pairs
-from .grid import Grid
-from .learning import learn
-from .live_map import LiveMap, arc_depth
-from .maps import MapSet, part_of
-from .parameters import Parameters, SearchParameters
-from .prior import odds_given_neighbours
-from .readings import Readings
-from .search import Progress, Search, SearchResult
-from .threads import cores
-from .transient import transient_echoes
-from .uncertainty import uncertainty_map
+from .common.grid import Grid, part_of
+from .common.parameters import Parameters, SearchParameters
+from .common.readings import Readings, in_canonical_order
+from .evidence.evidence import Evidence
+from .learning.model_update import learn
+from .maps.dynamic import transient_echoes
+from .maps.log_odds_map import LiveMap, arc_depth
+from .maps.map_set import MapSet
+from .maps.post_processing import finish
+from .maps.traversed import driven_cells
+from .maps.uncertainty import uncertainty_map
+from .runtime.cancelling import check
+from .runtime.memory import memory_for_pairs
+from .runtime.threads import cores
+from .search.prior import odds_given_neighbours
+from .search.search import Progress, Search, SearchResult
+from .sensor.cone_table import grid_of
 
 Watch = Callable[[str, Progress | None], None]
 """Hears the name of each stage as it begins, and of every sweep of the search."""
-
-
-def in_canonical_order(readings: Readings) -> Readings:
-    """Return the readings ordered by stamp, sensor name and values, so that the maps do not depend on arrival.
-
-    Sums of floating point numbers depend on their order; two readings that are still equal are interchangeable.
-    """
-    rank = np.argsort(np.argsort(np.array(readings.sensor_names or ('',))))
-    r = readings
-    keys = (r.sigma, r.half_angle, r.z_max, r.yaw, r.y, r.x, r.z, rank[r.sensor], r.stamp)
-    return readings.select(np.lexsort(keys))
 
 
 class Mapper:

@@ -17,21 +17,20 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from .cones import effective_sigma, grid_of
-from .driven import STRIDES, mark_driven
-from .evidence import Evidence
-from .finishing import finish
-from .footprint import memory_for_pairs
-from .grid import Grid
-from .live_map import arc_depth
-from .maps import part_of
-from .moves import flip_in_order, promising
-from .parameters import Parameters
-from .prior import Prior, local_prior, odds_given_neighbours, shapes
-from .readings import Readings
-from .search import LEAST, Search, Window
-from .threads import cores
-from .uncertainty import uncertainty_map
+from .common.grid import Grid, part_of
+from .common.parameters import Parameters
+from .common.readings import Readings
+from .evidence.evidence import Evidence
+from .maps.log_odds_map import arc_depth
+from .maps.post_processing import finish
+from .maps.traversed import STRIDES, mark_driven
+from .maps.uncertainty import uncertainty_map
+from .runtime.memory import memory_for_pairs
+from .runtime.threads import cores
+from .search.moves import flip_in_order, promising
+from .search.prior import Prior, local_prior, odds_given_neighbours, shapes
+from .search.search import LEAST, Search, Window
+from .sensor.cone_table import effective_sigma, grid_of
 
 SAME_PLACE = 0.5
 """Cells, and share of the half angle, by which poses may differ."""

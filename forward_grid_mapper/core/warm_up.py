@@ -7,12 +7,12 @@ import math
 
 import numpy as np
 
-from .health import sensor_health
+from .common.parameters import Parameters
+from .common.readings import Readings
+from .learning.sensor_health import sensor_health
 from .mapping import Mapper
-from .maps import MapSet
+from .maps.map_set import MapSet
 from .online_map import OnlineMap
-from .parameters import Parameters
-from .readings import Readings
 
 
 def warm_up() -> MapSet:

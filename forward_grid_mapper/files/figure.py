@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 
 from numpy.typing import NDArray
 
-from ..core.errors import OutputError
-from ..core.grid import Grid
+from ..core.common.errors import OutputError
+from ..core.common.grid import Grid
 from .output_folder import output_errors
 
 Box = tuple[float, float, float, float]

@@ -16,8 +16,8 @@ from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-from ..core.errors import BagError, OutputError
-from ..core.readings import Readings
+from ..core.common.errors import BagError, OutputError
+from ..core.common.readings import Readings
 from .journal_format import MAGIC, Contents, frames_block, name_block, path_block, read, readings_block
 from .output_folder import output_errors
 from .syncing import Syncer

@@ -21,8 +21,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ..core.errors import BagError
-from ..core.readings import Readings
+from ..core.common.errors import BagError
+from ..core.common.readings import Readings
 
 MAGIC = b'FGMAPJ1\n'
 SYNC = b'\xf5FGM'

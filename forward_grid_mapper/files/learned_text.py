@@ -10,10 +10,10 @@ from typing import Any
 
 import yaml
 
-from ..core.errors import OutputError
-from ..core.joint_learning import Learned
-from ..core.messages import Pose2
-from ..core.standard_errors import LEARNED
+from ..core.common.errors import OutputError
+from ..core.learning.joint_learning import Learned
+from ..core.learning.standard_errors import LEARNED
+from ..core.messages.message_types import Pose2
 from .output_folder import output_errors
 from .parameter_text import dump_parameters
 

@@ -10,10 +10,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.errors import InputError
-from ..core.grid import Grid
-from ..core.maps import UNKNOWN, MapSet
-from ..core.parameters import Parameters
+from ..core.common.errors import InputError
+from ..core.common.grid import UNKNOWN, Grid
+from ..core.common.parameters import Parameters
+from ..core.maps.map_set import MapSet
 from .output_folder import output_errors
 
 

@@ -9,8 +9,8 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from ..core.errors import InputError, OutputError
-from ..core.grid import Grid
+from ..core.common.errors import InputError, OutputError
+from ..core.common.grid import Grid
 from .output_folder import output_errors
 from .pgm import read_pgm, write_pgm
 

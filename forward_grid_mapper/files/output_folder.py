@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from ..core.errors import OutputError
+from ..core.common.errors import OutputError
 
 _STAGING = re.compile(r'\.(?P<name>.+)\.[0-9a-f]{8}\.partial')
 _FULL = {errno.ENOSPC, errno.EDQUOT}

@@ -10,9 +10,9 @@ from typing import Any, NamedTuple
 
 import yaml
 
-from ..core.errors import ParameterError
-from ..core.messages import Pose2
-from ..core.parameters import Parameter, find
+from ..core.common.errors import ParameterError
+from ..core.common.parameters import Parameter, find
+from ..core.messages.message_types import Pose2
 
 NODE_NAME = 'forward_grid_mapper'
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import yaml
 
-from ..core.parameters import TABLE, Parameter, Parameters
+from ..core.common.parameters import TABLE, Parameter, Parameters
 
 _WIDTH = 100
 _INDENT = '    '

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.errors import InputError
+from ..core.common.errors import InputError
 from .output_folder import output_errors
 
 _GAP = rb'(?:\s|#[^\n]*\n)+'

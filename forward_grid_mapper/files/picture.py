@@ -8,9 +8,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.errors import OutputError
-from ..core.grid import Grid
-from ..core.maps import UNKNOWN, MapSet
+from ..core.common.errors import OutputError
+from ..core.common.grid import UNKNOWN, Grid
+from ..core.maps.map_set import MapSet
 from .output_folder import output_errors
 
 Box = tuple[float, float, float, float]

@@ -12,9 +12,10 @@ from typing import Any
 import numpy as np
 
 from .. import __version__
-from ..core.health import SensorHealth, health_warning, sensor_health
-from ..core.maps import UNKNOWN, MapSet
-from ..core.parameters import TABLE
+from ..core.common.grid import UNKNOWN
+from ..core.common.parameters import TABLE
+from ..core.learning.sensor_health import SensorHealth, health_warning, sensor_health
+from ..core.maps.map_set import MapSet
 from .output_folder import output_errors
 from .report_text import report_text
 

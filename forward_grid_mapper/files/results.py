@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.errors import OutputError
-from ..core.grid import Grid
-from ..core.maps import MapSet
-from .doubt import doubt
+from ..core.common.errors import OutputError
+from ..core.common.grid import Grid
+from ..core.maps.map_set import MapSet
 from .map_archive import write_npz
 from .map_files import write_raw, write_trinary
 from .output_folder import output_errors, output_folder
+from .quality_warning import doubt
 from .report import report_data, write_report
 
 

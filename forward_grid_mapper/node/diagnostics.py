@@ -9,8 +9,9 @@ from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 
-from ..core.grid import Grid
-from ..core.placing import ODOMETRY_REASONS, REASONS, Placer
+from ..core.common.grid import Grid
+from ..core.messages.pose_association import Placer
+from ..core.messages.rep117 import ODOMETRY_REASONS, REASONS
 from .em import Run
 
 SILENCE = 3.0

@@ -11,15 +11,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.errors import Cancelled, InputError, MapperError
-from ..core.footprint import shortage
-from ..core.grid import Grid
+from ..core.common.errors import Cancelled, InputError, MapperError
+from ..core.common.grid import Grid
+from ..core.common.parameters import Parameters
+from ..core.common.readings import Readings
 from ..core.mapping import Mapper
-from ..core.maps import MapSet
-from ..core.parameters import Parameters
-from ..core.readings import Readings
-from ..core.search import Progress
-from ..files.doubt import doubt
+from ..core.maps.map_set import MapSet
+from ..core.runtime.memory import shortage
+from ..core.search.search import Progress
+from ..files.quality_warning import doubt
 
 
 @dataclass

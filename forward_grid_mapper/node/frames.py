@@ -8,8 +8,8 @@ from collections import deque
 from collections.abc import Mapping
 from typing import Any
 
-from ..core.messages import NANOSECONDS, OdometryMessage, Pose2, yaw_of
-from ..core.placing import JUMP, LATER, Later
+from ..core.messages.message_types import NANOSECONDS, OdometryMessage, Pose2, yaw_of
+from ..core.messages.pose_association import JUMP, LATER, Later
 
 STEEPEST = math.sin(math.radians(60.0))
 """A sensor whose axis leaves the plane by more cannot be mapped in it."""

@@ -10,7 +10,7 @@ from builtin_interfaces.msg import Time
 from nav_msgs.msg import OccupancyGrid
 from numpy.typing import NDArray
 
-from ..core.grid import Grid
+from ..core.common.grid import Grid
 from ..files.map_files import occupancy_values
 
 

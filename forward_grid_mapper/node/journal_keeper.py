@@ -9,8 +9,8 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.node import Node
 
-from ..core.errors import OutputError
-from ..core.placing import Placer
+from ..core.common.errors import OutputError
+from ..core.messages.pose_association import Placer
 from ..files.journal import Journal
 from .diagnostics import status
 

@@ -15,7 +15,7 @@ import traceback
 from collections.abc import Sequence
 from typing import Any
 
-from ..core.errors import MapperError
+from ..core.common.errors import MapperError
 from .stopping import Stopper
 
 USAGE = """usage: mapper [--ros-args ...]

@@ -18,15 +18,15 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Range
 from std_srvs.srv import SetBool, Trigger
 
-from ..core.errors import MapperError
-from ..core.grid import Grid
-from ..core.live_map import LiveMap
-from ..core.maps import MapSet
-from ..core.messages import NANOSECONDS, odometry_message, range_message
-from ..core.parameters import Parameters
-from ..core.placing import MOST_FRAMES, Placer
-from ..files.doubt import doubt, thinned
+from ..core.common.errors import MapperError
+from ..core.common.grid import Grid
+from ..core.common.parameters import Parameters
+from ..core.maps.log_odds_map import LiveMap
+from ..core.maps.map_set import MapSet
+from ..core.messages.message_types import NANOSECONDS, odometry_message, range_message
+from ..core.messages.pose_association import MOST_FRAMES, Placer
 from ..files.output_folder import free_name
+from ..files.quality_warning import doubt, thinned
 from ..files.results import write_results
 from . import diagnostics, ros_parameters
 from .deferred import DeferredService, Reply

@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.errors import MapperError
-from ..core.grid import Grid
-from ..core.maps import MapSet
+from ..core.common.errors import MapperError
+from ..core.common.grid import Grid
+from ..core.common.parameters import Parameters
+from ..core.common.readings import Readings
+from ..core.maps.map_set import MapSet
 from ..core.online_map import OnlineMap
-from ..core.parameters import Parameters
-from ..core.readings import Readings
 
 Publish = Callable[[int, Grid, NDArray[np.int8], NDArray[np.float32]], None]
 """Takes the generation of the map, its grid, the ML map and the uncertainty map."""

@@ -11,9 +11,9 @@ from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescri
 from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
 
-from ..core.errors import ParameterError
-from ..core.messages import Pose2
-from ..core.parameters import TABLE, Parameter, Parameters
+from ..core.common.errors import ParameterError
+from ..core.common.parameters import TABLE, Parameter, Parameters
+from ..core.messages.message_types import Pose2
 
 ROS_OWN = ('use_sim_time', 'start_type_description_service', 'qos_overrides')
 NAMES = {row.name for row in TABLE}

@@ -7,9 +7,9 @@ from collections.abc import Callable
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
 
-from ..core.health import SensorHealth, health_warning, sensor_health
-from ..core.maps import MapSet
-from ..core.readings import Readings
+from ..core.common.readings import Readings
+from ..core.learning.sensor_health import SensorHealth, health_warning, sensor_health
+from ..core.maps.map_set import MapSet
 from .diagnostics import status
 
 

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.messages import NANOSECONDS, OdometryMessage, Pose2, RangeMessage
-from ..core.readings import Readings
+from ..core.common.readings import Readings
+from ..core.messages.message_types import NANOSECONDS, OdometryMessage, Pose2, RangeMessage
 from .rays import blocked, cast
 from .sonar import NOISE_FREE, NOISY, PERSON_RADIUS, NoiseModel, SonarArray, measure, sonar_ring
 from .trajectory import Trajectory

@@ -12,9 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.grid import Grid
-from ..core.maps import UNKNOWN
-from ..core.readings import Readings
+from ..core.common.grid import UNKNOWN, Grid
+from ..core.common.readings import Readings
 from .rays import NOTHING, cast
 from .world import Door, World, cells_along
 

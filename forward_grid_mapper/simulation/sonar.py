@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.messages import Pose2
+from ..core.messages.message_types import Pose2
 from .rays import NOTHING, cast, cast_discs
 from .world import World
 

@@ -14,7 +14,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.grid import Grid
+from ..core.common.grid import Grid
 
 Cell = tuple[int, int]
 Axis = Literal['x', 'y']

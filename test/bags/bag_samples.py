@@ -8,8 +8,8 @@ from pathlib import Path
 from rosbags import rosbag1, rosbag2
 from rosbags.typesys import Stores, get_typestore
 
-from forward_grid_mapper.bags import BagWriter
-from forward_grid_mapper.core.messages import OdometryMessage, Pose2, RangeMessage
+from forward_grid_mapper.bags.writer import BagWriter
+from forward_grid_mapper.core.messages.message_types import OdometryMessage, Pose2, RangeMessage
 
 SECOND = 1_000_000_000
 START = 1_700_000_000 * SECOND

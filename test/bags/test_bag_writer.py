@@ -10,10 +10,11 @@ from bag_samples import MOUNTS, START, SUFFIXES, write_sample
 from rosbags.highlevel import AnyReader
 from rosbags.interfaces import QosDurability, QosReliability
 
-from forward_grid_mapper.bags import Bag, BagWriter
-from forward_grid_mapper.core.errors import OutputError
-from forward_grid_mapper.core.grid import Grid
-from forward_grid_mapper.core.messages import RangeMessage
+from forward_grid_mapper.bags.reader import Bag
+from forward_grid_mapper.bags.writer import BagWriter
+from forward_grid_mapper.core.common.errors import OutputError
+from forward_grid_mapper.core.common.grid import Grid
+from forward_grid_mapper.core.messages.message_types import RangeMessage
 
 RANGE = RangeMessage(START, 'sonar_0', 1.0, 0.125, 5.0, 0.25)
 GRID = Grid(0.25, -3, 5, 4, 2)

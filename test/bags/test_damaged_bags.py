@@ -9,9 +9,10 @@ from pathlib import Path
 import pytest
 from bag_samples import COUNT, SUFFIXES, sample_messages, storage_file, write_many_chunks, write_sample
 
-from forward_grid_mapper.bags import Bag, Topics
-from forward_grid_mapper.core.errors import BagError, MapperError
-from forward_grid_mapper.core.messages import RangeMessage
+from forward_grid_mapper.bags.choice import Topics
+from forward_grid_mapper.bags.reader import Bag
+from forward_grid_mapper.core.common.errors import BagError, MapperError
+from forward_grid_mapper.core.messages.message_types import RangeMessage
 
 KINDS = sorted(SUFFIXES)
 TOPICS = Topics(('/sonar',), '/odom')

@@ -7,9 +7,9 @@ import math
 import numpy as np
 import pytest
 
-from forward_grid_mapper.bags import StaticTransforms
-from forward_grid_mapper.core.errors import InputError
-from forward_grid_mapper.core.messages import Pose2
+from forward_grid_mapper.bags.static_transforms import StaticTransforms
+from forward_grid_mapper.core.common.errors import InputError
+from forward_grid_mapper.core.messages.message_types import Pose2
 
 NONE = (0.0, 0.0, 0.0)
 IDENTITY = (0.0, 0.0, 0.0, 1.0)

@@ -7,9 +7,11 @@ from pathlib import Path
 import pytest
 from bag_samples import START, write_sample
 
-from forward_grid_mapper.bags import Bag, BagWriter, Topics
-from forward_grid_mapper.core.errors import BagError
-from forward_grid_mapper.core.messages import OdometryMessage, Pose2, RangeMessage
+from forward_grid_mapper.bags.choice import Topics
+from forward_grid_mapper.bags.reader import Bag
+from forward_grid_mapper.bags.writer import BagWriter
+from forward_grid_mapper.core.common.errors import BagError
+from forward_grid_mapper.core.messages.message_types import OdometryMessage, Pose2, RangeMessage
 
 ODOMETRY = OdometryMessage(START, 'odom', 'base_link', Pose2(0.0, 0.0, 0.0))
 RANGE = RangeMessage(START, 'sonar_0', 1.0, 0.125, 5.0, 0.25)

@@ -11,9 +11,9 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 
-from forward_grid_mapper.bags import BagWriter
+from forward_grid_mapper.bags.writer import BagWriter
 from forward_grid_mapper.commands import process_bag
-from forward_grid_mapper.core.messages import OdometryMessage, Pose2, RangeMessage
+from forward_grid_mapper.core.messages.message_types import OdometryMessage, Pose2, RangeMessage
 from forward_grid_mapper.simulation.drive import BASE_FRAME, START, door_drive
 from forward_grid_mapper.simulation.sonar import NOISY, front_array
 

@@ -24,13 +24,13 @@ from drive_samples import (
 )
 from rosbags.highlevel import AnyReader
 
-from forward_grid_mapper.bags import BagWriter
+from forward_grid_mapper.bags.writer import BagWriter
 from forward_grid_mapper.commands import process_bag
-from forward_grid_mapper.commands.offline import read_drive
-from forward_grid_mapper.core.mapping import in_canonical_order
-from forward_grid_mapper.core.messages import Pose2
-from forward_grid_mapper.core.parameters import Parameters
+from forward_grid_mapper.core.common.parameters import Parameters
+from forward_grid_mapper.core.common.readings import in_canonical_order
+from forward_grid_mapper.core.messages.message_types import Pose2
 from forward_grid_mapper.files import drawing
+from forward_grid_mapper.recordings.read_drive import read_drive
 
 FRAMES = [frame for frame, _ in tape().mounts]
 COUNT = len(tape().ranges)

@@ -17,10 +17,10 @@ import pytest
 from drive_samples import FILES, code_of, everything_in, mapped, refusal, tape, write_tape
 from rosbags import rosbag2
 
-from forward_grid_mapper.bags import BagWriter
+from forward_grid_mapper.bags.writer import BagWriter
 from forward_grid_mapper.commands import process_bag
 from forward_grid_mapper.commands.console import Ticker
-from forward_grid_mapper.core.search import Progress
+from forward_grid_mapper.core.search.search import Progress
 
 
 @pytest.fixture(scope='module')

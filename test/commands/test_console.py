@@ -17,7 +17,7 @@ from forward_grid_mapper import __version__
 from forward_grid_mapper.__main__ import COMMANDS
 from forward_grid_mapper.commands import console, process_bag
 from forward_grid_mapper.commands.console import Ticker, readable
-from forward_grid_mapper.core.search import Progress
+from forward_grid_mapper.core.search.search import Progress
 
 MODULE = [sys.executable, '-m', 'forward_grid_mapper']
 

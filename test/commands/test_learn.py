@@ -10,7 +10,7 @@ import yaml
 from drive_samples import code_of, everything_in, mapped, tape, write_tape
 
 from forward_grid_mapper.commands import learn
-from forward_grid_mapper.core.parameters import Parameters
+from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.files import drawing
 from forward_grid_mapper.files.parameter_file import load_parameters
 

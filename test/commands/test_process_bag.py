@@ -14,10 +14,10 @@ from drive_samples import FILES, Tape, arrays_in, assert_same_maps, code_of, map
 from rosbags.highlevel import AnyReader
 
 from forward_grid_mapper.commands import process_bag, simulate
+from forward_grid_mapper.core.common.parameters import TABLE, Parameters
 from forward_grid_mapper.core.mapping import Mapper
-from forward_grid_mapper.core.messages import Pose2
-from forward_grid_mapper.core.parameters import TABLE, Parameters
-from forward_grid_mapper.core.placing import Placer
+from forward_grid_mapper.core.messages.message_types import Pose2
+from forward_grid_mapper.core.messages.pose_association import Placer
 from forward_grid_mapper.files import drawing
 from forward_grid_mapper.files.map_archive import read_npz
 from forward_grid_mapper.files.map_files import occupancy_values, read_map

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from drive_samples import code_of, everything_in, in_turn, mapped, tape
 
-from forward_grid_mapper.bags import Bag
+from forward_grid_mapper.bags.reader import Bag
 from forward_grid_mapper.commands import simulate
 from forward_grid_mapper.files.map_files import read_map
 from forward_grid_mapper.simulation.drive import door_drive

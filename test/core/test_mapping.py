@@ -10,16 +10,16 @@ import pytest
 
 import naive
 from conftest import PLAIN, PLAIN_MODEL, random_readings
-from forward_grid_mapper.core.driven import driven_cells
-from forward_grid_mapper.core.errors import Cancelled, InputError
-from forward_grid_mapper.core.forward_model import expectations, log_likelihood
-from forward_grid_mapper.core.grid import Grid
+from forward_grid_mapper.core.common.errors import Cancelled, InputError
+from forward_grid_mapper.core.common.grid import Grid
+from forward_grid_mapper.core.common.parameters import Parameters
+from forward_grid_mapper.core.common.readings import Readings
 from forward_grid_mapper.core.mapping import Mapper
-from forward_grid_mapper.core.maps import MapSet
-from forward_grid_mapper.core.parameters import Parameters
-from forward_grid_mapper.core.prior import Prior, local_prior, shapes
-from forward_grid_mapper.core.readings import Readings
-from forward_grid_mapper.core.search import ROUNDING
+from forward_grid_mapper.core.maps.map_set import MapSet
+from forward_grid_mapper.core.maps.traversed import driven_cells
+from forward_grid_mapper.core.search.prior import Prior, local_prior, shapes
+from forward_grid_mapper.core.search.search import ROUNDING
+from forward_grid_mapper.core.sensor.forward_model import expectations, log_likelihood
 
 AREA = Grid(0.1, -13, 4, 30, 20)
 

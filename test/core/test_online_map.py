@@ -10,17 +10,17 @@ import pytest
 
 from conftest import PLAIN, random_readings
 from forward_grid_mapper.core import online_map
-from forward_grid_mapper.core.errors import InputError
-from forward_grid_mapper.core.evidence import Evidence
-from forward_grid_mapper.core.grid import Grid
+from forward_grid_mapper.core.common.errors import InputError
+from forward_grid_mapper.core.common.grid import Grid, part_of
+from forward_grid_mapper.core.common.parameters import Parameters
+from forward_grid_mapper.core.common.readings import Readings
+from forward_grid_mapper.core.evidence.evidence import Evidence
+from forward_grid_mapper.core.evidence.neighbourhood import patterns
 from forward_grid_mapper.core.mapping import Mapper
-from forward_grid_mapper.core.maps import part_of
 from forward_grid_mapper.core.online_map import MARGIN, OnlineMap
-from forward_grid_mapper.core.parameters import Parameters
-from forward_grid_mapper.core.prior import patterns
-from forward_grid_mapper.core.readings import Readings
-from forward_grid_mapper.simulation.drive import NOISY, Recording, corridor_drive, door_drive
+from forward_grid_mapper.simulation.drive import Recording, corridor_drive, door_drive
 from forward_grid_mapper.simulation.score import score_map, visible_surface
+from forward_grid_mapper.simulation.sonar import NOISY
 
 AREA = Grid(0.1, -5, 3, 40, 30)
 

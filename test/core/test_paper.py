@@ -12,23 +12,24 @@ import pytest
 
 import naive
 from conftest import PLAIN, plain_model, plain_search, random_readings
-from forward_grid_mapper.core.cones import effective_sigma
-from forward_grid_mapper.core.errors import ParameterError
-from forward_grid_mapper.core.evidence import Evidence
-from forward_grid_mapper.core.flips import gain_of as gain_of_flip
-from forward_grid_mapper.core.forward_model import expectations, log_likelihood
-from forward_grid_mapper.core.grid import Grid
-from forward_grid_mapper.core.learning import learn
-from forward_grid_mapper.core.live_map import LiveMap
-from forward_grid_mapper.core.logs import QUANTUM
+from forward_grid_mapper.core.common.errors import ParameterError
+from forward_grid_mapper.core.common.grid import Grid
+from forward_grid_mapper.core.common.parameters import ModelParameters, Parameters, find
+from forward_grid_mapper.core.common.readings import Readings
+from forward_grid_mapper.core.evidence.evidence import Evidence
+from forward_grid_mapper.core.evidence.fixed_point import QUANTUM
+from forward_grid_mapper.core.learning.model_update import learn
 from forward_grid_mapper.core.mapping import Mapper
-from forward_grid_mapper.core.moves import flip_in_order
-from forward_grid_mapper.core.parameters import ModelParameters, Parameters, find
-from forward_grid_mapper.core.prior import Prior
-from forward_grid_mapper.core.readings import Readings
-from forward_grid_mapper.core.search import LEAST, Search
-from forward_grid_mapper.core.uncertainty import marginals
-from forward_grid_mapper.simulation.drive import NOISY, corridor_drive, door_drive
+from forward_grid_mapper.core.maps.log_odds_map import LiveMap
+from forward_grid_mapper.core.maps.uncertainty import marginals
+from forward_grid_mapper.core.search.flips import gain_of as gain_of_flip
+from forward_grid_mapper.core.search.moves import flip_in_order
+from forward_grid_mapper.core.search.prior import Prior
+from forward_grid_mapper.core.search.search import LEAST, Search
+from forward_grid_mapper.core.sensor.cone_table import effective_sigma
+from forward_grid_mapper.core.sensor.forward_model import expectations, log_likelihood
+from forward_grid_mapper.simulation.drive import corridor_drive, door_drive
+from forward_grid_mapper.simulation.sonar import NOISY
 
 LINE = Grid(0.1, 0, 0, 12, 1)
 """One row of cells; cell c lies 0.05 + 0.1 c metres before a sensor at the origin."""

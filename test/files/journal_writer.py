@@ -10,7 +10,7 @@ import struct
 import sys
 import time
 
-from forward_grid_mapper.core.reading_buffer import ReadingBuffer
+from forward_grid_mapper.core.messages.reading_buffer import ReadingBuffer
 from forward_grid_mapper.files.journal import Journal
 
 

@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from forward_grid_mapper.core.grid import Grid
-from forward_grid_mapper.core.maps import MapSet
-from forward_grid_mapper.core.parameters import Parameters
-from forward_grid_mapper.core.readings import Readings
+from forward_grid_mapper.core.common.grid import Grid
+from forward_grid_mapper.core.common.parameters import Parameters
+from forward_grid_mapper.core.common.readings import Readings
+from forward_grid_mapper.core.maps.map_set import MapSet
 
 
 def made_maps(

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from made_maps import made_maps
 
-from forward_grid_mapper.core.errors import MapperError, ParameterError
-from forward_grid_mapper.core.grid import Grid
+from forward_grid_mapper.core.common.errors import MapperError, ParameterError
+from forward_grid_mapper.core.common.grid import Grid
 from forward_grid_mapper.files.map_archive import read_npz, write_npz
 from forward_grid_mapper.files.map_files import read_map, write_trinary
 from forward_grid_mapper.files.parameter_file import load_parameters

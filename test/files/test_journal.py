@@ -16,8 +16,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from forward_grid_mapper.core.errors import BagError, OutputError
-from forward_grid_mapper.core.readings import Readings
+from forward_grid_mapper.core.common.errors import BagError, OutputError
+from forward_grid_mapper.core.common.readings import Readings
 from forward_grid_mapper.files import journal as journal_module
 from forward_grid_mapper.files import syncing
 from forward_grid_mapper.files.journal import Journal, drive_file, drives

@@ -17,9 +17,9 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import array_shapes, arrays
 from made_maps import made_maps
 
-from forward_grid_mapper.core.errors import InputError, OutputError
-from forward_grid_mapper.core.grid import Grid
-from forward_grid_mapper.core.parameters import Parameters
+from forward_grid_mapper.core.common.errors import InputError, OutputError
+from forward_grid_mapper.core.common.grid import Grid
+from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.files.map_archive import read_npz, write_npz
 from forward_grid_mapper.files.map_files import occupancy_values, read_map, write_raw, write_trinary
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from forward_grid_mapper.core.errors import OutputError
+from forward_grid_mapper.core.common.errors import OutputError
 from forward_grid_mapper.files.output_folder import free_name, output_errors, output_folder
 
 

@@ -11,9 +11,9 @@ import yaml
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from forward_grid_mapper.core.errors import ParameterError
-from forward_grid_mapper.core.messages import Pose2
-from forward_grid_mapper.core.parameters import TABLE, Parameter, Parameters
+from forward_grid_mapper.core.common.errors import ParameterError
+from forward_grid_mapper.core.common.parameters import TABLE, Parameter, Parameters
+from forward_grid_mapper.core.messages.message_types import Pose2
 from forward_grid_mapper.files.parameter_file import ParameterFile, load_parameters, parse_sensor, parse_setting
 from forward_grid_mapper.files.parameter_text import dump_parameters, parameters_markdown
 

@@ -10,8 +10,8 @@ import pytest
 from made_maps import made_maps
 
 from forward_grid_mapper import files
-from forward_grid_mapper.core.errors import OutputError
-from forward_grid_mapper.core.grid import Grid
+from forward_grid_mapper.core.common.errors import OutputError
+from forward_grid_mapper.core.common.grid import Grid
 from forward_grid_mapper.files.picture import compose, write_picture
 
 PATH = np.stack([np.linspace(-1, 1, 50), np.zeros(50)], axis=1)

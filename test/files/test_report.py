@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 from made_maps import made_maps
 
-from forward_grid_mapper.core.errors import OutputError
-from forward_grid_mapper.core.parameters import Parameters
-from forward_grid_mapper.files.report import report_data, report_text, write_report
+from forward_grid_mapper.core.common.errors import OutputError
+from forward_grid_mapper.core.common.parameters import Parameters
+from forward_grid_mapper.files.report import report_data, write_report
+from forward_grid_mapper.files.report_text import report_text
 
 SOURCE: dict[str, Any] = {
     'bag': Path('/data/run_1.mcap'),

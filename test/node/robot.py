@@ -28,7 +28,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Range
 from std_srvs.srv import SetBool, Trigger
 
-from forward_grid_mapper.core.messages import NANOSECONDS, OdometryMessage, RangeMessage
+from forward_grid_mapper.core.messages.message_types import NANOSECONDS, OdometryMessage, RangeMessage
 
 LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 RELIABLE = QoSProfile(depth=100_000, reliability=ReliabilityPolicy.RELIABLE)

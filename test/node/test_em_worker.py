@@ -7,9 +7,9 @@ from typing import Any
 
 import pytest
 
+from forward_grid_mapper.core.common.parameters import Parameters
+from forward_grid_mapper.core.common.readings import Readings
 from forward_grid_mapper.core.mapping import Mapper
-from forward_grid_mapper.core.parameters import Parameters
-from forward_grid_mapper.core.readings import Readings
 from forward_grid_mapper.node import em
 from forward_grid_mapper.node.em import EmWorker, Outcome
 

@@ -10,8 +10,8 @@ import pytest
 
 pytest.importorskip('rclpy', reason='stamps are asked for with rclpy')
 
-from forward_grid_mapper.core.messages import NANOSECONDS, OdometryMessage, Pose2, RangeMessage
-from forward_grid_mapper.core.placing import LATER, Placer
+from forward_grid_mapper.core.messages.message_types import NANOSECONDS, OdometryMessage, Pose2, RangeMessage
+from forward_grid_mapper.core.messages.pose_association import LATER, Placer
 from forward_grid_mapper.node import frames
 from forward_grid_mapper.node.frames import MapFrame, Mounts, Transforms, planar
 

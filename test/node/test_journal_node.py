@@ -16,7 +16,7 @@ pytest.importorskip('rclpy', reason='the tests of the node need rclpy')
 from robot import Robot
 
 from forward_grid_mapper.commands.process_bag import main as process_bag
-from forward_grid_mapper.core.messages import NANOSECONDS, OdometryMessage, Pose2, RangeMessage
+from forward_grid_mapper.core.messages.message_types import NANOSECONDS, OdometryMessage, Pose2, RangeMessage
 from forward_grid_mapper.files.map_archive import read_npz
 
 OPTIONS = (

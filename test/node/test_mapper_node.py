@@ -19,10 +19,10 @@ from nav_msgs.msg import OccupancyGrid
 from robot import MAPS, Robot
 from rosgraph_msgs.msg import Clock
 
-from forward_grid_mapper.bags import Bag
+from forward_grid_mapper.bags.reader import Bag
 from forward_grid_mapper.commands.process_bag import main as process_bag
 from forward_grid_mapper.commands.simulate import write_recording
-from forward_grid_mapper.core.messages import NANOSECONDS, OdometryMessage, Pose2, RangeMessage
+from forward_grid_mapper.core.messages.message_types import NANOSECONDS, OdometryMessage, Pose2, RangeMessage
 from forward_grid_mapper.files.map_archive import read_npz
 from forward_grid_mapper.files.map_files import read_map
 from forward_grid_mapper.simulation.drive import Recording, corridor_drive, door_drive

@@ -14,9 +14,9 @@ pytest.importorskip('rclpy', reason='the tests of the node need rclpy')
 from robot import Robot
 from test_mapper_node import RELIABLE, merged, mounts, values
 
-from forward_grid_mapper.core.grid import Grid
+from forward_grid_mapper.core.common.grid import Grid
+from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.mapping import Mapper
-from forward_grid_mapper.core.parameters import Parameters
 from forward_grid_mapper.simulation.drive import door_drive
 from forward_grid_mapper.simulation.score import score_map, visible_surface
 from forward_grid_mapper.simulation.sonar import NOISY

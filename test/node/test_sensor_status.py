@@ -11,8 +11,8 @@ pytest.importorskip('rclpy', reason='the tests of the node need rclpy')
 
 from diagnostic_msgs.msg import DiagnosticStatus
 
+from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.mapping import Mapper
-from forward_grid_mapper.core.parameters import Parameters
 from forward_grid_mapper.node.sensor_status import SensorWatch
 from forward_grid_mapper.simulation.drive import drive
 from forward_grid_mapper.simulation.sonar import NOISY

@@ -15,9 +15,9 @@ from typing import Any
 import pytest
 
 import forward_grid_mapper
-from forward_grid_mapper.bags import Bag, BagWriter
-from forward_grid_mapper.commands.ros_messages import message_class
-from forward_grid_mapper.core.messages import (
+from forward_grid_mapper.bags.reader import Bag
+from forward_grid_mapper.bags.writer import BagWriter
+from forward_grid_mapper.core.messages.message_types import (
     NANOSECONDS,
     OdometryMessage,
     Pose2,
@@ -25,6 +25,7 @@ from forward_grid_mapper.core.messages import (
     odometry_message,
     range_message,
 )
+from forward_grid_mapper.replay.ros_messages import message_class
 
 START = 1_700_000_000 * NANOSECONDS
 RANGE = 'sensor_msgs/msg/Range'

@@ -11,9 +11,9 @@ import pytest
 from replay_samples import ODOMETRY, RANGE, START
 
 from forward_grid_mapper.bags.choice import Topics
-from forward_grid_mapper.commands.player import Player
-from forward_grid_mapper.core.errors import BagError
-from forward_grid_mapper.core.messages import NANOSECONDS
+from forward_grid_mapper.core.common.errors import BagError
+from forward_grid_mapper.core.messages.message_types import NANOSECONDS
+from forward_grid_mapper.replay.player import Player
 
 TOPICS = Topics(('sonar',), 'odom')
 NAMES = {'sonar': '/sonar', 'odom': '/odom', '/clock': '/clock'}

@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 from replay_samples import CLOCK, ODOMETRY, RANGE, SENSORS, START, Wire, messages_in, wire, write_bag
 
-from forward_grid_mapper.core.messages import NANOSECONDS, stamp_of
+from forward_grid_mapper.core.messages.message_types import NANOSECONDS, stamp_of
 
 DOMAIN = random.randint(1, 100)
 

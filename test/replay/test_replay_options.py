@@ -11,12 +11,12 @@ from pathlib import Path
 import pytest
 from replay_samples import ODOMETRY, RANGE, START, write_bag
 
-from forward_grid_mapper.bags import BagWriter
+from forward_grid_mapper.bags.writer import BagWriter
 from forward_grid_mapper.commands import replay_bag
-from forward_grid_mapper.commands.publishers import renamed
-from forward_grid_mapper.commands.stop_signal import StopSignal
-from forward_grid_mapper.core.errors import ParameterError
-from forward_grid_mapper.core.messages import OdometryMessage, Pose2, RangeMessage
+from forward_grid_mapper.core.common.errors import ParameterError
+from forward_grid_mapper.core.messages.message_types import OdometryMessage, Pose2, RangeMessage
+from forward_grid_mapper.replay.publishers import renamed
+from forward_grid_mapper.replay.stop_signal import StopSignal
 
 TOPICS = {'/sonar': RANGE, 'odom': ODOMETRY}
 

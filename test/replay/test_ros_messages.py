@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from rosbags.typesys import Stores, get_typestore
 
-from forward_grid_mapper.commands.ros_messages import MISFITS, filled, message_class, static_transforms
-from forward_grid_mapper.core.errors import MapperError
+from forward_grid_mapper.core.common.errors import MapperError
+from forward_grid_mapper.replay.ros_messages import MISFITS, filled, message_class, static_transforms
 
 pytest.importorskip('rclpy', reason='rclpy is not installed (the extra ros, or a sourced ROS 2)')
 STORES = {'jazzy': Stores.ROS2_JAZZY, 'humble': Stores.ROS2_HUMBLE, 'ros1': Stores.ROS1_NOETIC}

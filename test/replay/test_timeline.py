@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from forward_grid_mapper.commands.timeline import LONGEST_GAP, Timeline
-from forward_grid_mapper.core.messages import NANOSECONDS
+from forward_grid_mapper.core.messages.message_types import NANOSECONDS
+from forward_grid_mapper.replay.timeline import LONGEST_GAP, Timeline
 
 SECOND = NANOSECONDS
 START = 1_700_000_000 * SECOND

@@ -7,18 +7,9 @@ import math
 import numpy as np
 import pytest
 
-from forward_grid_mapper.simulation.drive import (
-    NOISE_FREE,
-    NOISY,
-    START,
-    building_drive,
-    corridor_drive,
-    door_drive,
-    drive,
-    drive_sweeps,
-)
+from forward_grid_mapper.simulation.drive import START, building_drive, corridor_drive, door_drive, drive, drive_sweeps
 from forward_grid_mapper.simulation.rays import blocked
-from forward_grid_mapper.simulation.sonar import front_array
+from forward_grid_mapper.simulation.sonar import NOISE_FREE, NOISY, front_array
 from forward_grid_mapper.simulation.world import door_world, rooms_world
 
 TOUR = np.array([[1.5, 1.5], [3.0, 3.45], [9.0, 3.45], [9.0, 2.0], [10.5, 6.5]])

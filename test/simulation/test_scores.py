@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from forward_grid_mapper.core.grid import Grid
+from forward_grid_mapper.core.common.grid import Grid
 from forward_grid_mapper.simulation.drive import corridor_drive, door_drive
 from forward_grid_mapper.simulation.score import score_map, threshold, visible_surface
 from forward_grid_mapper.simulation.world import WORLDS

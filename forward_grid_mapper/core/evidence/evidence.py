@@ -1,0 +1,337 @@
+"""The evidence of every cell, given readings and a map: built once, extended by new readings, kept right by flips."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..common.grid import UNKNOWN, Grid
+from ..common.parameters import ModelParameters
+from ..common.readings import Readings
+from ..runtime.cancelling import check
+from ..runtime.jit import kernel
+from ..runtime.threads import parts, run_each
+from ..sensor.cone import row_runs, within
+from ..sensor.cone_table import CONE, Floats, cone_of, cone_table, offset_of
+from ..sensor.surface_normals import facing_of, gather, no_facing
+from .fixed_point import QUANTUM, ratios_for
+from .neighbourhood import patterns
+from .pairs import WORD, WORDS_PER_BAND_PAIR, WORDS_PER_RUN, Lattice, bench_for, room_for_words
+from .state import SHARE, Maps, Model, State
+from .tile_index import SHIFT, enter, more_chunks, no_tiles
+from .updates import enter_all, weigh
+
+STRAIGHT = 1.5707
+"""Radians off the normal from where on no reading grazes."""
+
+FREE, BAND, LARGEST, WORDS, UNSTORED = range(5)
+"""Of the totals: pairs in free zones and in bands, cells of the largest cone, words stored, readings not stored."""
+
+
+@kernel
+def _index(s: State, limits: tuple[int, int, int], totals: Any) -> int:
+    """Count the pairs of readings and enter these in the tiles; return the reading at which chunks ran out, or the end.
+
+    Parameters
+    ----------
+    limits
+        The first reading, the last one plus one, and the words that stored pairs may take.
+    totals : int64, shape (5,)
+        Added to.
+    """
+    begin, end, words = limits
+    cones, lattice, tiles, seen, before = s.cones, s.lattice, s.tiles, s.maps.seen, s.facing.before
+    for t in range(begin, end):
+        reading = cones[t]
+        cone = cone_of(reading, lattice.nearest)
+        bottom, top = max(cone.bottom, 0), min(cone.top, lattice.height - 1)
+        across = min(2 * int(cone.reach) + 3, lattice.width)
+        most = (((top - bottom) >> SHIFT) + 2) * ((across >> SHIFT) + 2)
+        if s.stop[0] or tiles.used[0] + most > len(tiles.chunks):
+            return t
+        runs, free, band = 0, 0, 0
+        for row in range(bottom, top + 1):
+            a, b, c, d = row_runs(cone, row, reading.reach, lattice.width, lattice.nearest)
+            first, last = within(cone.x, row + 0.5 - cone.y, reading.free, lattice.nearest)
+            for left, right in ((a, b), (c, d)):
+                if left > right:
+                    continue
+                enter(tiles, row, left, right, t)
+                inside = max(min(right, last) - max(left, first) + 1, 0)
+                runs += inside > 0
+                if s.facing.slant > 0.0 and inside > 0:
+                    # a surface that is grazed may cut a run in two
+                    runs += before[row, min(right, last) + 1] - before[row, max(left, first)]
+                for c in range(np.uint64(row * lattice.width + left), np.uint64(row * lattice.width + right + 1)):
+                    seen[c] += 1
+                free += inside
+                band += right - left + 1 - inside
+        share = s.shares[t]
+        size = WORDS_PER_RUN * runs + WORDS_PER_BAND_PAIR * band
+        share.at = totals[WORDS]
+        share.stored = totals[WORDS] + size <= words
+        if share.stored:
+            totals[WORDS] += size
+        else:
+            totals[UNSTORED] += 1
+        totals[FREE] += free
+        totals[BAND] += band
+        totals[LARGEST] = max(totals[LARGEST], free + band)
+    return end
+
+
+def share_table(readings: Readings, sigma: Floats, model: ModelParameters) -> NDArray[np.void]:
+    """Return records of `SHARE`, shape (N,), with all that no map changes; `sigma` is that of `effective_sigma`."""
+    shares = np.zeros(len(readings), SHARE)
+    error = (readings.z_max - readings.z) / sigma
+    density = np.where(error <= model.cut, np.exp(-0.5 * error**2) / (math.sqrt(2 * math.pi) * sigma), 0.0)
+    shares['floor'] = model.p_rand / readings.z_max + np.where(readings.echo, 0.0, model.p_lost * density)
+    shares['no_echo'] = density
+    shares['weight'] = 1
+    return shares
+
+
+def _maps(grid: Grid, occupied: NDArray[np.uint8]) -> Maps:
+    """Return what is kept for the cells of a grid, without readings, on the map `occupied`, shape `grid.shape`."""
+    seen, evidence = np.zeros(grid.size, np.int32), np.zeros(grid.size, np.int64)
+    occupied = occupied.reshape(grid.shape)
+    return Maps(occupied.ravel(), evidence, seen, patterns(occupied, grid.shape))
+
+
+class Evidence:
+    """Readings, a map, and what flipping each of its cells would gain.
+
+    Attributes
+    ----------
+    grid : Grid
+    model : ModelParameters
+    state : State
+        What the kernels work on; arrays that grow are replaced, so it must not be kept.
+    """
+
+    def __init__(
+        self,
+        grid: Grid,
+        model: ModelParameters,
+        memory: float = math.inf,
+        threads: int = 1,
+        stop: NDArray[np.uint8] | None = None,
+        start: NDArray[np.uint8] | None = None,
+    ) -> None:
+        """Begin without readings, on an empty map or on the map `start` (1 occupied, shape `grid.shape`).
+
+        Parameters
+        ----------
+        grid : Grid
+            Cells outside of it are left out.
+        model : ModelParameters
+        memory : float
+            Bytes that the stored pairs may take.
+        threads : int
+            Threads to use where it pays; the result does not depend on it.
+        stop : uint8, shape (1,), optional
+            Set to 1 from any thread to cancel.
+        """
+        self.grid, self.model, self._threads = grid, model, threads
+        self._words = int(min(memory / WORD, 2.0**60))
+        self._totals = np.zeros(5, np.int64)
+        self._size = 0
+        self.state = State(
+            facing=no_facing(),
+            lattice=Lattice(grid.height, grid.width, model.cell_distance == 'nearest', model.cut, grid.resolution),
+            model=Model(model.p_hit, 1.0 - model.p_rand - model.p_lost),
+            cones=np.empty(0, CONE),
+            shares=np.empty(0, SHARE),
+            pairs=room_for_words(0),
+            tiles=no_tiles(grid.height, grid.width),
+            maps=_maps(grid, np.zeros(grid.shape, np.uint8) if start is None else np.array(start, np.uint8)),
+            bench=bench_for(0),
+            ratios=ratios_for(0),
+            seers=np.empty((0, 2), np.int32),
+            clock=np.zeros(1, np.int64),
+            stop=np.zeros(1, np.uint8) if stop is None else stop,
+        )
+
+    def __len__(self) -> int:
+        return self._size
+
+    @property
+    def pairs(self) -> int:
+        """Number of pairs of a cell and a reading."""
+        return int(self._totals[FREE] + self._totals[BAND])
+
+    @property
+    def unstored(self) -> int:
+        """Number of readings whose pairs found no memory."""
+        return int(self._totals[UNSTORED])
+
+    @property
+    def nbytes(self) -> int:
+        """Memory of the pairs and of what is kept for readings and cells, bytes."""
+        s = self.state
+        kept = (s.cones, s.shares, s.pairs.cell, s.tiles.chunks, s.seers, *s.maps)
+        return sum(int(array.nbytes) for array in kept)
+
+    @property
+    def log_likelihood(self) -> float:
+        """Log p(Z | m) in nats."""
+        shares = self.state.shares[: self._size]
+        return float((shares['likelihood'].astype(np.int64) * shares['weight']).sum() * QUANTUM)
+
+    def of_occupancy(self) -> Floats:
+        """Return log p(Z | cell occupied, rest of the map) − log p(Z | cell free, rest of the map) in nats.
+
+        Shape (cells,); 0 where no reading sees the cell.
+        """
+        maps = self.state.maps
+        out: Floats = np.where(maps.occupied == 1, -QUANTUM, QUANTUM) * maps.evidence
+        return out
+
+    @property
+    def z_max(self) -> Floats:
+        """The largest range of every reading in metres, shape (N,)."""
+        far = self.state.cones['z_max'][: self._size] - offset_of(self.model)
+        out: Floats = far * self.grid.resolution
+        return out
+
+    @property
+    def likelihoods(self) -> Floats:
+        """p(z | m) of every reading in 1/m, shape (N,)."""
+        out: Floats = np.exp(self.state.shares['likelihood'][: self._size] * QUANTUM)
+        return out
+
+    def observed(self) -> NDArray[np.int8]:
+        """Return a copy of the map, shape `grid.shape`: 1 occupied, 0 free, -1 where no reading sees the cell."""
+        maps = self.state.maps
+        return np.where(maps.seen > 0, maps.occupied.astype(np.int8), np.int8(UNKNOWN)).reshape(self.grid.shape)
+
+    def extend(self, readings: Readings) -> None:
+        """Add readings.
+
+        Raises
+        ------
+        Cancelled
+            If `stop` was set.
+        """
+        begin, end = self._size, self._size + len(readings)
+        cones = cone_table(readings, self.grid, self.model)
+        shares = share_table(readings, cones['sigma'] * self.grid.resolution, self.model)
+        self._reserve(end)
+        s = self.state
+        s.cones[begin:end], s.shares[begin:end] = cones, shares
+        self._take_in(begin, end)
+
+    def weigh(self, readings: NDArray[np.int64]) -> None:
+        """Let each of `readings` (indices, shape (N,)) stand for one more reading that says the same."""
+        weigh(self.state, readings)
+
+    def grow(self, grid: Grid) -> None:
+        """Go on with a larger grid, whose new cells are free; all readings are taken in anew.
+
+        Parameters
+        ----------
+        grid : Grid
+            Holds the old one.
+        """
+        old, maps, size = self.grid, self.state.maps, self._size
+        window = grid.window(old)
+        occupied = np.zeros(grid.shape, np.uint8)
+        occupied[window] = maps.occupied.reshape(old.shape)
+        self.state.cones['x'][:size] += window[1].start
+        self.state.cones['y'][:size] += window[0].start
+        self.grid = grid
+        self.state = self.state._replace(
+            lattice=self.state.lattice._replace(height=grid.height, width=grid.width),
+            tiles=no_tiles(grid.height, grid.width),
+            maps=_maps(grid, occupied),
+        )
+        self._totals[:] = 0
+        self._take_in(0, size)
+
+    def rebuild(self) -> None:
+        """Explain all readings anew, after the map was changed in many places."""
+        maps = self.state.maps
+        maps.evidence[:] = 0
+        maps.pattern[:] = patterns(maps.occupied, self.grid.shape)
+        self._enter(0, self._size, new=False)
+
+    def each(self, begin: int, end: int, work: Callable[[State, int, int], None]) -> None:
+        """Have several threads work on parts of the readings `begin` to `end`, each with room of its own."""
+        largest = int(self._totals[LARGEST])
+        jobs: list[Callable[[], None]] = []
+        for k, (first, last) in enumerate(parts(begin, end, self._threads)):
+            s = self.state
+            if k:
+                s = s._replace(bench=bench_for(largest), ratios=ratios_for(largest))
+            jobs.append(partial(work, s, first, last))
+        run_each(jobs)
+        check(self.state.stop)
+
+    def _enter(self, begin: int, end: int, new: bool) -> None:
+        maps = self.state.maps
+        own: list[Maps] = []
+
+        def work(s: State, first: int, last: int) -> None:
+            if first > begin:
+                s = s._replace(maps=maps._replace(evidence=np.zeros_like(maps.evidence)))
+                own.append(s.maps)
+            enter_all(s, first, last, new)
+
+        self.each(begin, end, work)
+        for other in own:
+            np.add(maps.evidence, other.evidence, out=maps.evidence)
+
+    def _take_in(self, begin: int, end: int) -> None:
+        """Index readings whose cones are in place, and add what they say to the evidence."""
+        if not begin and self.model.grazing_angle < STRAIGHT:
+            self._face(end)
+        done = begin
+        while done < end:
+            s = self.state
+            done = _index(s, (done, end, self._words), self._totals)
+            check(s.stop)
+            if done < end:
+                self.state = s._replace(tiles=more_chunks(s.tiles))
+        self._size = end
+        self._make_room()
+        self._enter(begin, end, new=True)
+
+    def _face(self, end: int) -> None:
+        """Learn from the first readings which way surfaces face."""
+        sums: list[NDArray[np.int64]] = []
+
+        def work(s: State, first: int, last: int) -> None:
+            sums.append(np.zeros((3, self.grid.size), np.int64))
+            gather(s.cones, self.grid.shape, s.lattice.nearest, (first, last), sums[-1], s.stop)
+
+        self.each(0, end, work)
+        facing = facing_of(np.sum(sums, axis=0), self.grid.shape, self.model.grazing_angle)
+        self.state = self.state._replace(facing=facing)
+
+    def _reserve(self, size: int) -> None:
+        """Make room for `size` readings; more than that where they come in small numbers."""
+        s = self.state
+        if size <= len(s.shares):
+            return
+        room = size if not self._size else max(size, self._size * 3 // 2)
+        cones, shares = np.empty(room, CONE), np.zeros(room, SHARE)
+        cones[: self._size], shares[: self._size] = s.cones[: self._size], s.shares[: self._size]
+        self.state = s._replace(cones=cones, shares=shares, seers=np.empty((room, 2), np.int32))
+
+    def _make_room(self) -> None:
+        """Make room for the pairs that were counted."""
+        s = self.state
+        words, largest = int(self._totals[WORDS]), int(self._totals[LARGEST])
+        if words > len(s.pairs.cell):
+            kept = len(s.pairs.cell)
+            pairs = room_for_words(words if not kept else max(words, min(words * 3 // 2, self._words)))
+            pairs.cell[:kept] = s.pairs.cell
+            s = s._replace(pairs=pairs)
+        if largest + 3 > len(s.bench.new):
+            s = s._replace(bench=bench_for(largest), ratios=ratios_for(largest))
+        self.state = s

@@ -1,0 +1,64 @@
+"""Logarithms of likelihood ratios as whole numbers, so that sums of them are exact.
+
+A sum of whole numbers does not depend on its order, and what was added can be taken away again without a trace. So the
+evidence of a cell, kept up to date through millions of changes, is always what a new sum would be, and two threads come
+to the same as one.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..runtime.jit import kernel
+
+QUANTUM = 2.0**-24
+"""Nats in a unit; a ratio fits in 32 bits with ±128 nats."""
+
+_SCALE = 1.0 / QUANTUM
+_ROOT_HALF = np.int32(0x3F3504F3)  # the bits of float32 √½
+_EXPONENT = np.int32(23)
+
+
+class Ratios(NamedTuple):
+    """Room for the likelihood ratios of one cone, and the bits that they are stored as; arrays of one length."""
+
+    ratio: NDArray[np.float32]
+    ratio_bits: NDArray[np.int32]
+    mantissa: NDArray[np.float32]
+    mantissa_bits: NDArray[np.int32]
+
+
+def ratios_for(largest: int) -> Ratios:
+    """Return room for cones of up to `largest` cells."""
+    ratio, mantissa = np.empty(largest + 3, np.float32), np.empty(largest + 3, np.float32)
+    return Ratios(ratio, ratio.view(np.int32), mantissa, mantissa.view(np.int32))
+
+
+@kernel
+def quantise_logs(ratios: Ratios, m: int, out: Any) -> None:
+    """Write the logs of the first m ratios (positive, normal) into `out` (int32), in units of QUANTUM.
+
+    The method is that of Cephes' logf: the number's bits give x = 2ᵉ (1 + f) with 1 + f in [√½, √2), and a polynomial
+    gives log(1 + f) to 3e-8. Loops of plain arithmetic, which the compiler turns into vector instructions.
+    """
+    for k in range(m):
+        bits = ratios.ratio_bits[k]
+        exponent = np.int32(np.int32(bits - _ROOT_HALF) >> _EXPONENT)
+        out[k] = exponent
+        ratios.mantissa_bits[k] = np.int32(bits - np.int32(exponent << _EXPONENT))
+    for k in range(m):
+        f = ratios.mantissa[k] - 1.0
+        y = 7.0376836292e-2 * f - 1.1514610310e-1
+        y = y * f + 1.1676998740e-1
+        y = y * f - 1.2420140846e-1
+        y = y * f + 1.4249322787e-1
+        y = y * f - 1.6668057665e-1
+        y = y * f + 2.0000714765e-1
+        y = y * f - 2.4999993993e-1
+        y = y * f + 3.3333331174e-1
+        y = f + f * f * (y * f - 0.5) + 0.6931471805599453 * out[k]
+        out[k] = np.int32(math.floor(y * _SCALE + 0.5))

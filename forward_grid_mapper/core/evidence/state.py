@@ -1,0 +1,109 @@
+"""What is kept for every reading and every cell while a map is searched: the arrays that all kernels work on."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..sensor.cone_table import Cones
+from ..sensor.surface_normals import Facing
+from .fixed_point import Ratios
+from .pairs import Bench, Lattice, Pairs
+from .tile_index import Tiles
+
+SHARE = np.dtype(
+    [
+        ('floor', np.float64),
+        ('no_echo', np.float64),
+        ('through', np.float64),
+        ('at', np.int64),
+        ('changed', np.int64),
+        ('stored', np.int32),
+        ('runs', np.int32),
+        ('bands', np.int32),
+        ('blocking', np.int32),
+        ('weight', np.int32),
+        ('occupy', np.int32),
+        ('release', np.int32),
+        ('likelihood', np.int32),
+    ],
+    align=True,
+)
+"""What is kept for a reading beside its cone.
+
+floor, no_echo
+    The densities p_rand / z_max, with p_lost · N(z; z_max, σ) where there is no echo, and N(z; z_max, σ) in 1/m, which
+    no map changes.
+blocking, through
+    Occupied cells in the free zone, and the share of the reading that they leave to the band,
+    (1 − p_rand − p_lost) (1 − p_hit)^blocking.
+stored, at, runs, bands
+    Whether its pairs are stored, where in `Pairs`, and how many runs and band pairs there are.
+weight
+    How many equal readings this one stands for.
+occupy, release
+    Log of the likelihood ratio of occupying, or freeing, a cell of the free zone, in units of `logs.QUANTUM`.
+likelihood
+    log p(z | m), in the same units.
+changed
+    The clock when it was last recomputed.
+"""
+
+
+class Model(NamedTuple):
+    """p_hit, and the share of readings that the map explains, 1 − p_rand − p_lost."""
+
+    p_hit: float
+    share: float
+
+
+class Maps(NamedTuple):
+    """What is kept for every cell.
+
+    Attributes
+    ----------
+    occupied : uint8
+        The map.
+    evidence : int64
+        Log-likelihood gain of flipping the cell, in units of `logs.QUANTUM`.
+    seen : int32
+        Number of readings in whose cone the cell is.
+    pattern : uint8
+        Which of its neighbours are occupied (`prior`).
+    """
+
+    occupied: NDArray[np.uint8]
+    evidence: NDArray[np.int64]
+    seen: NDArray[np.int32]
+    pattern: NDArray[np.uint8]
+
+
+class State(NamedTuple):
+    """All that the kernels work on.
+
+    Attributes
+    ----------
+    cones, shares : records of `CONE` and `SHARE`, shape (N,)
+    seers : int32, shape (N, 2)
+        The readings that see the cell at hand, and 1 if it is in their free zone.
+    clock : int64, shape (1,)
+        Counts flips.
+    stop : uint8, shape (1,)
+        Set to 1 from any thread to cancel.
+    """
+
+    lattice: Lattice
+    facing: Facing
+    model: Model
+    cones: Cones
+    shares: NDArray[np.void]
+    pairs: Pairs
+    tiles: Tiles
+    maps: Maps
+    bench: Bench
+    ratios: Ratios
+    seers: NDArray[np.int32]
+    clock: NDArray[np.int64]
+    stop: NDArray[np.uint8]

@@ -1,0 +1,1 @@
+"""What a map says of the sensors: model parameters with their standard errors, and the health of each sensor."""

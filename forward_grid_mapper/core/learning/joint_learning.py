@@ -1,0 +1,242 @@
+"""Learning of the model together with the map: rounds of map search and updates, and doubts about what came out.
+
+Each round makes the map of the values so far and updates them, on that map, until they stay. The next round's map tells
+whether the new values are any good: where it has lost walls that the first map showed, they are refused, and learning
+ends with those of the round before.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..common.grid import Grid
+from ..common.parameters import ModelParameters, Parameters
+from ..common.readings import Readings
+from ..mapping import Mapper
+from ..maps.map_set import MapSet
+from ..search.search import Progress
+from ..sensor.forward_model import expectations, log_likelihood
+from .lost_walls import Stretch, lost_walls
+from .model_update import learn
+from .standard_errors import LEARNED, Estimate, estimates
+
+Watch = Callable[[str, Progress | None], None]
+
+FEW_READINGS = 200
+"""So few informing readings are worth a warning."""
+MUCH_CHANCE = 0.3
+"""A larger learned p_rand is worth a warning."""
+LIKELIHOOD_DROP = 0.01
+"""Nats a reading by which a new map may be less likely than the one before, at the same values."""
+_UPDATES = 100
+_SETTLED = 2e-4
+_CONVERGED = 0.01
+_NO_LOSS = 1e-4
+
+
+@dataclass(frozen=True)
+class Round:
+    """One round of learning.
+
+    Attributes
+    ----------
+    model : ModelParameters
+        The values; of round 0, those that learning started from.
+    readings : int
+    log_likelihood : float
+        Of the readings, given these values and the map searched with them, in nats.
+    log_likelihood_before : float
+        The same with the map that the values were learned from; NaN in round 0.
+    occupied : int
+        Occupied cells of the map.
+    unexplained : int
+        Echoes that this map leaves to chance or to a lost echo.
+    lost : tuple of Stretch
+        Walls of the first map that this one has given up.
+    """
+
+    model: ModelParameters
+    readings: int
+    log_likelihood: float
+    log_likelihood_before: float
+    occupied: int
+    unexplained: int
+    lost: tuple[Stretch, ...]
+
+    @property
+    def lost_length(self) -> float:
+        """Metres of wall that were given up."""
+        return sum(stretch.length for stretch in self.lost)
+
+
+@dataclass(frozen=True)
+class Learned:
+    """What learning found.
+
+    Attributes
+    ----------
+    parameters : Parameters
+        Those given, with the learned values.
+    estimates : dict of str to Estimate
+        The learned values with their standard errors; empty if the very first update was refused.
+    rounds : tuple of Round
+        From round 0, which learned nothing yet, to the last, refused or not.
+    accepted : int
+        The round whose values are handed out.
+    converged : bool
+        Whether the values had come to rest.
+    maps : MapSet
+        Of the accepted round.
+    warnings : tuple of str
+    """
+
+    parameters: Parameters
+    estimates: dict[str, Estimate]
+    rounds: tuple[Round, ...]
+    accepted: int
+    converged: bool
+    maps: MapSet
+    warnings: tuple[str, ...]
+
+
+def settle(readings: Readings, grid: Grid, occupied: NDArray[Any], model: ModelParameters) -> ModelParameters:
+    """Return `model` after as many updates on one map as it takes until its values stay."""
+    for _ in range(_UPDATES):
+        before, model = model, learn(readings, grid, occupied, model)
+        if _change(before, model) < _SETTLED:
+            break
+    # the updates approach 0 for ever
+    return dataclasses.replace(model, p_lost=0.0) if model.p_lost < _NO_LOSS else model
+
+
+def learn_jointly(
+    readings: Readings,
+    parameters: Parameters,
+    rounds: int = 5,
+    keep_going: bool = False,
+    watch: Watch = lambda stage, progress: None,
+) -> Learned:
+    """Learn p_hit, p_rand, p_lost and σ together with the map.
+
+    Parameters
+    ----------
+    readings : Readings
+    parameters : Parameters
+        Where to start; p_lost stays 0 if it is 0.
+    rounds : int
+        At most.
+    keep_going : bool
+        Accept values although their map loses walls.
+    watch : callable
+        Hears of stages and progress, as in `Mapper.run`.
+
+    Raises
+    ------
+    InputError
+        If there are no readings, or they span too large a map.
+    """
+    first = last = Mapper(parameters).run(readings, watch)
+    accepted, told = [first], [_round(first, first, math.nan)]
+    learned_from = first
+    converged = False
+    for _ in range(rounds):
+        watch('learning', None)
+        model = settle(last.readings, last.grid, last.ml, last.parameters.model)
+        before = log_likelihood(last.readings, last.grid, last.ml, model)
+        maps = Mapper(dataclasses.replace(parameters, model=model)).run(readings, watch)
+        told.append(_round(first, maps, before))
+        if told[-1].lost and not keep_going:
+            break
+        learned_from = last
+        accepted.append(maps)
+        converged = _change(last.parameters.model, model) < _CONVERGED
+        last = maps
+        if converged:
+            break
+    found = {}
+    if len(accepted) > 1:
+        found = estimates(learned_from.readings, learned_from.grid, learned_from.ml, last.parameters.model)
+    number = len(accepted) - 1
+    doubts = (*_doubts(told, number, converged), *_weak(found, last.parameters.model))
+    return Learned(last.parameters, found, tuple(told), number, converged, last, doubts)
+
+
+def _change(before: ModelParameters, after: ModelParameters) -> float:
+    """Return the largest change: of the probabilities as they are, of σ in parts of it."""
+    changes = [abs(getattr(after, name) - getattr(before, name)) for name in LEARNED]
+    changes[LEARNED.index('sigma')] /= before.sigma
+    return float(max(changes))
+
+
+def _round(first: MapSet, maps: MapSet, before: float) -> Round:
+    e = expectations(maps.readings, maps.grid, maps.ml, maps.parameters.model)
+    return Round(
+        maps.parameters.model,
+        len(maps.readings),
+        maps.log_likelihood,
+        before,
+        int(np.count_nonzero(maps.ml == 1)),
+        int(np.count_nonzero(maps.readings.echo & (e.random + e.lost > 0.5))),
+        tuple(lost_walls(first, maps)) if maps is not first else (),
+    )
+
+
+def _doubts(rounds: list[Round], accepted: int, converged: bool) -> list[str]:
+    """Say what speaks against the way that learning took."""
+    told = []
+    start, last = rounds[0], rounds[-1]
+    if last.lost:
+        longest = last.lost[0]
+        (x0, y0), (x1, y1) = longest.start, longest.end
+        echoes = sum(stretch.echoes for stretch in last.lost)
+        rise = last.model.p_hit - start.model.p_hit
+        climbed = f'p_hit rose from {start.model.p_hit:.2f} to {last.model.p_hit:.2f}, and ' if rise > 0 else ''
+        basin = (
+            'this is how smooth walls get lost: their silence outweighs their echoes as soon as p_hit is large'
+            if rise > 0
+            else 'their echoes are now left to chance'
+        )
+        if accepted:
+            kept = f'those of round {accepted} are kept'
+        else:
+            kept = 'the values from the start are kept, and nothing was learned'
+        told.append(
+            f'round {len(rounds) - 1} loses walls: {climbed}{last.lost_length:.1f} m of wall in '
+            f'{len(last.lost)} stretches that the first map shows are gone, the longest from ({x0:.1f}, {y0:.1f}) to '
+            f'({x1:.1f}, {y1:.1f}); {echoes} of their echoes count as chance now, and of all echoes '
+            f'{last.unexplained} instead of {start.unexplained}; {basin}; '
+            + ('they are handed out all the same' if accepted == len(rounds) - 1 else f'its values are refused, {kept}')
+        )
+    for number, this in enumerate(rounds):
+        drop = this.log_likelihood_before - this.log_likelihood
+        if drop > LIKELIHOOD_DROP * this.readings:
+            told.append(
+                f'round {number}: the search ended in a map that is {drop:.0f} nats less likely than the one before, '
+                f'at the same values; it went into another basin'
+            )
+    if accepted and not converged and accepted == len(rounds) - 1:
+        told.append(f'the values had not come to rest after {accepted} rounds; try more with --rounds')
+    return told
+
+
+def _weak(found: dict[str, Estimate], model: ModelParameters) -> list[str]:
+    """Say which values are not worth much."""
+    told = []
+    for name, estimate in found.items():
+        if estimate.bound and not (name == 'p_lost' and model.p_lost == 0):
+            told.append(f'{name} = {estimate.value:.3g} has no standard error: {estimate.bound}')
+        if estimate.readings < FEW_READINGS and not (name == 'p_lost' and model.p_lost == 0):
+            told.append(f'only {estimate.readings:.0f} readings inform {name}; take it as a guess')
+    if found and model.p_rand > MUCH_CHANCE:
+        told.append(
+            f'p_rand = {model.p_rand:.2f} is more than a sonar makes up by itself: look for a broken sensor, a wrong '
+            f'sensor pose, odometry that drifts, or people about the robot'
+        )
+    return told

@@ -1,0 +1,58 @@
+"""Learning of p_hit, p_rand and σ from the expectations (Thrun's outer EM loop); an opt-in.
+
+Given a map, the updates maximise the expected log-likelihood (ALGORITHM §7):
+
+    p_rand = mean e_*     p_lost = mean e_lost, if it was not 0
+    σ²     = Σ e_k (z − d_k)² / Σ e_k over readings with an echo
+    p_hit  = Σ e_k / (Σ k·e_k + Σ K·e_0)
+
+With the true map they recover the truth. Learned together with the map, p_hit is biased upward, since the map has only
+as many cells as it needs.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..common.grid import Grid
+from ..common.parameters import ModelParameters, find
+from ..common.readings import Readings
+from ..sensor.forward_model import expectations
+
+MOST_UNEXPLAINED = 0.9
+"""Largest sum of p_rand and p_lost that is learned."""
+
+
+def learn(readings: Readings, grid: Grid, occupied: NDArray[Any], model: ModelParameters) -> ModelParameters:
+    """Return `model` after one update of its probabilities and σ, given a map; values stay in the table's ranges.
+
+    A value that no reading informs is kept (σ without echoes, p_hit without any obstacle).
+    """
+    e = expectations(readings, grid, occupied, model)
+    values = {'p_rand': float(e.random.mean())}
+    if model.p_lost > 0:
+        values['p_lost'] = float(e.lost.mean())
+    # readings that state their own σ say nothing about the model's
+    unstated = readings.echo & (readings.sigma == 0)
+    hits = float(e.hit[unstated].sum())
+    if hits > 0:
+        values['sigma'] = math.sqrt(float(e.squared_error[unstated].sum()) / hits)
+    # lost echoes and chance say nothing about the obstacles that stood in the way
+    chances = float(e.rank.sum() + (e.obstacles * e.no_echo).sum())
+    if chances > 0:
+        values['p_hit'] = float(e.hit.sum()) / chances
+    bounded: dict[str, Any] = {
+        name: float(np.clip(value, find(name).low, find(name).high)) for name, value in values.items()
+    }
+    # a map that explains nothing must not take the whole model with it
+    excess = bounded['p_rand'] + bounded.get('p_lost', 0.0)
+    if excess > MOST_UNEXPLAINED:
+        for name in ('p_rand', 'p_lost'):
+            if name in bounded:
+                bounded[name] *= MOST_UNEXPLAINED / excess
+    return dataclasses.replace(model, **bounded)

@@ -1,0 +1,227 @@
+"""The health of each sensor: what its readings are worth, and which sensor stands out from the others.
+
+Shares of a sensor's readings, given the ML map:
+
+    random    chance is the likeliest cause (e_* above one half)
+    no echo   nothing was heard within max range
+    missed    no echo, though the map has an obstacle within 3/4 of max range in the cone
+    short     an echo by chance, nearer than half the way to the first obstacle of the cone, or to max range if none
+    same      echoes within the commonest 0.2 m of range, whatever the map
+
+A sensor that hears its own robot repeats itself, and the map may even believe it. So where a sensor repeats a range of
+less than half of what is usual among the others, a live map of the others is asked as well: an echo from where they
+see free space is short, too.
+
+A share is held against those of the other sensors, since in a hall of smooth walls all are silent, and in a crowd all
+are random. It is suspect if it is large by itself *and* well above the median of the others.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..common.grid import Grid
+from ..common.readings import Floats, Readings
+from ..maps.log_odds_map import LiveMap
+from ..maps.map_set import MapSet
+from ..runtime.jit import kernel
+
+NEAR = 0.5
+"""A chance echo is short if it is nearer than this part of the way to the first obstacle."""
+REACH = 0.75
+"""A silence counts as missed if there is an obstacle within this part of max range."""
+FEW = 30
+"""Fewer readings are not judged."""
+FEW_SHARE = 0.1
+"""Nor are fewer than this part of the median of the others."""
+SILENT, DEAF = 0.95, 0.2
+"""A sensor that hears nothing has at least the first share of no echo, and the second of missed obstacles."""
+SHORT = 0.5
+RANDOM = 0.5
+SAME, WINDOW = 0.8, 0.2
+"""A sensor that repeats itself has at least this share of its readings in a window of so many metres."""
+CLOSE = 0.7
+"""If so large a part of the chance readings is short, but not always the same, somebody walks there."""
+ABOVE = 0.25
+"""A suspect share exceeds the median of the others by at least so much."""
+FREE = 0.35
+"""The live map of the others is free below this probability."""
+_RAYS = 9
+_STEP = 0.5
+
+
+@dataclass(frozen=True)
+class SensorHealth:
+    """One row of the table; shares lie in [0, 1] and are NaN without readings.
+
+    `common` is the middle of the commonest 0.2 m of range, metres. `verdict` is 'ok', 'few readings', 'something moves
+    near it', 'never hears anything', 'always short' or 'mostly random'.
+    """
+
+    readings: int
+    random: float
+    no_echo: float
+    missed: float
+    short: float
+    same: float
+    common: float
+    verdict: str
+
+    @property
+    def suspect(self) -> bool:
+        """Whether the sensor seems to be broken, badly mounted or given a wrong pose."""
+        return self.verdict in ('never hears anything', 'always short', 'mostly random')
+
+    @property
+    def told(self) -> str:
+        """The verdict, with the range that a short sensor repeats."""
+        return f'{self.verdict}: {self.common:.2f} m' if self.verdict == 'always short' else self.verdict
+
+    def __str__(self) -> str:
+        if not self.readings:
+            return f'no readings: {self.verdict}'
+        return (
+            f'{self.readings} readings, {self.random:.0%} random, {self.no_echo:.0%} no echo, '
+            f'{self.missed:.0%} missed, {self.short:.0%} short: {self.verdict}'
+        )
+
+
+@kernel
+def _first_obstacles(x: Any, y: Any, yaw: Any, half_angle: Any, reach: Any, occupied: Any, out: Any) -> None:
+    """Fill `out` with the distance along the fan of rays to the first occupied cell, infinite without one; in cells."""
+    height, width = occupied.shape
+    for t in range(len(x)):
+        nearest = np.inf
+        for ray in range(_RAYS):
+            angle = yaw[t] + half_angle[t] * (2.0 * ray / (_RAYS - 1) - 1.0)
+            dx, dy = math.cos(angle), math.sin(angle)
+            d = 0.0
+            while d < min(nearest, reach[t]):
+                row, column = int(math.floor(y[t] + d * dy)), int(math.floor(x[t] + d * dx))
+                if 0 <= row < height and 0 <= column < width and occupied[row, column]:
+                    nearest = d
+                    break
+                d += _STEP
+        out[t] = nearest
+
+
+def first_obstacles(readings: Readings, grid: Grid, ml: NDArray[np.int8]) -> Floats:
+    """Return the distance to the first occupied cell within max range in each reading's cone, metres; inf for none."""
+    scale = 1.0 / grid.resolution
+    out = np.empty(len(readings))
+    _first_obstacles(
+        readings.x * scale - grid.column,
+        readings.y * scale - grid.row,
+        np.ascontiguousarray(readings.yaw),
+        np.ascontiguousarray(readings.half_angle),
+        readings.z_max * scale,
+        np.ascontiguousarray(ml == 1),
+        out,
+    )
+    return out * grid.resolution
+
+
+def commonest_range(z: Floats) -> tuple[int, float]:
+    """Return how many ranges the fullest window of `WINDOW` metres holds, and its middle; (0, NaN) without any."""
+    if not len(z):
+        return 0, math.nan
+    ordered = np.sort(z)
+    held = np.searchsorted(ordered, ordered + WINDOW, 'right') - np.arange(len(z))
+    first = int(held.argmax())
+    return int(held[first]), float(ordered[first : first + held[first]].mean())
+
+
+def sensor_health(maps: MapSet) -> dict[str, SensorHealth]:
+    """Return the table of all sensors, by name in the order of `Readings.sensor_names`."""
+    readings = maps.readings
+    obstacle = first_obstacles(readings, maps.grid, maps.ml)
+    echo = readings.echo
+    count = len(readings.sensor_names)
+    numbers = np.bincount(readings.sensor, minlength=count)[:count]
+    heard = [readings.z[echo & (readings.sensor == k)] for k in range(count)]
+    common = [commonest_range(z) for z in heard]
+    usual_range = np.array([np.median(z) if len(z) else math.nan for z in heard])
+    short = echo & maps.unexplained & (readings.z < NEAR * np.minimum(obstacle, readings.z_max))
+    for k, (held, middle) in enumerate(common):
+        if held >= max(SAME * numbers[k], 1) and middle < NEAR * _median(np.delete(usual_range, k)):
+            short |= _from_free_space(maps, k)
+    marks = {
+        'random': maps.unexplained,
+        'no_echo': ~echo,
+        'missed': ~echo & (obstacle < REACH * readings.z_max),
+        'short': short,
+    }
+    with np.errstate(invalid='ignore'):
+        shares: dict[str, Floats] = {
+            name: np.bincount(readings.sensor, weights=mark, minlength=count)[:count] / numbers
+            for name, mark in marks.items()
+        }
+        shares['same'] = np.array([held for held, _ in common], np.float64) / numbers
+    made = {}
+    for k, name in enumerate(readings.sensor_names):
+        mine = {kind: float(share[k]) for kind, share in shares.items()}
+        others = {kind: _median(np.delete(share, k)) for kind, share in shares.items()}
+        usual = _median(np.delete(numbers, k).astype(np.float64))
+        verdict = _verdict(int(numbers[k]), usual, mine, others)
+        made[name] = SensorHealth(int(numbers[k]), **mine, common=common[k][1], verdict=verdict)
+    return made
+
+
+def _from_free_space(maps: MapSet, sensor: int) -> NDArray[np.bool_]:
+    """Return which echoes of a sensor come from where the live map of the other sensors is free, shape (N,)."""
+    readings = maps.readings
+    mine = (readings.sensor == sensor) & readings.echo
+    live = LiveMap(maps.parameters)
+    live.add(readings.select(readings.sensor != sensor))
+    chosen = readings.select(mine)
+    rows, columns = live.grid.cells_of(
+        chosen.x + chosen.z * np.cos(chosen.yaw), chosen.y + chosen.z * np.sin(chosen.yaw)
+    )
+    inside = (rows >= 0) & (rows < live.grid.height) & (columns >= 0) & (columns < live.grid.width)
+    probability = live.probability()
+    free = np.zeros(len(readings), bool)
+    there = np.flatnonzero(mine)[inside]
+    # a comparison with NaN, where the others know nothing, is false
+    free[there] = probability[rows[inside], columns[inside]] < FREE
+    return free
+
+
+def _median(values: Floats) -> float:
+    """Return the median of what is known, NaN if nothing is."""
+    known = values[np.isfinite(values)]
+    return float(np.median(known)) if len(known) else math.nan
+
+
+def _verdict(number: int, usual: float, mine: dict[str, float], others: dict[str, float]) -> str:
+    if number < FEW or number < FEW_SHARE * usual:
+        return 'few readings'
+
+    def above(kind: str) -> bool:
+        # a sensor alone is judged by itself
+        return not math.isfinite(others[kind]) or mine[kind] >= others[kind] + ABOVE
+
+    if mine['no_echo'] >= SILENT and mine['missed'] >= DEAF and above('no_echo'):
+        return 'never hears anything'
+    if mine['short'] >= SHORT and mine['same'] >= SAME and above('short'):
+        return 'always short'
+    if mine['random'] >= RANDOM and mine['short'] >= CLOSE * mine['random']:
+        return 'something moves near it'
+    if mine['random'] >= RANDOM and above('random'):
+        return 'mostly random'
+    return 'ok'
+
+
+def health_warning(table: dict[str, SensorHealth]) -> str:
+    """Return one line that names the suspect sensors, or ''."""
+    suspects = [f'{name} ({row.told})' for name, row in table.items() if row.suspect]
+    if not suspects:
+        return ''
+    return (
+        f'{"a sensor stands" if len(suspects) == 1 else f"{len(suspects)} sensors stand"} out from the others: '
+        f'{", ".join(suspects)}; broken, covered, or mounted elsewhere than its pose says?'
+    )

@@ -1,0 +1,182 @@
+"""How sure learned parameters are, given the map: estimating functions, standard errors and intervals.
+
+The updates of `learning` end where, over all readings, the sum of
+
+    ψ_rand  = e_* / p_rand − (e_hit + e_0) / (1 − p_rand − p_lost)
+    ψ_lost  = e_lost / p_lost − (e_hit + e_0) / (1 − p_rand − p_lost)
+    ψ_hit   = e_hit / p_hit − (Σ (k − 1)·e_k + K·e_0) / (1 − p_hit)
+    ψ_sigma = Σ e_k (z − d_k)² / σ³ − e_hit / σ          (echoes without a σ of their own)
+
+is zero. The first three are the derivatives of log p(z | m), by Fisher's identity; so is the last, but for the readings
+without echo, which say nothing of σ. With A = −∂Σψ/∂θ, the observed information, and B the variance of Σψ, the
+covariance is A⁻¹ B A⁻ᵀ. B is taken twice: as if readings were independent, and over blocks of time, since a person or
+a smooth wall spoils many readings in a row. The larger standard error counts.
+
+All this is conditional on the map: that the map was made from the same readings is not in it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..common.grid import Grid
+from ..common.parameters import ModelParameters, find
+from ..common.readings import Floats, Readings
+from ..sensor.forward_model import Expectations, expectations
+
+LEARNED = ('p_hit', 'p_rand', 'p_lost', 'sigma')
+BLOCKS = 30
+"""Blocks of time, each with as many readings as the others."""
+LEAST_BLOCK = 10
+"""Readings in a block, at least."""
+_STEP = 1e-3
+_NEAR = 1e-3
+_NORMAL = 1.96
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A learned value and how sure it is.
+
+    Attributes
+    ----------
+    value : float
+    error : float
+        Standard error; NaN where the value could not be learned or lies at a bound.
+    low, high : float
+        Bounds of the 95 % interval: normal in the logit of a probability and in the logarithm of σ.
+    readings : float
+        Expected number of readings that inform the value: for p_hit those that met an obstacle, by echo or in silence;
+        for σ those that are echoes of one; for p_lost those without echo; for p_rand all.
+    bound : str
+        Why it has no standard error, or ''.
+    """
+
+    value: float
+    error: float
+    low: float
+    high: float
+    readings: float
+    bound: str = ''
+
+
+def estimating_functions(
+    readings: Readings, grid: Grid, occupied: NDArray[Any], model: ModelParameters
+) -> dict[str, Floats]:
+    """Return ψ of every parameter, each of shape (N,); without p_lost if that is zero."""
+    e = expectations(readings, grid, occupied, model)
+    explained = (e.hit + e.no_echo) / (1.0 - model.p_rand - model.p_lost)
+    missed = e.rank - e.hit + e.obstacles * e.no_echo
+    unstated = readings.echo & (readings.sigma == 0)
+    made = {
+        'p_hit': e.hit / model.p_hit - missed / (1.0 - model.p_hit),
+        'p_rand': e.random / model.p_rand - explained,
+        'sigma': np.where(unstated, e.squared_error / model.sigma**3 - e.hit / model.sigma, 0.0),
+    }
+    if model.p_lost > 0:
+        made['p_lost'] = e.lost / model.p_lost - explained
+    return made
+
+
+def estimates(readings: Readings, grid: Grid, occupied: NDArray[Any], model: ModelParameters) -> dict[str, Estimate]:
+    """Return each learned value of `model` with its standard error, given the map.
+
+    Parameters
+    ----------
+    readings : Readings
+    grid : Grid
+    occupied : array of shape `grid.shape`
+        The map that `model` was learned from; 1 is occupied.
+    model : ModelParameters
+        Where the updates ended.
+    """
+    informed = _informed(readings, expectations(readings, grid, occupied, model))
+    held = {name: _held(name, model, grid.resolution, informed[name]) for name in LEARNED}
+    free = [name for name in LEARNED if not held[name]]
+    errors = dict(zip(free, _errors(readings, grid, occupied, model, free), strict=True))
+    made = {}
+    for name in LEARNED:
+        value, error = float(getattr(model, name)), errors.get(name, math.nan)
+        why = held[name]
+        if not why and not math.isfinite(error):
+            why = 'the readings do not determine it'
+        made[name] = Estimate(value, error, *_interval(name, value, error), informed[name], why)
+    return made
+
+
+def _informed(readings: Readings, e: Expectations) -> dict[str, float]:
+    unstated = readings.echo & (readings.sigma == 0)
+    return {
+        'p_hit': float((e.hit + e.no_echo * (e.obstacles > 0)).sum()),
+        'p_rand': float(len(readings)),
+        'p_lost': float(np.count_nonzero(~readings.echo)),
+        'sigma': float(e.hit[unstated].sum()),
+    }
+
+
+def _held(name: str, model: ModelParameters, resolution: float, informed: float) -> str:
+    """Return why a parameter does not move, or ''."""
+    value, row = getattr(model, name), find(name)
+    if name == 'p_lost' and value == 0:
+        return '0 is the model without lost echoes, which is not left by learning'
+    if informed < 1:
+        return 'no reading informs it'
+    if name == 'sigma' and value <= resolution / 2:
+        return 'it lies below half a cell, which is used instead'
+    if value < row.low + _NEAR or value > row.high - _NEAR:
+        return f'it lies at a bound of what is admitted, {row.range}'
+    return ''
+
+
+def _errors(
+    readings: Readings, grid: Grid, occupied: NDArray[Any], model: ModelParameters, free: list[str]
+) -> list[float]:
+    """Return the standard errors of the parameters `free`, in their order; NaN where they are not determined."""
+    if not free:
+        return []
+
+    def psi(at: ModelParameters) -> Floats:
+        made = estimating_functions(readings, grid, occupied, at)
+        return np.stack([made[name] for name in free])
+
+    information = np.empty((len(free), len(free)))
+    for column, name in enumerate(free):
+        value = getattr(model, name)
+        room = value if name == 'sigma' else min(value, 1.0 - value)
+        step = _STEP * room
+        above, below = (psi(dataclasses.replace(model, **{name: value + d})).sum(1) for d in (step, -step))
+        information[:, column] = (below - above) / (2.0 * step)
+    try:
+        inverse = np.linalg.inv(information)
+    except np.linalg.LinAlgError:
+        return [math.nan] * len(free)
+    functions = psi(model)
+    variances = [functions @ functions.T]
+    # in order of time, whatever the order of the readings
+    ordered = functions[:, np.argsort(readings.stamp, kind='stable')]
+    count = min(BLOCKS, len(readings) // LEAST_BLOCK)
+    if count > len(free):
+        sums = np.stack([part.sum(1) for part in np.array_split(ordered, count, axis=1)], axis=1)
+        spread = sums - sums.mean(1, keepdims=True)
+        variances.append(count / (count - 1) * (spread @ spread.T))
+    squares = np.max([np.diag(inverse @ variance @ inverse.T) for variance in variances], axis=0)
+    # where the information has no positive diagonal, the values are not at a maximum
+    sound = (np.diag(inverse) > 0) & (squares > 0)
+    return [math.sqrt(square) if good else math.nan for square, good in zip(squares, sound, strict=True)]
+
+
+def _interval(name: str, value: float, error: float) -> tuple[float, float]:
+    if not math.isfinite(error):
+        return math.nan, math.nan
+    if name == 'sigma':
+        factor = math.exp(_NORMAL * error / value)
+        return value / factor, value * factor
+    odds = value / (1.0 - value)
+    factor = math.exp(min(_NORMAL * error / (value * (1.0 - value)), 700.0))
+    return odds / factor / (1.0 + odds / factor), 1.0 / (1.0 + 1.0 / (odds * factor))

@@ -1,0 +1,119 @@
+"""Free space: through which cells readings passed on their way to what explains them."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..common.readings import Floats
+from ..evidence.evidence import Evidence
+from ..evidence.state import State
+from ..runtime.jit import kernel
+from ..sensor.cone import row_runs, strength, within
+from ..sensor.cone_table import cone_of
+
+MOST_OBSTACLES = 4096
+"""Occupied cells in one band that are told apart."""
+
+
+UNIT = 2.0**-20
+"""Unit of the sums of passed readings, which as whole numbers do not depend on their order."""
+
+
+@kernel
+def _obstacles(s: State, t: int, occupied: Any, squares: Any, left: Any) -> tuple[int, int, float]:
+    """List the occupied cells in the band of a cone, all of it, near to far.
+
+    Writes the squares of their distances, and into `left` (longer by one) what of T is left in front of each and
+    behind the last. Returns how many there are, how many are in the free zone, and the least square of these.
+    """
+    reading, share = s.cones[t], s.shares[t]
+    cone = cone_of(reading, s.lattice.nearest)
+    n, blocking, near = 0, 0, np.inf
+    for row in range(max(cone.bottom, 0), min(cone.top, s.lattice.height - 1) + 1):
+        a, b, c, d = row_runs(cone, row, reading.reach, s.lattice.width, s.lattice.nearest)
+        v = row + 0.5 - cone.y
+        first, last = within(cone.x, v, reading.free, s.lattice.nearest)
+        for begin, end in ((a, b), (c, d)):
+            for column in range(begin, end + 1):
+                if occupied[row * s.lattice.width + column]:
+                    u = column + 0.5 - cone.x
+                    if first <= column <= last:
+                        blocking += 1
+                        near = min(near, u * u + v * v)
+                    elif n < len(squares):
+                        k = n
+                        while k > 0 and squares[k - 1] > u * u + v * v:
+                            squares[k] = squares[k - 1]
+                            k -= 1
+                        squares[k] = u * u + v * v
+                        n += 1
+    p = s.model.p_hit
+    weight = s.model.share * (1.0 - p) ** blocking
+    peak = 1.0 / (math.sqrt(2.0 * math.pi) * reading.sigma * s.lattice.resolution)
+    for k in range(n):
+        error = (reading.z - math.sqrt(squares[k])) / reading.sigma
+        left[k] = weight * p * peak * math.exp(-0.5 * error * error) if abs(error) <= s.lattice.cut else 0.0
+        weight *= 1.0 - p
+    left[n] = weight * share.no_echo
+    for k in range(n - 1, -1, -1):
+        left[k] += left[k + 1]
+    return n, blocking, near
+
+
+@kernel
+def count_passed(s: State, begin: int, end: int, random: Floats, lost: Floats, occupied: Any, passed: Any) -> None:
+    """Add to `passed` (int64, in units of UNIT) how likely the readings `begin` to `end` passed each of their cells.
+
+    This looks at whole cones, what they graze included. `random` and `lost` are the densities p_rand / z_max and
+    p_lost · N(z; z_max, σ) of all readings in 1/m.
+    """
+    squares, left = np.empty(MOST_OBSTACLES), np.empty(MOST_OBSTACLES + 1)
+    for t in range(begin, end):
+        if s.stop[0]:
+            break
+        reading, share = s.cones[t], s.shares[t]
+        n, blocking, near = _obstacles(s, t, occupied, squares, left)
+        scale = share.weight / ((random[t] + lost[t] + left[0]) * UNIT)
+        chance = random[t] * scale if reading.z < reading.z_max else 0.0
+        in_front = left[0] * scale + chance
+        hidden = left[0] * scale + chance * (1.0 - s.model.p_hit) ** blocking
+        cone = cone_of(reading, s.lattice.nearest)
+        axis_x, axis_y, sine2 = reading.axis_x, reading.axis_y, reading.sine**2
+        for row in range(max(cone.bottom, 0), min(cone.top, s.lattice.height - 1) + 1):
+            a, b, c, d = row_runs(cone, row, reading.reach, s.lattice.width, s.lattice.nearest)
+            v = row + 0.5 - cone.y
+            first, last = within(cone.x, v, reading.free, s.lattice.nearest)
+            line = passed[row * s.lattice.width : (row + 1) * s.lattice.width]
+            for start, stop in ((a, b), (c, d)):
+                for column in range(start, stop + 1):
+                    u = column + 0.5 - cone.x
+                    square = u * u + v * v
+                    weight = strength(axis_x, axis_y, sine2, u, v)
+                    if first <= column <= last:
+                        line[column] += int(weight * (hidden if blocking and square > near else in_front))
+                    else:
+                        k = 0
+                        while k < n and squares[k] <= square:
+                            k += 1
+                        line[column] += int(weight * left[k] * scale)
+
+
+def passed_readings(evidence: Evidence, occupied: NDArray[np.uint8]) -> Floats:
+    """Return how many readings are expected to have passed each cell of a map, shape (cells,)."""
+    model = evidence.model
+    random = model.p_rand / evidence.z_max
+    # of an echo from almost as far as z_max too, so that it frees little more than a reading without any
+    lost = model.p_lost * evidence.state.shares['no_echo'][: len(evidence)]
+    sums: list[NDArray[np.int64]] = []
+
+    def work(s: State, begin: int, end: int) -> None:
+        sums.append(np.zeros(evidence.grid.size, np.int64))
+        count_passed(s, begin, end, random, lost, occupied, sums[-1])
+
+    evidence.each(0, len(evidence), work)
+    total: Floats = np.sum(sums, axis=0) * UNIT
+    return total

@@ -1,0 +1,63 @@
+"""From the map that the search found to the one that is handed out: walls drawn out, and free told from unknown.
+
+The search says of a cell that it is free where nothing makes it occupied. Whether anything went through it is another
+question. Given the map, each reading tells how likely it passed a cell on its way to whatever explains it: for a cell
+at distance d, with A the share of T from occupied cells up to d,
+
+    p(passed) = (T − A) / (c + T)
+
+and in the free zone T / (c + T), plus that of chance for an echo: something that the map lacks may have been there.
+Chance counts (1 − p_hit) for each obstacle that it had to get by in the free zone. Here c holds p_lost · N(z; z_max, σ)
+of every reading, so that an echo from nearly z_max frees little more than no echo. A reading counts by the strength of
+its beam at the cell, since what stands at the edge of a cone is easily missed. A cell through which less than about
+one reading passed is not known to be free.
+
+Where a straight wall ends in the open, the cells ahead have nothing against them and are not known to be free, it goes
+on for a few cells: a wall is more likely to leave the view than to end there.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..evidence.evidence import Evidence
+from .free_space import passed_readings
+from .wall_extension import extend
+
+
+def _grown(cells: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    wide = np.pad(cells, 1)
+    rows = wide[:-2] | wide[1:-1] | wide[2:]
+    out: NDArray[np.bool_] = rows[:, :-2] | rows[:, 1:-1] | rows[:, 2:]
+    return out
+
+
+def finish(evidence: Evidence, steps: int, least_passed: float, driven: NDArray[np.bool_]) -> NDArray[np.int8]:
+    """Return the ML map that is handed out, shape `grid.shape`: 1 occupied, 0 free, -1 not observed.
+
+    Parameters
+    ----------
+    evidence : Evidence
+        After the search.
+    steps : int
+        Cells by which to draw walls out.
+    least_passed : float
+        Readings that must have passed a cell, or one beside it, for it to be free; 0 takes all cells that were seen.
+    driven : bool, shape `grid.shape`
+        Cells that are known to be free, though no reading may see them.
+    """
+    ml = evidence.observed()
+    # no cone holds the middle of the robot
+    ml[driven & (ml < 0)] = 0
+    known = driven & (ml == 0)
+    if least_passed > 0:
+        passed = passed_readings(evidence, evidence.state.maps.occupied).reshape(ml.shape)
+        known |= (passed >= least_passed) & (ml == 0)
+    if steps:
+        ahead = np.zeros(ml.shape, np.uint8)
+        extend(evidence.state, steps, known.astype(np.uint8).ravel(), ahead.ravel())
+        ml[ahead == 1] = 1
+    if least_passed > 0:
+        ml[(ml == 0) & ~_grown(known)] = -1
+    return ml

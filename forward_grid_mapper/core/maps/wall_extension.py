@@ -1,0 +1,55 @@
+"""Wall extension: straight walls go on where they leave the view."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from ..evidence.state import State
+from ..runtime.jit import kernel
+from .log_odds_map import QUANTUM
+
+STRAIGHT_RUN = 4
+"""Cells in a row that make a straight wall."""
+
+
+MOST_AGAINST = 0.05
+"""Nats that may speak against a cell by which a wall goes on."""
+
+
+@kernel
+def _ahead(c: int, k: int, height: int, width: int, n: int) -> int:
+    """Return the cell that is n steps from c in direction k (in eighths of a turn), or -1 off the grid."""
+    o = c
+    for _ in range(n):
+        x, y = o % width, o // width
+        dx = 1 if k in (0, 1, 7) else (-1 if k in (3, 4, 5) else 0)
+        dy = 1 if k in (1, 2, 3) else (-1 if k in (5, 6, 7) else 0)
+        if not (0 <= x + dx < width and 0 <= y + dy < height):
+            return -1
+        o = (y + dy) * width + x + dx
+    return o
+
+
+@kernel
+def extend(s: State, steps: int, barred: Any, out: Any) -> None:
+    """Set in `out` (uint8) the cells by which straight walls go on at their ends, up to what is `barred` (uint8)."""
+    height, width = s.lattice.height, s.lattice.width
+    occupied, evidence, seen = s.maps.occupied, s.maps.evidence, s.maps.seen
+    for c in range(len(occupied)):
+        if not occupied[c]:
+            continue
+        for k in range(8):
+            straight = True
+            for n in range(1, STRAIGHT_RUN):
+                o = _ahead(c, (k + 4) & 7, height, width, n)
+                straight = straight and o >= 0 and occupied[o] == 1
+            # a true end has no neighbour ahead, nor abreast of what is ahead
+            for turn in (k, (k + 1) & 7, (k + 7) & 7):
+                o = _ahead(c, turn, height, width, 1)
+                straight = straight and (o < 0 or occupied[o] == 0)
+            if straight:
+                for n in range(1, steps + 1):
+                    o = _ahead(c, k, height, width, n)
+                    if o < 0 or occupied[o] or not seen[o] or barred[o] or evidence[o] * QUANTUM < -MOST_AGAINST:
+                        break
+                    out[o] = 1

@@ -1,0 +1,1 @@
+"""From ROS messages, in any order, to readings in the map frame."""

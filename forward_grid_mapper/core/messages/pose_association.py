@@ -1,0 +1,430 @@
+"""Placing of readings: messages in any interleaving → readings in the map frame, every rejection counted by reason.
+
+One `Placer` serves the offline tool and the node. Where a reading goes is decided by message stamps alone, so the
+same messages give the same readings however fast they arrive; a clock is asked only how long one has waited already.
+"""
+
+from __future__ import annotations
+
+import heapq
+import math
+import time
+from bisect import bisect_left
+from collections import Counter
+from collections.abc import Callable
+
+from ..common.parameters import Parameters
+from ..common.readings import Readings
+from .message_types import NANOSECONDS, OdometryMessage, Pose2, RangeMessage
+from .reading_buffer import ReadingBuffer
+from .rep117 import LONGEST_NAME, _Measurement, measure
+
+
+class Later:
+    """What a lookup answers when the pose may still become known."""
+
+
+LATER = Later()
+
+MountLookup = Callable[[str, str, int], 'Pose2 | Later | None']
+"""(base frame, sensor frame, stamp in ns) → pose of the sensor in the base frame, `LATER`, or None if unknown."""
+
+
+HISTORY = 600 * NANOSECONDS
+"""Odometry older than this, relative to the newest, is forgotten: Range messages are late by less, even where a bag is
+replayed faster than they can be taken."""
+
+MOST_POSES = 100_000
+"""Odometry messages that are kept at the most; 15 MB."""
+
+JUMP = NANOSECONDS
+"""Odometry older than the newest by more than this means that the clock jumped back, not that messages overtook."""
+
+RETRY = NANOSECONDS // 20
+"""How often, in message time, a pose that may still become known is asked for again."""
+
+FARTHEST = 2e7
+"""Metres from the origin beyond which no pose can be right: half the way round the Earth."""
+
+PATH_STEP = 0.05
+"""Metres between points of the robot's path, as long as it is short."""
+
+MOST_POINTS = 100_000
+"""Points of the path; when there are more, every other one goes."""
+
+FASTEST = 100.0
+"""Metres a second between two odometry messages, beyond which the pose jumped: no robot was ever in between."""
+
+STRIDE = 1.0
+"""Metres that the pose may jump in no time, as a localisation does that corrects itself."""
+
+LARGEST_CONE = 2_000_000
+"""Cells that one reading may touch, so that none keeps the node busy for longer than a moment."""
+
+
+MOST_FRAMES = 1000
+"""Sensor frames that are told apart in the counts; whatever comes after them is counted as `OTHERS`."""
+
+
+OTHERS = '(other frames)'
+
+MOST_WAITING = 100_000
+"""Readings that may wait for odometry at once, so that memory stays bounded without any."""
+
+
+def interpolate(before: Pose2, after: Pose2, fraction: float) -> Pose2:
+    """Return the pose at `fraction` of the way: position linear, yaw by the shortest way."""
+    turn = math.remainder(after.yaw - before.yaw, 2 * math.pi)
+    return Pose2(
+        before.x + fraction * (after.x - before.x),
+        before.y + fraction * (after.y - before.y),
+        before.yaw + fraction * turn,
+    )
+
+
+def _possible(pose: Pose2) -> bool:
+    """Whether a pose is finite and on Earth; `max` and `min` would hide a NaN."""
+    return abs(pose.x) < FARTHEST and abs(pose.y) < FARTHEST and math.isfinite(pose.yaw)
+
+
+class Placer:
+    """Takes Range and Odometry one at a time, in any interleaving, and keeps the readings it could place.
+
+    Attributes
+    ----------
+    received, odometry_received : int
+        Range and Odometry messages so far. ``received == len(buffer) + waiting + sum(rejected.values())``, always,
+        as long as the buffer is not cleared.
+    rejected, odometry_rejected : Counter of str
+        Messages by reason (`REASONS`, `ODOMETRY_REASONS`).
+    rejected_by_frame : dict of frame_id → Counter
+    unknown_frames : set of str
+        Sensor frames without a mounting pose.
+    map_frame, base_frame : str
+        The frames of the first odometry message; empty before it.
+    path : list of (x, y)
+        Where the robot drove, in metres: a point every `PATH_STEP`, or the double, and so on, of a long drive.
+    time_jumps : int
+        How often odometry's clock jumped back.
+    """
+
+    def __init__(
+        self,
+        mounts: MountLookup,
+        parameters: Parameters | None = None,
+        patient: bool = False,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        """Prepare for messages.
+
+        Parameters
+        ----------
+        mounts : callable
+            Tells where a sensor sits on the robot.
+        parameters : Parameters, optional
+        patient : bool
+            Keep all odometry and let readings wait for it without a bound, as befits a file: then the readings placed
+            do not depend on how the two streams interleave.
+        clock : callable
+            Returns seconds. A reading times out when `pose_timeout` has passed both by the stamps that came after it
+            and by this clock: so neither a bag that is replayed fast nor a simulation that stands still loses any.
+        """
+        self._clock = clock
+        self._mounts = mounts
+        self.parameters = (parameters or Parameters()).placing
+        self._all = parameters or Parameters()
+        self._box = (math.inf, -math.inf, math.inf, -math.inf)
+        self._patient = patient
+        self.buffer = ReadingBuffer(self.parameters.max_readings)
+        self.received = self.odometry_received = 0
+        self.rejected: Counter[str] = Counter()
+        self.odometry_rejected: Counter[str] = Counter()
+        self.rejected_by_frame: dict[str, Counter[str]] = {}
+        self.unknown_frames: set[str] = set()
+        self.map_frame = self.base_frame = ''
+        self.time_jumps = 0
+        self._waiting: list[_Measurement] = []
+        self.path: list[tuple[float, float]] = []
+        self._path_step = PATH_STEP
+        self._stamps: list[int] = []
+        self._poses: list[Pose2] = []
+        self._newest_range: int | None = None
+        self._held: list[tuple[_Measurement, Pose2]] = []
+        self._next_try = self._next_look = 0
+        self._other_frame = False
+
+    @property
+    def waiting(self) -> int:
+        """Number of readings that wait for odometry or for the pose of their sensor."""
+        return len(self._waiting) + len(self._held)
+
+    @property
+    def readings(self) -> Readings:
+        """The readings to map from: all that were placed, or `max_readings` of them."""
+        return self.buffer.bounded()
+
+    def add_range(self, message: RangeMessage) -> None:
+        """Take one Range message."""
+        self.received += 1
+        measured = measure(message, self.parameters)
+        if isinstance(measured, str):
+            self._reject(message.frame_id, measured)
+            return
+        measured.newest = self._stamps[-1] if self._stamps else None
+        if self.waiting >= MOST_WAITING and not self._patient:
+            self._reject(message.frame_id, 'too_many_waiting')
+            return
+        measured.number, measured.arrival = self.received, self._clock()
+        heapq.heappush(self._waiting, measured)
+        self._newest_range = max(message.stamp, self._newest_range or message.stamp)
+        self._settle()
+
+    def reject(self, message: RangeMessage, reason: str) -> None:
+        """Take one Range message and reject it for a reason that is not its own."""
+        self.received += 1
+        self._reject(message.frame_id, reason)
+
+    def clear(self, parameters: Parameters | None = None) -> None:
+        """Forget readings, counts and path; odometry is kept, so that the next reading can be placed.
+
+        `parameters` are those of the maps that begin now.
+        """
+        self._all = parameters or self._all
+        if self._other_frame:
+            self.map_frame = self.base_frame = ''
+            self._stamps.clear()
+            self._poses.clear()
+        self.buffer.clear()
+        self.rejected.clear()
+        self.odometry_rejected.clear()
+        self.rejected_by_frame.clear()
+        self.unknown_frames.clear()
+        self._waiting.clear()
+        self._held.clear()
+        self.path.clear()
+        self._path_step = PATH_STEP
+        self.received = self.odometry_received = self.time_jumps = 0
+        self._box = (math.inf, -math.inf, math.inf, -math.inf)
+
+    def add_odometry(self, message: OdometryMessage) -> None:
+        """Take one Odometry message."""
+        self.odometry_received += 1
+        if message.pose is None or not _possible(message.pose):
+            self.odometry_rejected['bad_pose'] += 1
+            return
+        if max(len(message.frame_id), len(message.child_frame_id)) > LONGEST_NAME:
+            self.odometry_rejected['long_frame_id'] += 1
+            return
+        if not self.map_frame and not self.base_frame:
+            self.map_frame, self.base_frame = message.frame_id, message.child_frame_id
+        if (message.frame_id, message.child_frame_id) != (self.map_frame, self.base_frame):
+            self.odometry_rejected['other_frame'] += 1
+            self._other_frame = True
+            return
+        self._other_frame = False
+        self.extend_path(message.pose[:2])
+        stamps, poses = self._stamps, self._poses
+        if stamps and message.stamp < stamps[-1] - JUMP:
+            self._jump_back()
+        if not stamps or message.stamp > stamps[-1]:
+            stamps.append(message.stamp)
+            poses.append(message.pose)
+        else:
+            at = bisect_left(stamps, message.stamp)
+            if stamps[at] == message.stamp:
+                poses[at] = message.pose
+            else:
+                stamps.insert(at, message.stamp)
+                poses.insert(at, message.pose)
+        self._settle()
+        if self._patient:
+            return
+        # trimmed by halves, so that the cost a message is constant
+        old = bisect_left(stamps, stamps[-1] - HISTORY) if len(stamps) < MOST_POSES else MOST_POSES // 2
+        if old > 64 and old >= len(stamps) // 2:
+            del stamps[: old - 1], poses[: old - 1]
+
+    def finish(self) -> None:
+        """Say that no more messages come: what still waits is placed if it can be, or rejected."""
+        if self._stamps:
+            self._settle_up_to(self._stamps[-1])
+        for measured in sorted(self._waiting):
+            self._reject(measured.frame_id, 'after_odometry' if self._stamps else 'no_odometry')
+        self._waiting.clear()
+        for measured, _ in self._held:
+            self._reject_unknown(measured)
+        self._held.clear()
+
+    def restore(self, readings: Readings) -> None:
+        """Take readings that were placed by an earlier run, as received and accepted."""
+        if not len(readings):
+            return
+        self.received += len(readings)
+        left, right, bottom, top = self._box
+        reach = float(readings.z.max())
+        self._box = (
+            min(left, float(readings.x.min()) - reach),
+            max(right, float(readings.x.max()) + reach),
+            min(bottom, float(readings.y.min()) - reach),
+            max(top, float(readings.y.max()) + reach),
+        )
+        self.buffer.extend(readings)
+
+    def extend_path(self, point: tuple[float, float]) -> None:
+        """Add a point to the robot's path, if it lies far enough from the last one."""
+        if self.path and math.dist(self.path[-1], point) <= self._path_step:
+            return
+        self.path.append(point)
+        if len(self.path) > MOST_POINTS:
+            del self.path[1::2]
+            self._path_step *= 2
+
+    def _reject(self, frame_id: str, reason: str) -> None:
+        self.rejected[reason] += 1
+        known = self.rejected_by_frame
+        room = len(known) < MOST_FRAMES and len(frame_id) <= LONGEST_NAME
+        frame = frame_id if frame_id in known or room else OTHERS
+        self.rejected_by_frame.setdefault(frame, Counter())[reason] += 1
+
+    def _reject_unknown(self, measured: _Measurement) -> None:
+        if len(self.unknown_frames) < MOST_FRAMES:
+            self.unknown_frames.add(measured.frame_id)
+        self._reject(measured.frame_id, 'unknown_mount')
+
+    def _jump_back(self) -> None:
+        self._settle_up_to(self._stamps[-1])
+        self.time_jumps += 1
+        for measured in (*self._waiting, *(held for held, _ in self._held)):
+            self._reject(measured.frame_id, 'time_jump')
+        self._waiting.clear()
+        self._held.clear()
+        self._next_try = self._next_look = 0
+        self._stamps.clear()
+        self._poses.clear()
+        self._newest_range = None
+
+    def _settle(self) -> None:
+        """Place or reject every waiting reading whose fate is known."""
+        newest = self._stamps[-1] if self._stamps else None
+        if newest is not None:
+            # odometry may be late by up to JUMP, and a file can wait for it
+            self._settle_up_to(newest - JUMP if self._patient else newest)
+        if self._patient:
+            return
+        now = max(self._newest_range or 0, newest or 0)
+        # a gap that would be bridged must not time out first
+        patience = max(self.parameters.pose_timeout, self.parameters.max_pose_gap)
+        limit = now - round(patience * NANOSECONDS)
+        if newest is not None and self._waiting and newest >= self._next_look:
+            self._next_look = newest + NANOSECONDS
+            self._drop_the_future(newest, patience)
+        if not ((self._waiting and self._waiting[0].stamp < limit) or self._held):
+            return
+        oldest = self._clock() - patience
+        while self._waiting and self._waiting[0].stamp < limit and self._waiting[0].arrival < oldest:
+            self._reject(heapq.heappop(self._waiting).frame_id, 'no_odometry')
+        if self._held and now >= self._next_try:
+            self._next_try = now + RETRY
+            held, self._held = self._held, []
+            for measured, pose in held:
+                if measured.stamp < limit and measured.arrival < oldest:
+                    self._reject_unknown(measured)
+                else:
+                    self._mount(measured, pose)
+
+    def _drop_the_future(self, newest: int, patience: float) -> None:
+        """Reject what odometry should have reached by now, by its own stamps and by the clock."""
+        oldest = self._clock() - patience
+        stay = []
+        for measured in self._waiting:
+            if measured.newest is None:
+                measured.newest = newest
+            if measured.arrival < oldest and newest - measured.newest > patience * NANOSECONDS:
+                self._reject(measured.frame_id, 'from_the_future')
+            else:
+                stay.append(measured)
+        if len(stay) < len(self._waiting):
+            self._waiting = stay
+            heapq.heapify(self._waiting)
+
+    def _settle_up_to(self, stamp: int) -> None:
+        while self._waiting and self._waiting[0].stamp <= stamp:
+            self._place(heapq.heappop(self._waiting))
+
+    def _place(self, measured: _Measurement) -> None:
+        stamps = self._stamps
+        after = bisect_left(stamps, measured.stamp)
+        if stamps[after] == measured.stamp:
+            pose = self._poses[after]
+        elif after == 0:
+            self._reject(measured.frame_id, 'before_odometry')
+            return
+        else:
+            gap = stamps[after] - stamps[after - 1]
+            if gap > self.parameters.max_pose_gap * NANOSECONDS:
+                self._reject(measured.frame_id, 'pose_gap')
+                return
+            apart = math.dist(self._poses[after - 1][:2], self._poses[after][:2])
+            if apart > STRIDE + FASTEST * gap / NANOSECONDS:
+                self._reject(measured.frame_id, 'pose_jump')
+                return
+            fraction = (measured.stamp - stamps[after - 1]) / gap
+            pose = interpolate(self._poses[after - 1], self._poses[after], fraction)
+        self._mount(measured, pose)
+
+    def _mount(self, measured: _Measurement, pose: Pose2) -> None:
+        """Add the sensor's pose on the robot to the robot's, and keep the reading."""
+        mount = self._mounts(self.base_frame, measured.frame_id, measured.stamp)
+        if isinstance(mount, Later):
+            self._held.append((measured, pose))
+            return
+        if mount is None:
+            self._reject_unknown(measured)
+            return
+        sensor = pose.compose(mount)
+        reason = self._misfit(sensor, measured)
+        if reason:
+            self._reject(measured.frame_id, reason)
+            return
+        self.buffer.append(
+            measured.frame_id,
+            x=sensor.x,
+            y=sensor.y,
+            yaw=sensor.yaw,
+            z=measured.z,
+            z_max=measured.z_max,
+            half_angle=measured.half_angle,
+            sigma=measured.sigma,
+            stamp=measured.stamp,
+        )
+
+    def _reach(self, measured: _Measurement) -> float:
+        """Return how far from the sensor the maps take note of a reading, and two cells more, in metres."""
+        p = self._all
+        cell = p.grid.resolution
+        explained = measured.z + p.model.cut * max(measured.sigma or p.model.sigma, cell / 2)
+        return max(min(explained, measured.z_max), measured.z + max(p.live.live_depth, cell / 2)) + 2 * cell
+
+    def _misfit(self, sensor: Pose2, measured: _Measurement) -> str:
+        """Return why the map cannot grow to hold a reading; if it can, note that it does."""
+        reach = self._reach(measured)
+        cell = self._all.grid.resolution
+        if not _possible(sensor):
+            return 'too_far_away'
+        left, right, bottom, top = self._box
+        if left <= right:
+            away = max(left - sensor.x, sensor.x - right, bottom - sensor.y, sensor.y - top)
+            if away > self.parameters.max_jump:
+                return 'far_from_map'
+        box = (
+            min(left, sensor.x - reach),
+            max(right, sensor.x + reach),
+            min(bottom, sensor.y - reach),
+            max(top, sensor.y + reach),
+        )
+        if not ((box[1] - box[0]) / cell + 1) * ((box[3] - box[2]) / cell + 1) <= self._all.grid.max_cells:
+            return 'too_far_away'
+        if measured.half_angle * (reach / cell) ** 2 > LARGEST_CONE:
+            return 'large_cone'
+        self._box = box
+        return ''

@@ -1,0 +1,102 @@
+"""REP 117: what one Range message says, or why it is rejected."""
+
+from __future__ import annotations
+
+import math
+
+from ..common.parameters import PlacingParameters
+from .message_types import RangeMessage
+
+REASONS = {
+    'nan_range': 'the range is not a number',
+    'too_near': 'the range is -inf, or less than a millimetre: something too near to measure, or a dead sensor',
+    'below_min_range': 'the range is below min_range',
+    'over_range': 'no echo, and over_range is "discard"',
+    'bad_limits': 'min_range or max_range is negative, not finite, or max_range is not above min_range',
+    'bad_field_of_view': 'the field of view is not between 0 and 180 degrees; parameter field_of_view overrides it',
+    'empty_frame_id': 'the header has no frame_id, so the sensor is unknown',
+    'long_frame_id': 'the frame_id has more than 255 characters',
+    'unknown_mount': 'nothing tells where this frame is on the robot: give --sensor, a YAML or a transform',
+    'before_odometry': 'the stamp is before the first odometry, or the message came minutes late',
+    'after_odometry': 'the recording ended before odometry reached the stamp',
+    'no_odometry': 'odometry did not reach the stamp within pose_timeout',
+    'pose_gap': 'odometry has a gap longer than max_pose_gap here',
+    'pose_jump': 'odometry jumps here, faster than anything drives',
+    'from_the_future': 'odometry went on for pose_timeout and is still before the stamp; is the sensor ahead?',
+    'time_jump': 'the clock jumped back while the reading waited for its pose',
+    'too_many_waiting': 'too many readings waited for odometry at once',
+    'too_far_away': 'the map would have more than max_cells cells; are pose and max_range right?',
+    'far_from_map': 'the reading is farther than max_jump from all that is mapped; if the pose is right, reset',
+    'large_cone': 'the cone has millions of cells; are range, field of view and resolution right?',
+    'paused': 'the mapper was paused',
+}
+"""Why a reading is rejected, in words."""
+
+
+ODOMETRY_REASONS = {
+    'bad_pose': 'the pose is not finite, absurdly far away, or its quaternion is not normalised',
+    'long_frame_id': 'the frame_id or child_frame_id has more than 255 characters',
+    'other_frame': 'the frame_id or child_frame_id is not that of the first odometry message; reset takes the new',
+}
+"""Why an odometry message is rejected, in words."""
+
+
+NEAREST = 0.001
+"""Metres below which a range is none: what drivers send of a sensor that is dead."""
+
+
+LONGEST_NAME = 255
+"""Characters of a frame's name."""
+
+
+class _Measurement:
+    """A Range that passed REP 117: what it says, before it is placed. Order is that of stamps, then of arrival."""
+
+    __slots__ = ('arrival', 'frame_id', 'half_angle', 'newest', 'number', 'sigma', 'stamp', 'z', 'z_max')
+
+    def __init__(self, message: RangeMessage, z: float, z_max: float, half_angle: float, sigma: float) -> None:
+        self.stamp, self.frame_id = message.stamp, message.frame_id
+        self.z, self.z_max, self.half_angle, self.sigma = z, z_max, half_angle, sigma
+        self.number, self.arrival = 0, 0.0
+        self.newest: int | None = None
+
+    def __lt__(self, other: _Measurement) -> bool:
+        return (self.stamp, self.number) < (other.stamp, other.number)
+
+
+def measure(message: RangeMessage, parameters: PlacingParameters) -> _Measurement | str:
+    """Apply REP 117 and the overrides to one Range message; return what it says, or the reason of its rejection.
+
+    A fixed-distance ranger (min_range = max_range) answers -inf for "something within max_range" and +inf for
+    "nothing". The former says no more than that the range lies in (0, max_range), and is taken as half of it with a
+    σ of one twelfth, which spans most of the interval at ±5 σ.
+    """
+    if not message.frame_id:
+        return 'empty_frame_id'
+    if len(message.frame_id) > LONGEST_NAME:
+        return 'long_frame_id'
+    angle = parameters.field_of_view or message.field_of_view
+    if not 0.0 < angle < math.pi:
+        return 'bad_field_of_view'
+    fixed = message.min_range == message.max_range
+    z_max = parameters.max_range or message.max_range
+    if not (0.0 < z_max < math.inf and 0.0 <= message.min_range and (fixed or message.min_range < z_max)):
+        return 'bad_limits'
+    z, sigma = message.range, 0.0
+    if 0.0 < message.variance < math.inf:
+        sigma = math.sqrt(message.variance)
+    if math.isnan(z):
+        return 'nan_range'
+    if z == -math.inf:
+        if not fixed:
+            return 'too_near'
+        z, sigma = z_max / 2, z_max / 12
+    elif z < (0.0 if fixed else message.min_range):
+        return 'below_min_range'
+    elif z < NEAREST:
+        return 'too_near'
+    if z >= z_max:
+        if parameters.over_range == 'discard':
+            return 'over_range'
+        z = z_max
+    return _Measurement(message, z, z_max, angle / 2, sigma)

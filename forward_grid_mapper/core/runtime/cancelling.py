@@ -1,0 +1,14 @@
+"""Cancelling of long work from another thread."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..common.errors import Cancelled
+
+
+def check(stop: NDArray[np.uint8]) -> None:
+    """Raise `Cancelled` if `stop` is set."""
+    if stop[0]:
+        raise Cancelled('the work was cancelled; nothing was changed')

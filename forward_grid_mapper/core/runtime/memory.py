@@ -1,0 +1,84 @@
+"""How much memory a run of EM takes at the least, and how much there is.
+
+Linux grants more memory than it has and ends the process that uses it. A run that cannot fit must therefore not begin,
+or it takes the readings and the live map with it.
+"""
+
+from __future__ import annotations
+
+import resource
+from pathlib import Path
+
+from ..common.parameters import Parameters
+from ..common.readings import Readings
+from ..maps.log_odds_map import arc_depth
+from ..sensor.cone_table import grid_of
+
+BYTES_A_READING = 400
+"""What the search keeps for a reading without its pairs, twice over where arrays are sorted or grow."""
+
+BYTES_A_CELL = 60
+
+CGROUP = Path('/sys/fs/cgroup')
+
+
+def least_memory(readings: Readings, parameters: Parameters) -> int:
+    """Return the bytes that EM of these readings takes at the least, without memory for pairs."""
+    p = parameters
+    cells = grid_of(readings, p.model, p.grid, beyond=arc_depth(p)).size if len(readings) else 0
+    return cells * BYTES_A_CELL + len(readings) * BYTES_A_READING
+
+
+def memory_for_pairs(parameters: Parameters) -> float:
+    """Return the bytes that pairs may take: what the parameters admit, or what is free if that is less."""
+    free = free_memory()
+    asked = parameters.search.max_memory * 1e6
+    # half of it, since others live here as well
+    return asked if free is None else min(asked, free / 2)
+
+
+def free_memory() -> int | None:
+    """Return the bytes that this process can still take: of the machine, its control group, and its own limit.
+
+    None where none of them is told.
+    """
+    known = [value for value in (_of_the_machine(), _of_the_group(), _of_the_process()) if value is not None]
+    return max(min(known), 0) if known else None
+
+
+def shortage(readings: Readings, parameters: Parameters) -> str:
+    """Return why EM of these readings cannot fit the memory; empty if it may."""
+    free, needed = free_memory(), least_memory(readings, parameters)
+    if free is None or needed <= free:
+        return ''
+    return (
+        f'EM of {len(readings)} readings takes {needed / 1e9:.1f} GB at the least, and {free / 1e9:.1f} GB are free; '
+        f'lower max_readings, use a coarser resolution, or reset'
+    )
+
+
+def _of_the_machine() -> int | None:
+    return _kilobytes(Path('/proc/meminfo'), 'MemAvailable:')
+
+
+def _of_the_process() -> int | None:
+    limit = resource.getrlimit(resource.RLIMIT_AS)[0]
+    used = _kilobytes(Path('/proc/self/status'), 'VmSize:')
+    return None if limit == resource.RLIM_INFINITY or used is None else limit - used
+
+
+def _of_the_group() -> int | None:
+    try:
+        limit = (CGROUP / 'memory.max').read_text().strip()
+        used = int((CGROUP / 'memory.current').read_text())
+        return None if limit == 'max' else int(limit) - used
+    except (OSError, ValueError):
+        return None
+
+
+def _kilobytes(path: Path, key: str) -> int | None:
+    try:
+        line = next(line for line in path.read_text().splitlines() if line.startswith(key))
+        return int(line.split()[1]) * 1024
+    except (OSError, StopIteration, ValueError, IndexError):
+        return None

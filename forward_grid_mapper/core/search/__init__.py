@@ -1,0 +1,1 @@
+"""The search for the maximum likelihood map, and the prior of maps."""

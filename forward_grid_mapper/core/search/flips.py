@@ -1,0 +1,116 @@
+"""Flips of single cells: which of them gain, and many of them at once or one after the other."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..common.readings import Floats
+from ..evidence.fixed_point import QUANTUM
+from ..evidence.state import State
+from ..evidence.updates import flip
+from ..runtime.jit import kernel
+from .prior import Prior, prior_gain
+
+
+@kernel
+def gain_of(s: State, prior: Prior, c: int) -> float:
+    """Return what flipping cell c gains, prior included, in nats."""
+    data = s.maps.evidence[c] * QUANTUM
+    return float(data + prior_gain(prior, s.maps.occupied, s.maps.pattern, c, s.lattice.width))
+
+
+WORTH_WAITING = 0.5
+"""Share of the gain it had when the sweep began that a cell must still have to be flipped in the same sweep."""
+
+
+Least = tuple[float, float]
+"""Nats that a flip must gain, and what it must gain more for every reading that sees the cell."""
+
+
+@kernel
+def _least(s: State, least: Least, c: int) -> float:
+    return float(least[0] + least[1] * s.maps.seen[c])
+
+
+@kernel
+def promising(s: State, prior: Prior, least: Least, window: tuple[int, int, int, int], cells: Any, gains: Any) -> int:
+    """List the cells whose flip gains more than `least`, and what they gain; return their number.
+
+    `window` is where to look: first row, last one plus one, and columns likewise.
+    """
+    maps, width = s.maps, s.lattice.width
+    occupied, evidence, seen, pattern = maps.occupied, maps.evidence, maps.seen, maps.pattern
+    n = 0
+    for row in range(window[0], window[1]):
+        for c in range(np.uint64(row * width + window[2]), np.uint64(row * width + window[3])):
+            if not seen[c]:
+                continue
+            data = evidence[c] * QUANTUM
+            if occupied[c] or pattern[c]:
+                gain = data + prior_gain(prior, occupied, pattern, int(c), width)
+            else:
+                gain = data + prior.local[c] + prior.shape[0]
+            if gain > least[0] + least[1] * seen[c]:
+                cells[n] = c
+                gains[n] = gain
+                n += 1
+    return n
+
+
+@kernel
+def highest(s: State, cells: NDArray[np.int64], gains: Floats, room: Floats) -> NDArray[np.bool_]:
+    """Tell which of `cells` gain more than those of their eight neighbours that gain as well; of equals, the first.
+
+    `room` (float64, shape (cells of the map,)) must be 0, and is left so.
+    """
+    height, width = s.lattice.height, s.lattice.width
+    for i in range(len(cells)):
+        room[cells[i]] = gains[i]
+    chosen = np.ones(len(cells), np.bool_)
+    for i in range(len(cells)):
+        row, column = cells[i] // width, cells[i] % width
+        for y in range(max(row - 1, 0), min(row + 2, height)):
+            for x in range(max(column - 1, 0), min(column + 2, width)):
+                o = y * width + x
+                if room[o] > gains[i] or (room[o] == gains[i] and o < cells[i]):
+                    chosen[i] = False
+    for i in range(len(cells)):
+        room[cells[i]] = 0.0
+    return chosen
+
+
+@kernel
+def flip_in_order(s: State, prior: Prior, least: Least, cells: NDArray[np.int64], gains: Floats) -> tuple[int, float]:
+    """Flip those of `cells`, in order, that still gain enough; return their number and total gain.
+
+    `gains` is what they gained when the sweep began. A cell that lost much of that since, to the flip of another one,
+    waits for the next sweep, where it may find itself behind a better one.
+    """
+    flips, total = 0, 0.0
+    for i in range(len(cells)):
+        if s.stop[0]:
+            break
+        gain = gain_of(s, prior, cells[i])
+        if gain > max(_least(s, least, cells[i]), WORTH_WAITING * gains[i]):
+            flip(s, cells[i])
+            flips += 1
+            total += gain
+    return flips, total
+
+
+@kernel
+def free_needless(s: State, prior: Prior, least: Least, cells: NDArray[np.int64]) -> tuple[int, float]:
+    """Free those of `cells`, occupied ones, that cost nothing but rounding to free; return their number and gain."""
+    flips, total = 0, 0.0
+    for c in cells:
+        if s.stop[0]:
+            break
+        gain = gain_of(s, prior, c)
+        if s.maps.seen[c] and gain >= -least[1] * s.maps.seen[c]:
+            flip(s, c)
+            flips += 1
+            total += gain
+    return flips, total

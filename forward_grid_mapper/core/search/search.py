@@ -1,0 +1,269 @@
+"""The search for the maximum likelihood map: EM with flips in both directions, and moves.
+
+First come rounds in which all cells flip at once that gain, and gain more than their neighbours. They begin with far
+too many occupied cells and thin them out, which leads to better maps than to add one cell at a time, and takes a few
+passes over the readings. When rounds no longer help, sweeps go over the cells that gain, most promising first, until
+no single flip gains anything; then occupied cells are moved to neighbours, and so on until neither gains. Ties keep
+the state, but for occupied cells at the end that nothing needs: those are freed.
+
+All this happens twice: at first as if the cells of a map were independent, then, from the map found so, with what the
+prior says of walls (`prior`), and with bridges (`bridges`) when nothing else gains. In either part the objective
+
+    J(m) = log p(Z | m) + log p(m)
+
+never falls, and at the end no single flip raises it by more than `LEAST_GAIN` and the cell's share of `ROUNDING`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..common.parameters import SearchParameters
+from ..evidence.evidence import Evidence
+from ..evidence.state import State
+from ..runtime.cancelling import check
+from ..sensor.cone_table import Floats
+from .gap_closing import build_bridges
+from .moves import (
+    best_shifts,
+    flip_in_order,
+    free_needless,
+    highest,
+    promising,
+    see_any,
+    shift_in_order,
+    try_shifts,
+    unsettle,
+)
+from .prior import Prior, local_prior, log_prior, shapes
+
+LEAST_GAIN = 1e-4
+"""Nats that a flip must gain."""
+
+ROUNDING = 2e-7
+"""Nats that it must gain in addition for each of the cell's readings: what float32 ratios may be off, so that the
+search cannot go round, not even where ten thousand readings are off to the same side."""
+
+LEAST = (LEAST_GAIN, ROUNDING)
+
+FEW = 32
+"""Flips in a round below which sweeps are faster."""
+
+
+LITTLE = 0.005
+"""Share of all that was gained which a round must add for another one to follow."""
+
+
+@dataclass(frozen=True)
+class Progress:
+    """Where a search stands: sweeps done, flips and moves made so far, gain in nats since the start."""
+
+    sweeps: int
+    flips: int
+    shifts: int
+    gain: float
+
+
+@dataclass(frozen=True)
+class SearchResult:
+    """The map found, and how.
+
+    Attributes
+    ----------
+    occupied : uint8, shape (cells,)
+        1 occupied, 0 free; cells that no reading touches are 0.
+    evidence : float64, shape (cells,)
+        log p(Z | cell occupied, rest of the map) − log p(Z | cell free, rest of the map) in nats, 0 where untouched.
+    prior : Prior
+        That which the map was found with.
+    log_prior : float
+        That of the map, up to a constant.
+    progress : Progress
+    converged : bool
+        False when `max_sweeps` ended the search.
+    """
+
+    occupied: NDArray[np.uint8]
+    evidence: Floats
+    prior: Prior
+    log_prior: float
+    progress: Progress
+    converged: bool
+
+
+Window = tuple[int, int, int, int]
+Watch = Callable[[Progress], None]
+
+
+class Search:
+    """One search; its map so far is `evidence.state.maps.occupied`, which another thread may read at any time."""
+
+    def __init__(
+        self,
+        evidence: Evidence,
+        parameters: SearchParameters,
+        driven: NDArray[np.bool_] | None = None,
+        window: Window | None = None,
+    ) -> None:
+        """Start from the map that `evidence` has.
+
+        Parameters
+        ----------
+        evidence : Evidence
+        parameters : SearchParameters
+        driven : bool, shape (cells,), optional
+            Cells over which sensors were moved.
+        window : optional
+            First row, last one plus one, and columns likewise, of the cells that may change; by default all.
+        """
+        self.evidence, self._parameters = evidence, parameters
+        height, width = evidence.grid.shape
+        self._window = window or (0, height, 0, width)
+        driven = np.zeros(evidence.grid.size, np.bool_) if driven is None else driven
+        self._whole = Prior(local_prior(parameters, driven), shapes(parameters))
+        # as if cells were independent
+        self._prior = self._whole._replace(shape=np.zeros(256))
+        self._settled = np.zeros(evidence.grid.size, np.uint8)
+        self._tried_at = -1
+        self.progress = Progress(0, 0, 0, 0.0)
+
+    def _advance(self, flips: int, shifts: int, gain: float, watch: Watch) -> None:
+        check(self.evidence.state.stop)
+        p = self.progress
+        self.progress = Progress(p.sweeps + 1, p.flips + flips, p.shifts + shifts, p.gain + gain)
+        watch(self.progress)
+
+    def _more(self) -> bool:
+        return self.progress.sweeps < self._parameters.max_sweeps
+
+    def _objective(self) -> float:
+        maps = self.evidence.state.maps
+        return self.evidence.log_likelihood + log_prior(self._prior, maps.occupied, maps.pattern)
+
+    def run(self, watch: Watch = lambda progress: None) -> SearchResult:
+        """Search until no flip and no move gains; `watch` hears of every sweep.
+
+        Raises
+        ------
+        Cancelled
+            If `stop` was set.
+        """
+        while self._more() and self._round(watch):
+            pass
+        return self.refine(watch)
+
+    def refine(self, watch: Watch = lambda progress: None) -> SearchResult:
+        """Do as `run` does, but without the rounds at the beginning."""
+        converged = self._climb(watch)
+        if self._whole.shape.any():
+            self._prior = self._whole
+            self._settled[:] = 0
+            converged = self._climb(watch)
+        maps = self.evidence.state.maps
+        return SearchResult(
+            maps.occupied,
+            self.evidence.of_occupancy(),
+            self._prior,
+            log_prior(self._prior, maps.occupied, maps.pattern),
+            self.progress,
+            converged,
+        )
+
+    def _climb(self, watch: Watch) -> bool:
+        """Flip, shift and bridge until nothing gains; return whether that was reached."""
+        p = self._parameters
+        while self._more():
+            if self._sweep(watch) or (p.shift_moves and self._shift(watch)) or (p.bridges > 1 and self._bridge(watch)):
+                continue
+            if not self._free(watch):
+                return True
+        return False
+
+    def _occupied(self) -> NDArray[np.int64]:
+        """Return the occupied cells in the window."""
+        bottom, top, left, right = self._window
+        width = self.evidence.grid.width
+        rows, columns = np.nonzero(self.evidence.state.maps.occupied.reshape(-1, width)[bottom:top, left:right])
+        return np.asarray((rows + bottom) * width + columns + left)
+
+    def _promising(self) -> tuple[NDArray[np.int64], Floats]:
+        """Return the cells whose flip gains, the best first, and what they gain."""
+        bottom, top, left, right = self._window
+        cells, gains = np.empty((top - bottom) * (right - left), np.int64), np.empty((top - bottom) * (right - left))
+        n = promising(self.evidence.state, self._prior, LEAST, self._window, cells, gains)
+        order = np.argsort(-gains[:n], kind='stable')
+        return cells[order], gains[order]
+
+    def _round(self, watch: Watch) -> bool:
+        """Flip all that gain more than their neighbours at once; return whether that helped."""
+        maps = self.evidence.state.maps
+        cells, gains = self._promising()
+        cells = cells[highest(self.evidence.state, cells, gains, np.zeros(self.evidence.grid.size))]
+        if len(cells) < FEW:
+            return False
+        before = self._objective()
+        maps.occupied[cells] ^= 1
+        self.evidence.rebuild()
+        gain = self._objective() - before
+        if gain <= 0:
+            maps.occupied[cells] ^= 1
+            self.evidence.rebuild()
+            return False
+        self._advance(len(cells), 0, gain, watch)
+        return gain > LITTLE * self.progress.gain
+
+    def _sweep(self, watch: Watch) -> int:
+        cells, gains = self._promising()
+        if not len(cells):
+            return 0
+        flips, gain = flip_in_order(self.evidence.state, self._prior, LEAST, cells, gains)
+        self._advance(flips, 0, gain, watch)
+        return flips
+
+    def _shift(self, watch: Watch) -> int:
+        evidence, s = self.evidence, self.evidence.state
+        if self._tried_at >= 0:
+            unsettle(s, self._tried_at, self._settled)
+        self._tried_at = int(s.clock[0])
+        cells = self._occupied()
+        cells = cells[self._settled[cells] == 0]
+        self._settled[cells] = 1
+        slot = np.full(evidence.grid.size, -1, np.int32)
+        slot[cells] = np.arange(len(cells), dtype=np.int32)
+        sees = np.ones(len(evidence), np.uint8)
+        if s.maps.seen[cells].sum() < len(evidence):
+            sees[:] = 0
+            see_any(s, cells, sees)
+        readings = np.flatnonzero(sees)
+        joints = []
+
+        def work(s: State, begin: int, end: int) -> None:
+            place, joint = np.full(len(slot), -1, np.int32), np.zeros((len(cells), 9), np.int64)
+            joints.append(joint)
+            try_shifts(s, readings[begin:end], slot, place, joint)
+
+        evidence.each(0, len(readings), work)
+        joint = np.sum(joints, axis=0)
+        targets, gains = best_shifts(s, self._prior, LEAST, cells, joint)
+        order = np.argsort(-gains, kind='stable')[: int((targets >= 0).sum())]
+        shifts, gain = shift_in_order(s, self._prior, LEAST, cells[order], targets[order])
+        self._advance(0, shifts, gain, watch)
+        return shifts
+
+    def _free(self, watch: Watch) -> int:
+        """Free cells that nothing needs, as rounds leave them where the prior does not speak against them."""
+        cells = self._occupied()
+        flips, gain = free_needless(self.evidence.state, self._prior, LEAST, cells)
+        if flips:
+            self._advance(flips, 0, max(gain, 0.0), watch)
+        return flips
+
+    def _bridge(self, watch: Watch) -> int:
+        s = self.evidence.state
+        flips, gain = build_bridges(s, self._prior, LEAST, self._occupied(), self._parameters.bridges)
+        self._advance(flips, 0, gain, watch)
+        return flips

@@ -1,0 +1,206 @@
+"""The search's moves: single flips, many flips together, and shifts of occupied cells to a neighbour.
+
+A shift frees cell c and occupies its neighbour o. What it gains follows from the single flips, since T is linear in
+each cell's share. For a reading that sees both, with likelihood ratios r_c and r_o of the single flips and
+q = 1 − p_hit, both together have the ratio
+
+    o behind c              r_c + (r_o − 1) / q
+    o in front of c         r_o + q (r_c − 1)
+    both in the free zone   1
+
+so that all shifts are tried in one pass over the readings, and none is made but those that gain.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..evidence.fixed_point import QUANTUM
+from ..evidence.neighbourhood import note_flip
+from ..evidence.pairs import WORDS_PER_RUN, Pairs, make
+from ..evidence.state import State
+from ..evidence.updates import explain, find_seers, flip
+from ..runtime.jit import kernel
+from ..sensor.cone_table import Floats
+from .flips import Least, _least, gain_of
+from .prior import Prior
+
+LEAST_JOINT = 1e-9
+"""Ratios of shifts are differences, and rounding may leave nothing of the smallest."""
+
+
+@kernel
+def unsettle(s: State, since: int, settled: Any) -> None:
+    """Mark the cells of all readings that changed after the clock was `since` as not settled."""
+    bench = s.bench
+    for t in range(len(s.shares)):
+        share = s.shares[t]
+        if share.changed > since:
+            pairs, at = (s.pairs, share.at) if share.stored else (bench.pairs, 0)
+            if not share.stored:
+                make(s.cones, s.lattice, s.facing, t, bench.pairs, 0, bench)
+            begin = at + WORDS_PER_RUN * share.runs
+            for k in range(at, begin, WORDS_PER_RUN):
+                settled[pairs.cell[k] : pairs.cell[k + 1] + 1] = 0
+            for k in range(begin, begin + share.bands):
+                settled[pairs.cell[k]] = 0
+
+
+@kernel
+def see_any(s: State, cells: NDArray[np.int64], sees: Any) -> None:
+    """Mark in `sees` (uint8, shape (N,)) the readings that see any of `cells`."""
+    for c in cells:
+        for i in range(find_seers(s, c)):
+            sees[s.seers[i, 0]] = 1
+
+
+@kernel
+def _in_runs(pairs: Pairs, at: int, runs: int, c: int) -> bool:
+    for k in range(at, at + WORDS_PER_RUN * runs, WORDS_PER_RUN):
+        if c <= pairs.cell[k + 1]:
+            return bool(c >= pairs.cell[k])
+    return False
+
+
+@kernel
+def _add_joint(s: State, share: Any, pairs: Pairs, at: int, cell: tuple[int, int], place: Any, joint: Any) -> None:
+    """Add to `joint` (9,) what a reading says of shifting a cell to each of its neighbours, beyond the two flips.
+
+    Parameters
+    ----------
+    cell
+        The cell, and its place in the band, or -1 if it is in the free zone.
+    place : int32, shape (cells,)
+        Places in the band, -1 elsewhere.
+    """
+    c, here = cell
+    height, width = s.lattice.height, s.lattice.width
+    q = 1.0 - s.model.p_hit
+    logs = at + WORDS_PER_RUN * share.runs + 2 * share.bands
+    own = pairs.log[logs + here] if here >= 0 else share.release
+    ratio = math.exp(own * QUANTUM)
+    row, column = c // width, c % width
+    for dy in range(-1, 2):
+        for dx in range(-1, 2):
+            if not (0 <= row + dy < height and 0 <= column + dx < width) or (dx == 0 and dy == 0):
+                continue
+            o = c + dy * width + dx
+            if s.maps.occupied[o]:
+                continue
+            there = place[o]
+            if there >= 0:
+                log = pairs.log[logs + there]
+                other = math.exp(log * QUANTUM)
+                together = ratio + (other - 1.0) / q if there > here else other + q * (ratio - 1.0)
+            elif _in_runs(pairs, at, share.runs, o):
+                log = share.occupy
+                together = math.exp(log * QUANTUM) + q * (ratio - 1.0) if here >= 0 else 1.0
+            else:
+                continue
+            gain = math.log(max(together, LEAST_JOINT)) / QUANTUM - own - log
+            joint[3 * dy + dx + 4] += share.weight * int(math.floor(gain + 0.5))
+
+
+@kernel
+def try_shifts(s: State, readings: Any, slot: Any, place: Any, joint: Any) -> None:
+    """Compute what some readings say of shifts, beyond the two flips, in units of `logs.QUANTUM`.
+
+    Parameters
+    ----------
+    readings : int64
+        Which readings.
+    slot : int32, shape (cells,)
+        Row of `joint` of each cell that is to be tried, -1 elsewhere.
+    place : int32, shape (cells,)
+        Room to work in; all -1, and left so.
+    joint : int64, shape (rows, 9)
+        By neighbour, row by row; added to. What it says of occupied neighbours means nothing.
+    """
+    bench = s.bench
+    for t in readings:
+        if s.stop[0]:
+            break
+        share = s.shares[t]
+        pairs, at = (s.pairs, share.at) if share.stored else (bench.pairs, 0)
+        if not share.stored:
+            make(s.cones, s.lattice, s.facing, t, bench.pairs, 0, bench)
+            explain(s.model, share, s.maps.occupied, bench.pairs, 0, s.ratios, bench.new)
+            log = WORDS_PER_RUN * share.runs + 2 * share.bands
+            for k in range(share.bands):
+                bench.pairs.log[log + k] = bench.new[k]
+        cells = at + WORDS_PER_RUN * share.runs
+        n = 0
+        for k in range(share.bands):
+            if slot[pairs.cell[cells + k]] >= 0:
+                bench.bucket[n] = k
+                n += 1
+        if not n and not share.blocking:
+            continue
+        for k in range(share.bands):
+            place[pairs.cell[cells + k]] = k
+        for i in range(n):
+            k = bench.bucket[i]
+            c = int(pairs.cell[cells + k])
+            _add_joint(s, share, pairs, at, (c, k), place, joint[slot[c]])
+        if share.blocking:
+            for k in range(at, cells, WORDS_PER_RUN):
+                for c in range(pairs.cell[k], pairs.cell[k + 1] + 1):
+                    if slot[c] >= 0:
+                        _add_joint(s, share, pairs, at, (c, -1), place, joint[slot[c]])
+        for k in range(share.bands):
+            place[pairs.cell[cells + k]] = -1
+
+
+@kernel
+def best_shifts(
+    s: State, prior: Prior, least: Least, cells: NDArray[np.int64], joint: Any
+) -> tuple[NDArray[np.int64], Floats]:
+    """Return for each of `cells` the free neighbour to which a shift gains most, -1 if none does, and what it gains."""
+    height, width = s.lattice.height, s.lattice.width
+    targets, gains = np.full(len(cells), -1, np.int64), np.zeros(len(cells))
+    for i in range(len(cells)):
+        c = cells[i]
+        row, column = c // width, c % width
+        loss = gain_of(s, prior, c)
+        # the prior of the neighbours depends on this cell
+        s.maps.occupied[c] ^= 1
+        note_flip(s.maps.pattern, c, height, width)
+        for k in range(9):
+            y, x = row + k // 3 - 1, column + k % 3 - 1
+            o = y * width + x
+            if k == 4 or not (0 <= y < height and 0 <= x < width) or s.maps.occupied[o] or not s.maps.seen[o]:
+                continue
+            gain = loss + gain_of(s, prior, o) + joint[i, k] * QUANTUM
+            if gain > max(gains[i], _least(s, least, c) + _least(s, least, o)):
+                targets[i], gains[i] = o, gain
+        s.maps.occupied[c] ^= 1
+        note_flip(s.maps.pattern, c, height, width)
+    return targets, gains
+
+
+@kernel
+def shift_in_order(
+    s: State, prior: Prior, least: Least, cells: NDArray[np.int64], targets: NDArray[np.int64]
+) -> tuple[int, float]:
+    """Make those shifts, in order, that still gain; return their number and total gain."""
+    moves, total = 0, 0.0
+    for i in range(len(cells)):
+        c, o = cells[i], targets[i]
+        if s.stop[0]:
+            break
+        if not s.maps.occupied[c] or s.maps.occupied[o]:
+            continue
+        loss = gain_of(s, prior, c)
+        flip(s, c)
+        gain = loss + gain_of(s, prior, o)
+        if gain > _least(s, least, c) + _least(s, least, o):
+            flip(s, o)
+            moves += 1
+            total += gain
+        else:
+            flip(s, c)
+    return moves, total

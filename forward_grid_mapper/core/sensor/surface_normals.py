@@ -1,0 +1,131 @@
+"""Which way surfaces face, and which readings only graze them.
+
+Sound that meets a smooth surface at a slant does not come back. So a reading that reaches past a surface contradicts it
+only if it met the surface nearly along its normal. Most of what speaks against walls that are there, in recordings
+of real sonars, comes from readings that graze them.
+
+The normal is estimated before any search, from the echoes alone. Near a surface the bearings of those readings whose
+range agrees gather around its normal; φ and φ + π are one, so 2φ is averaged, over the 3 x 3 cells around:
+
+    C = Σ w cos 2φ      S = Σ w sin 2φ      M = Σ w      w = exp(−(d − z)² / 2σ²)      normal = atan2(S, C) / 2
+
+It counts as known where M and √(C² + S²) / M are large enough.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..runtime.jit import kernel
+from .cone import row_runs
+from .cone_table import Cones, cone_of
+
+LEAST_WEIGHT = 3.0
+"""Echoes, in the sum M, that it takes to know a normal."""
+
+LEAST_AGREEMENT = 0.5
+"""Length of the mean of the doubled bearings that it takes, 1 where all agree."""
+
+THROUGH = 2.0
+"""A reading that grazes a cell does not contradict it if its range is this many σ beyond."""
+
+QUANTUM = 2.0**-20
+"""Unit of the sums, which as whole numbers do not depend on their order."""
+
+
+class Facing(NamedTuple):
+    """The normals of surfaces.
+
+    Attributes
+    ----------
+    known : uint8, shape (cells,)
+    x, y : float32, shape (cells,)
+        Unit vector along the normal, either way.
+    before : int32, shape (height, width + 1)
+        Number of known cells in each row before a column.
+    slant : float
+        Squared cosine of the angle off the normal above which a reading grazes; 0 if none does.
+    """
+
+    known: NDArray[np.uint8]
+    x: NDArray[np.float32]
+    y: NDArray[np.float32]
+    before: NDArray[np.int32]
+    slant: float
+
+
+def no_facing() -> Facing:
+    """Return that no reading grazes."""
+    none = np.zeros(0, np.float32)
+    return Facing(np.zeros(0, np.uint8), none, none, np.zeros((1, 1), np.int32), 0.0)
+
+
+@kernel
+def gather(cones: Cones, shape: tuple[int, int], nearest: bool, part: tuple[int, int], sums: Any, stop: Any) -> None:
+    """Add C, S and M of the readings `part[0]` to `part[1]` to `sums`, int64, shape (3, cells), in units of QUANTUM."""
+    height, width = shape
+    for t in range(part[0], part[1]):
+        if stop[0]:
+            break
+        reading = cones[t]
+        if reading.z >= reading.z_max:
+            continue
+        cone = cone_of(reading, nearest)
+        low = max(reading.z - 4.0 * reading.sigma, 0.0) ** 2
+        for row in range(max(cone.bottom, 0), min(cone.top, height - 1) + 1):
+            v = row + 0.5 - cone.y
+            a, b, c, d = row_runs(cone, row, reading.reach, width, nearest)
+            for begin, end in ((a, b), (c, d)):
+                for column in range(begin, end + 1):
+                    u = column + 0.5 - cone.x
+                    square = u * u + v * v
+                    if square <= low:
+                        continue
+                    error = (math.sqrt(square) - reading.z) / reading.sigma
+                    weight = math.exp(-0.5 * error * error) / QUANTUM
+                    cell = row * width + column
+                    sums[0, cell] += int(weight * (u * u - v * v) / square)
+                    sums[1, cell] += int(weight * 2.0 * u * v / square)
+                    sums[2, cell] += int(weight)
+
+
+def _box(values: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Return the sums over 3 x 3 cells, nothing beyond the edges."""
+    wide = np.pad(values, 1)
+    rows = wide[:-2] + wide[1:-1] + wide[2:]
+    out: NDArray[np.float64] = (rows[:, :-2] + rows[:, 1:-1] + rows[:, 2:]) * QUANTUM
+    return out
+
+
+def facing_of(sums: NDArray[np.int64], shape: tuple[int, int], angle: float) -> Facing:
+    """Return the normals that the sums of `gather` give; readings graze more than `angle` (radians) off them."""
+    cosine, sine, mass = (_box(values.reshape(shape)) for values in sums)
+    agreement = np.hypot(cosine, sine)
+    known = (mass >= LEAST_WEIGHT) & (agreement >= LEAST_AGREEMENT * mass)
+    normal = np.arctan2(sine, cosine) / 2
+    before = np.zeros((shape[0], shape[1] + 1), np.int32)
+    np.cumsum(known, axis=1, out=before[:, 1:])
+    return Facing(
+        known.ravel().view(np.uint8),
+        np.cos(normal).ravel().astype(np.float32),
+        np.sin(normal).ravel().astype(np.float32),
+        before,
+        math.cos(angle) ** 2,
+    )
+
+
+@kernel
+def grazes(facing: Facing, reading: Any, c: int, u: float, v: float) -> bool:
+    """Tell whether a reading meets cell c, at (u, v) from its apex, at a slant, and goes on beyond it."""
+    if not facing.known[c]:
+        return False
+    square = u * u + v * v
+    through = reading.z - THROUGH * reading.sigma
+    if through <= 0.0 or square >= through * through:
+        return False
+    along = u * facing.x[c] + v * facing.y[c]
+    return bool(along * along < facing.slant * square)

@@ -1,0 +1,66 @@
+"""A journal that a node kept becomes placed readings, as a bag does."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from ..commands.console import readable
+from ..core.common.errors import InputError, ParameterError
+from ..core.common.parameters import Parameters
+from ..core.messages.message_types import NANOSECONDS, Pose2
+from ..core.messages.pose_association import Placer
+from ..files.journal_format import Contents, read
+from .drive import Drive, LiveOfAll, thinning_note
+
+
+def read_journal(
+    path: Path,
+    parameters: Parameters,
+    mounts: Mapping[str, Pose2],
+    range_topics: Sequence[str] | None = None,
+    odom_topic: str | None = None,
+) -> Drive:
+    """Read a journal file; its readings are placed already.
+
+    Raises
+    ------
+    BagError
+        If the file cannot be read.
+    InputError
+        If it holds no reading.
+    ParameterError
+        If topics are asked for.
+    """
+    if range_topics or odom_topic:
+        raise ParameterError(f'{path} is a journal, which has no topics; leave out --range-topics and --odom-topic')
+    placer = Placer(lambda base, frame, stamp: None, parameters, patient=True)
+    live = LiveOfAll(placer, parameters)
+    contents = Contents()
+    first, last, names = math.inf, -math.inf, set()
+    for readings in read(path, contents):
+        placer.restore(readings)
+        first, last = min(first, int(readings.stamp.min())), max(last, int(readings.stamp.max()))
+        names |= set(readings.sensor_names)
+    if not len(placer.buffer):
+        raise InputError(f'the journal {path} holds no reading{f": {contents.harm}" if contents.harm else ""}')
+    placer.map_frame, placer.base_frame = contents.map_frame, contents.base_frame
+    for point in contents.path:
+        placer.extend_path(point)
+    warnings = [f'{path.name}: {contents.harm}'] if contents.harm else []
+    if mounts:
+        warnings.append('a journal holds placed readings: the poses of sensors that were given change nothing')
+    source = {
+        'bag': readable(path),
+        'odom_frame': placer.map_frame,
+        'map_frame': placer.map_frame,
+        'base_frame': placer.base_frame,
+        'mounts_from': 'the journal',
+        'stamps': [int(first), int(last)],
+        'duration_s': (last - first) / NANOSECONDS,
+        'path_m': sum(math.dist(a, b) for a, b in zip(placer.path, placer.path[1:], strict=False)),
+        'counts': {'received': placer.received, 'accepted': len(placer.buffer), 'rejected': {}},
+        'warnings': warnings + thinning_note(placer),
+    }
+    return Drive(placer, source, live)

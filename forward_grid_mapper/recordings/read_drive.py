@@ -1,0 +1,193 @@
+"""A recorded drive becomes placed readings: the offline counterpart of the node's subscriptions."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+
+from ..bags.reader import Bag
+from ..bags.static_transforms import StaticTransforms
+from ..commands.console import readable
+from ..core.common.errors import BagError, InputError
+from ..core.common.parameters import Parameters
+from ..core.messages.message_types import NANOSECONDS, Pose2, RangeMessage
+from ..core.messages.pose_association import Placer
+from ..core.messages.rep117 import ODOMETRY_REASONS, REASONS
+from ..files.journal import drive_file
+from .drive import Drive, LiveOfAll, thinning_note
+from .journal_drive import read_journal
+
+__all__ = ['Drive', 'Mounts', 'read_drive']
+
+
+class Mounts:
+    """Where the sensors sit: given by the user, who wins, or by the bag's static transforms."""
+
+    def __init__(self, given: Mapping[str, Pose2], transforms: StaticTransforms) -> None:
+        self._given = {frame.lstrip('/'): pose for frame, pose in given.items()}
+        self._transforms = transforms
+        self._found: dict[tuple[str, str], Pose2 | None] = {}
+        self.used: dict[str, str] = {}
+        self.unusable: dict[str, str] = {}
+
+    def __call__(self, base_frame: str, frame: str, stamp: int) -> Pose2 | None:
+        """Return the pose of a sensor in the base frame; transforms are static, so the stamp does not matter."""
+        key = (base_frame, frame)
+        if key not in self._found:
+            self._found[key] = self._look_up(base_frame, frame)
+        return self._found[key]
+
+    def _look_up(self, base_frame: str, frame: str) -> Pose2 | None:
+        pose = self._given.get(frame.lstrip('/'))
+        if pose is not None:
+            self.used[frame] = 'parameters'
+            return pose
+        try:
+            pose = self._transforms.lookup(base_frame, frame)
+        except InputError as error:
+            self.unusable[frame] = str(error)
+            return None
+        if pose is not None:
+            self.used[frame] = '/tf_static'
+        return pose
+
+    @property
+    def unused(self) -> list[str]:
+        """Frames with a given pose that no reading asked for."""
+        return sorted(set(self._given) - {frame.lstrip('/') for frame in self.used})
+
+    def explain(self, base_frame: str, frames: Sequence[str]) -> str:
+        """Say what to do about frames without a pose."""
+        known = self._transforms.frames
+        told = f'/tf_static joins {", ".join(known[:12])}' if known else 'the bag has no /tf_static'
+        reasons = ''.join(f' {self.unusable[frame]}' for frame in frames if frame in self.unusable)
+        return (
+            f'no pose on the robot (frame {base_frame or "?"}) is known for {", ".join(frames)}: {told}.{reasons} '
+            f'Give --sensor {frames[0]}=x,y,yaw for each, or sensors.{frames[0]}.pose in --params'
+        )
+
+
+def read_drive(
+    path: Path | str,
+    parameters: Parameters,
+    mounts: Mapping[str, Pose2],
+    range_topics: Sequence[str] | None = None,
+    odom_topic: str | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> Drive:
+    """Read a bag and place its readings, or take those of a journal.
+
+    Parameters
+    ----------
+    path : Path or str
+    parameters : Parameters
+    mounts : mapping
+        Poses of sensors in the robot's base frame that win over the bag's `/tf_static`.
+    range_topics, odom_topic
+        Topics to use; by default those found by type.
+    progress : callable, optional
+        Called with (done, total) messages.
+
+    Raises
+    ------
+    BagError
+        If the bag cannot be read, or the topics are not there or ambiguous.
+    InputError
+        If not a single reading could be placed; says why.
+    """
+    journal = drive_file(Path(path))
+    if journal is not None:
+        return read_journal(journal, parameters, mounts, range_topics, odom_topic)
+    with Bag(path) as bag:
+        topics = bag.choose_topics(range_topics, odom_topic)
+        lookup = Mounts(mounts, bag.static_transforms())
+        placer = Placer(lookup, parameters, patient=True)
+        live = LiveOfAll(placer, parameters)
+        spans: dict[str, list[int]] = {'ranges': [], 'odometry': []}
+        for message in bag.messages(topics, progress):
+            ranged = isinstance(message, RangeMessage)
+            span = spans['ranges' if ranged else 'odometry']
+            if not span:
+                span += [message.stamp, message.stamp]
+            span[:] = min(span[0], message.stamp), max(span[1], message.stamp)
+            if isinstance(message, RangeMessage):
+                placer.add_range(message)
+            else:
+                placer.add_odometry(message)
+        placer.finish()
+        undecodable = dict(bag.undecodable)
+        warnings = _warnings(bag, placer, lookup)
+    if not len(placer.buffer):
+        raise _nothing_placed(placer, lookup, spans, undecodable)
+    stamps = placer.readings.stamp
+    source = {
+        'bag': readable(path),
+        'range_topics': list(topics.range_topics),
+        'odom_topic': topics.odom_topic,
+        'odom_frame': placer.map_frame,
+        'map_frame': placer.map_frame,
+        'base_frame': placer.base_frame,
+        'mounts_from': ' and '.join(sorted(set(lookup.used.values()))),
+        'stamps': [int(stamps.min()), int(stamps.max())],
+        'duration_s': float(stamps.max() - stamps.min()) / NANOSECONDS,
+        'path_m': sum(math.dist(a, b) for a, b in zip(placer.path, placer.path[1:], strict=False)),
+        'counts': {
+            'received': placer.received,
+            'accepted': len(placer.buffer),
+            'rejected': dict(placer.rejected),
+            'odometry_received': placer.odometry_received,
+            'odometry_rejected': dict(placer.odometry_rejected),
+            'undecodable': undecodable,
+        },
+        'rejected_by_frame': {frame: dict(counts) for frame, counts in placer.rejected_by_frame.items()},
+        'warnings': warnings + thinning_note(placer),
+    }
+    return Drive(placer, source, live)
+
+
+def _warnings(bag: Bag, placer: Placer, lookup: Mounts) -> list[str]:
+    warnings = []
+    if bag.truncated:
+        warnings.append(bag.truncated)
+    for topic, count in bag.undecodable.items():
+        warnings.append(f'{count} messages on {topic} do not fit their type and were skipped')
+    if placer.unknown_frames:
+        warnings.append(lookup.explain(placer.base_frame, sorted(placer.unknown_frames)))
+    if unused := lookup.unused:
+        warnings.append(
+            f'poses were given for {", ".join(unused)}, but no reading has such a frame; is the name right?'
+        )
+    if placer.time_jumps:
+        warnings.append(f"odometry's clock jumped back {placer.time_jumps} times; what waited for a pose was dropped")
+    for reason, count in placer.odometry_rejected.items():
+        warnings.append(
+            f'{count} of {placer.odometry_received} odometry messages were rejected: {ODOMETRY_REASONS[reason]}'
+        )
+    for reason, count in placer.rejected.items():
+        if count > 0.2 * placer.received and reason != 'unknown_mount':
+            warnings.append(f'{count} of {placer.received} readings were rejected as {reason}: {REASONS[reason]}')
+    return warnings
+
+
+def _nothing_placed(
+    placer: Placer, lookup: Mounts, spans: Mapping[str, Sequence[int]], undecodable: Mapping[str, int]
+) -> Exception:
+    """Return the error that says why no reading could be placed, and what to do."""
+    ranges, odometry = spans['ranges'], spans['odometry']
+    lost = '; '.join(f'{count} on {topic} do not fit their type' for topic, count in undecodable.items())
+    if not ranges or not odometry:
+        kind = 'Range' if not ranges else 'Odometry'
+        return BagError(f'the chosen topics hold no readable {kind} message{f" ({lost})" if lost else ""}')
+    if set(placer.rejected) == {'unknown_mount'}:
+        return InputError(lookup.explain(placer.base_frame, sorted(placer.unknown_frames)))
+    if ranges[1] < odometry[0] or ranges[0] > odometry[1]:
+        a, b, c, d = (stamp / NANOSECONDS for stamp in (*ranges, *odometry))
+        return InputError(
+            f'the stamps do not overlap: Range has {a:.3f} … {b:.3f} s, odometry {c:.3f} … {d:.3f} s; '
+            f'are the drivers set to the same clock (use_sim_time)?'
+        )
+    reasons = '; '.join(f'{count} {reason} ({REASONS[reason]})' for reason, count in placer.rejected.most_common())
+    for reason, count in placer.odometry_rejected.most_common():
+        reasons += f'; {count} odometry messages were rejected too: {ODOMETRY_REASONS[reason]}'
+    return InputError(f'all {placer.received} readings were rejected: {reasons}')

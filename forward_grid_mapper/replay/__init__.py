@@ -1,0 +1,1 @@
+"""Playing a recorded drive to the node."""

@@ -1,0 +1,242 @@
+"""The replay's end of DDS: its publishers, who listens to them, and what has arrived."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from types import TracebackType
+from typing import Any
+
+from ..core.common.errors import InputError, MapperError, ParameterError
+from ..core.messages.message_types import NANOSECONDS
+from .ros_messages import filled, message_class
+from .stop_signal import StopSignal
+
+NODE = 'replay_bag'
+SETTLING = 0.5
+"""Seconds between meeting a subscriber and the first message: it has yet to meet us, and best effort sends once."""
+
+LINGER = 0.5
+"""Seconds between the last message and the end, for what a best-effort subscriber has not taken yet."""
+
+PATIENCE = 30.0
+"""Seconds that subscribers have to acknowledge; one that died is forgotten by DDS after 20."""
+
+
+class Publishers:
+    """A node with one publisher a topic; used in a `with` block.
+
+    Parameters
+    ----------
+    ros_arguments : sequence of str
+        From `--ros-args` on, for rclpy.
+    reliable : bool
+        Whether ranges and odometry are sent until they are acknowledged; best-effort subscribers hear both kinds.
+    stop : StopSignal
+        Ends every wait.
+    """
+
+    def __init__(self, ros_arguments: Sequence[str], reliable: bool, stop: StopSignal) -> None:
+        self._ros_arguments = list(ros_arguments)
+        self._reliable = reliable
+        self._stop = stop
+        self._publishers: dict[str, Any] = {}
+        self._types: dict[str, str] = {}
+        self._ros: Any = None
+        self._node: Any = None
+
+    def __enter__(self) -> Publishers:
+        """Start the node.
+
+        Raises
+        ------
+        MapperError
+            If ROS is not installed, or does not take its arguments.
+        """
+        try:
+            import rclpy
+            from rclpy.signals import SignalHandlerOptions
+        except ImportError as error:
+            raise MapperError(
+                f"ROS 2 is not there ({error}): source its setup.bash, or pip install 'forward_grid_mapper[ros]'"
+            ) from error
+        self._ros = rclpy
+        try:
+            rclpy.init(args=[NODE, *self._ros_arguments], signal_handler_options=SignalHandlerOptions.NO)
+            self._node = rclpy.create_node(NODE, start_parameter_services=False)
+        except Exception as error:  # rclpy's errors have no common base
+            self.__exit__(None, None, None)
+            raise MapperError(f'ROS 2 does not start: {error}') from error
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """End the node."""
+        if self._node is not None:
+            self._node.destroy_node()
+        self._ros.try_shutdown()
+
+    def add(self, topic: str, msgtype: str, latched: bool = False) -> None:
+        """Create the publisher of a topic, known by this name from here on, whatever remapping makes of it.
+
+        Raises
+        ------
+        ParameterError
+            If the name is not one of a topic.
+        """
+        from rclpy.exceptions import InvalidTopicNameException
+        from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+
+        quality = QoSProfile(
+            # what a reliable subscriber has not acknowledged is kept, and fills up until publishing has to wait for it
+            history=HistoryPolicy.KEEP_LAST if latched else HistoryPolicy.KEEP_ALL,
+            depth=1,
+            reliability=ReliabilityPolicy.RELIABLE if self._reliable or latched else ReliabilityPolicy.BEST_EFFORT,
+            durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
+        )
+        try:
+            self._publishers[topic] = self._node.create_publisher(message_class(msgtype), topic, quality)
+        except InvalidTopicNameException as error:
+            what = ' '.join(str(error).split())
+            raise ParameterError(f'{topic} cannot be published ({what}); choose another name with --remap') from error
+        self._types[topic] = msgtype
+
+    def publish(self, topic: str, source: Any) -> None:
+        """Publish a copy of a message as rosbags decodes it.
+
+        Raises
+        ------
+        *MISFITS
+            If it is of another definition.
+        InputError
+            If a reliable subscriber does not take it.
+        """
+        from rclpy._rclpy_pybind11 import RCLError
+
+        message = filled(message_class(self._types[topic])(), source)
+        deadline = time.monotonic() + PATIENCE
+        while not self._stop.is_set():
+            try:
+                self._publishers[topic].publish(message)
+                break
+            except RCLError as error:
+                # DDS waits for room in the history for a tenth of a second only
+                if time.monotonic() > deadline:
+                    raise InputError(f'subscribers of {topic} take nothing since {PATIENCE:.0f} s ({error})') from error
+
+    def publish_latched(self, topic: str, **fields: Any) -> None:
+        """Publish a message of these fields, which late subscribers get too."""
+        self._publishers[topic].publish(message_class(self._types[topic])(**fields))
+
+    def publish_clock(self, topic: str, stamp: int) -> None:
+        """Publish a `rosgraph_msgs/Clock`; `stamp` in nanoseconds."""
+        message = message_class(self._types[topic])()
+        message.clock.sec, message.clock.nanosec = divmod(stamp, NANOSECONDS)
+        self._publishers[topic].publish(message)
+
+    def wait_for_subscribers(self, topics: Sequence[str], seconds: float) -> None:
+        """Wait until each topic has a subscriber.
+
+        Raises
+        ------
+        InputError
+            Naming those that have none after so many seconds, and what to do.
+        """
+        deadline = time.monotonic() + seconds
+        while unheard := [topic for topic in topics if not self._publishers[topic].get_subscription_count()]:
+            if time.monotonic() > deadline:
+                raise InputError(self._nobody(unheard, seconds))
+            if self._stop.wait(0.05):
+                return
+        self._stop.wait(SETTLING)
+
+    def wait_until_acknowledged(self) -> None:
+        """Wait until every reliable subscriber has what was published.
+
+        Raises
+        ------
+        InputError
+            Naming the topics of those that do not acknowledge.
+        """
+        from rclpy.duration import Duration
+
+        deadline = time.monotonic() + PATIENCE
+        waiting = list(self._publishers)
+        while not self._stop.is_set():
+            # a short wait each, since rclpy lets no other thread run meanwhile
+            moment = Duration(nanoseconds=NANOSECONDS // 20)
+            waiting = [topic for topic in waiting if not self._publishers[topic].wait_for_all_acked(moment)]
+            if not waiting:
+                return
+            if time.monotonic() > deadline:
+                raise InputError(f'subscribers of {", ".join(waiting)} acknowledge nothing since {PATIENCE:.0f} s')
+            self._stop.wait(0.05)
+
+    def finish(self) -> None:
+        """Wait until what was published has arrived.
+
+        Raises
+        ------
+        InputError
+            If a reliable subscriber does not acknowledge.
+        """
+        self.wait_until_acknowledged()
+        self._stop.wait(LINGER)
+
+    def _nobody(self, unheard: Sequence[str], seconds: float) -> str:
+        lines = [f'\n  {self._publishers[topic].topic_name}: {self._reason(topic)}' for topic in unheard]
+        return (
+            f'no subscriber after {seconds:g} s{"".join(lines)}\nStart it with the same ROS_DOMAIN_ID, rename topics '
+            f'with --remap OLD:=NEW, play fewer with --range-topics, or begin unheard with --wait 0'
+        )
+
+    def _reason(self, topic: str) -> str:
+        """Say why a topic may have no subscriber that fits, or where others of its type listen."""
+        name, msgtype = self._publishers[topic].topic_name, self._types[topic]
+        found = self._node.get_subscriptions_info_by_topic(name)
+        for other in found:
+            if other.topic_type != msgtype:
+                return f'{other.node_name} expects {other.topic_type} there instead of {msgtype}'
+        if found:
+            return f'{found[0].node_name} wants it reliable; leave out --best-effort'
+        ours = {publisher.topic_name for publisher in self._publishers.values()}
+        elsewhere = [
+            other
+            for other, types in self._node.get_topic_names_and_types()
+            if msgtype in types and other not in ours and self._node.count_subscribers(other)
+        ]
+        if elsewhere:
+            return f'{msgtype} is listened to on {", ".join(elsewhere)}'
+        return f'nobody listens to {msgtype} on any topic'
+
+
+def renamed(topics: Mapping[str, str], remaps: Sequence[str]) -> dict[str, str]:
+    """Return the name under which each topic is to be published.
+
+    Parameters
+    ----------
+    topics : mapping
+        Message type by topic, as the bag names it.
+    remaps : sequence of str
+        Each 'old:=new'; a leading slash makes no difference.
+
+    Raises
+    ------
+    ParameterError
+        If one has another form or an unknown topic, or joins topics of different types.
+    """
+    names = {topic: f'/{topic.strip("/")}' for topic in topics}
+    by_name = {name: topic for topic, name in names.items()}
+    for text in remaps:
+        old, _, new = (f'/{part.strip().strip("/")}' for part in text.partition(':='))
+        if '/' in (old, new):
+            raise ParameterError(f'--remap: {text!r} is not of the form OLD:=NEW, such as /sonar:=/robot/sonar')
+        if old not in by_name:
+            raise ParameterError(f'--remap: {old} is not replayed; there are: {", ".join(sorted(by_name))}')
+        names[by_name[old]] = new
+    types: dict[str, str] = {}
+    for topic, name in names.items():
+        if types.setdefault(name, topics[topic]) != topics[topic]:
+            raise ParameterError(f'{name} would have messages of both {types[name]} and {topics[topic]}; see --remap')
+    return names

@@ -1,0 +1,73 @@
+"""From messages as rosbags decodes them, of ROS 1 or ROS 2, to those that rclpy publishes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from functools import lru_cache
+from importlib import import_module
+from typing import Any
+
+from ..core.common.errors import MapperError
+
+NEWER = frozenset({'variance'})
+"""Fields that a recording may lack because it is older than Jazzy; they keep their defaults."""
+
+
+MISFITS = (AttributeError, TypeError, ValueError, AssertionError)
+"""What a message of another definition raises when it is copied."""
+
+
+@lru_cache
+def message_class(msgtype: str) -> Any:
+    """Return the class of a type such as 'sensor_msgs/msg/Range'.
+
+    Raises
+    ------
+    MapperError
+        If its package is not installed.
+    """
+    package, _, name = msgtype.split('/')
+    try:
+        return getattr(import_module(f'{package}.msg'), name)
+    except ImportError as error:
+        raise MapperError(f'{error}; source ROS 2, or install ros-jazzy-{package.replace("_", "-")}') from error
+
+
+def filled(message: Any, source: Any) -> Any:
+    """Copy every field of `message` from `source`, at any depth; return `message`.
+
+    What only `source` has, as ROS 1's `header.seq`, is left out. Fields must be numbers, text, fixed arrays of numbers,
+    or messages of such.
+
+    Raises
+    ------
+    *MISFITS
+        If `source` lacks a field, or has something else in it.
+    """
+    for name in message.get_fields_and_field_types():
+        if name in NEWER and not hasattr(source, name):
+            continue
+        current, value = getattr(message, name), getattr(source, name)
+        if hasattr(current, 'get_fields_and_field_types'):
+            filled(current, value)
+        elif isinstance(current, (bool, int, float, str)):
+            # rosbags may decode to numpy's numbers, which rclpy refuses
+            setattr(message, name, type(current)(value))
+        else:
+            setattr(message, name, value)
+    return message
+
+
+def static_transforms(messages: Iterable[Any]) -> list[Any]:
+    """Return all transforms of several `tf2_msgs/TFMessage`, the last one of each child frame, as tf2 would keep them.
+
+    Raises
+    ------
+    MapperError, *MISFITS
+    """
+    kind = message_class('geometry_msgs/msg/TransformStamped')
+    latest: dict[str, Any] = {}
+    for message in messages:
+        for item in message.transforms:
+            latest[str(item.child_frame_id).lstrip('/')] = filled(kind(), item)
+    return list(latest.values())

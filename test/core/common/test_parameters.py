@@ -1,0 +1,45 @@
+"""The parameter table holds itself to its own ranges."""
+
+from __future__ import annotations
+
+import pytest
+
+from forward_grid_mapper.core.common.errors import ParameterError
+from forward_grid_mapper.core.common.parameters import TABLE, Parameters, find
+
+
+@pytest.mark.parametrize('row', TABLE, ids=lambda row: row.name)
+def test_rows_are_complete_and_defaults_admitted(row) -> None:
+    assert row.help.endswith('.')
+    assert row.check(row.default) == row.default
+    if row.type in (int, float):
+        assert row.low < row.high
+        for bad in (row.low - 1, row.high + 1, 'word', None, True):
+            with pytest.raises(ParameterError, match=row.name):
+                row.check(type(row.default)(bad) if isinstance(bad, float) and row.type is int else bad)
+    if row.type is float:
+        with pytest.raises(ParameterError):
+            row.check(float('nan'))
+    if row.choices:
+        with pytest.raises(ParameterError, match=row.choices[0]):
+            row.check('nonsense')
+
+
+def test_flat_values_go_there_and_back() -> None:
+    changed = Parameters.from_flat({'p_hit': 0.5, 'resolution': 1, 'shift_moves': False})
+    assert changed.model.p_hit == 0.5
+    assert changed.grid.resolution == 1.0
+    assert Parameters.from_flat(changed.flat()) == changed
+    assert Parameters.from_flat({}, base=changed) == changed
+
+
+def test_unknown_names_get_a_hint() -> None:
+    with pytest.raises(ParameterError, match='p_hit'):
+        find('phit')
+    with pytest.raises(ParameterError, match='resolution'):
+        Parameters.from_flat({'zzz': 1})
+
+
+def test_causes_must_leave_something_for_the_map() -> None:
+    with pytest.raises(ParameterError, match='p_rand'):
+        Parameters.from_flat({'p_rand': 0.7, 'p_lost': 0.5})

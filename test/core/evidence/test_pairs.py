@@ -1,0 +1,117 @@
+"""The pairs of readings against naive zones and densities."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+import naive
+from conftest import plain_model, random_readings
+from forward_grid_mapper.core.common.grid import Grid
+from forward_grid_mapper.core.evidence.evidence import Evidence
+from forward_grid_mapper.core.evidence.pairs import _sort, bench_for, make
+from forward_grid_mapper.core.sensor.cone_table import walk
+
+GRID = Grid(0.1, -7, 12, 41, 33)
+
+
+@pytest.mark.parametrize('some', [naive.awkward_readings, random_readings])
+@pytest.mark.parametrize('nearest', [False, True])
+@pytest.mark.parametrize('cut', [4.0, 5.0, 40.0])
+def test_runs_and_band_are_the_free_zone_and_the_rest_of_the_cone(some: object, nearest: bool, cut: float) -> None:
+    readings = some(np.random.default_rng(4), GRID, 80)
+    model = plain_model(cut=cut, sigma=0.06, cell_distance='nearest' if nearest else 'center')
+    evidence = Evidence(GRID, model)
+    evidence.extend(readings)
+    state = evidence.state
+    cells, distances = np.empty(GRID.size, np.int32), np.empty(GRID.size)
+    seen, pairs = np.zeros(GRID.size, int), 0
+    for t in range(len(readings)):
+        n = walk(state.cones, t, GRID.shape, nearest, cells, distances)
+        away = dict(zip(cells[:n].tolist(), (distances[:n] * GRID.resolution).tolist(), strict=True))
+        free, band, density, _ = naive.pairs_of(state, t)
+        assert free == sorted(set(free)), 'in ascending order, each once'
+        assert len(set(band)) == len(band)
+        assert not set(free) & set(band)
+        assert set(free) | set(band) == set(away)
+        end = naive.free_end(readings, t, GRID, model)
+        assert all(away[c] <= end + 1e-9 for c in free)
+        assert all(away[c] >= end - 1e-9 for c in band)
+        assert [away[c] for c in band] == sorted(away[c] for c in band)
+        sigma = naive.sigma_of(readings, t, GRID, model)
+        for c, told in zip(band, density, strict=True):
+            # where the noise is cut off, rounding may decide
+            if abs(abs(readings.z[t] - away[c]) - cut * sigma) > 1e-9:
+                assert told == pytest.approx(naive.normal(readings.z[t], away[c], sigma, cut), rel=1e-6, abs=1e-30)
+        seen[free + band] += 1
+        pairs += len(free) + len(band)
+    assert evidence.pairs == pairs
+    assert np.array_equal(state.maps.seen, seen)
+
+
+def test_each_run_lies_in_one_row() -> None:
+    evidence = Evidence(GRID, plain_model(sigma=0.01))
+    evidence.extend(random_readings(np.random.default_rng(5), GRID, 60))
+    state = evidence.state
+    for share in state.shares[:60]:
+        runs = state.pairs.cell[share['at'] : share['at'] + 2 * share['runs']].reshape(-1, 2)
+        assert (runs[:, 0] <= runs[:, 1]).all()
+        assert (runs[:, 0] // GRID.width == runs[:, 1] // GRID.width).all()
+
+
+def test_cells_of_equal_distance_stay_in_the_order_of_the_grid() -> None:
+    grid = Grid(0.1, 0, 0, 21, 21)
+    readings = naive.awkward_readings(np.random.default_rng(6), grid, 1)
+    for name, value in {'x': 1.05, 'y': 1.05, 'yaw': 0.0, 'z': 0.5, 'z_max': 2.0, 'half_angle': 1.5}.items():
+        getattr(readings, name)[:] = value
+    evidence = Evidence(grid, plain_model())
+    evidence.extend(readings)
+    _, band, _, _ = naive.pairs_of(evidence.state, 0)
+    squares = [(c % 21 - 10) ** 2 + (c // 21 - 10) ** 2 for c in band]
+    assert list(zip(squares, band, strict=True)) == sorted(zip(squares, band, strict=True))
+
+
+def test_pairs_made_anew_are_those_that_are_stored() -> None:
+    model = plain_model(cell_distance='nearest')
+    evidence = Evidence(GRID, model)
+    evidence.extend(naive.awkward_readings(np.random.default_rng(7), GRID, 100))
+    s = evidence.state
+    for t, share in enumerate(s.shares[:100]):
+        sizes = (int(share['runs']), int(share['bands']))
+        assert make(s.cones, s.lattice, s.facing, t, s.bench.pairs, 0, s.bench) == sizes
+        words = 2 * sizes[0] + 2 * sizes[1]
+        assert np.array_equal(s.bench.pairs.cell[:words], s.pairs.cell[share['at'] : share['at'] + words])
+
+
+@given(
+    st.lists(
+        st.floats(0, 1e3) | st.integers(0, 5).map(float) | st.floats(5, 5 + 1e-12) | st.just(5e-324),
+        max_size=60,
+    )
+)
+def test_the_sort_is_stable(keys: list[float]) -> None:
+    bench = bench_for(60)
+    m = len(keys)
+    bench.unsorted_key[:m] = keys
+    bench.unsorted[:m] = np.arange(m)
+    _sort(bench, m)
+    order = sorted(range(m), key=lambda k: keys[k])
+    assert bench.cell[:m].tolist() == order
+    assert bench.key[:m].tolist() == [keys[k] for k in order]
+
+
+def test_densities_integrate_to_one() -> None:
+    # along a row of cells, far finer than sigma
+    grid = Grid(0.005, 0, 0, 400, 1)
+    readings = naive.awkward_readings(np.random.default_rng(8), grid, 1)
+    for name, value in {'x': 0.0, 'y': 0.0025, 'yaw': 0.0, 'z': 1.0, 'z_max': 3.0, 'half_angle': 0.1}.items():
+        getattr(readings, name)[:] = value
+    readings.sigma[:] = 0.05
+    evidence = Evidence(grid, plain_model(cut=5.0))
+    evidence.extend(readings)
+    _, _, density, _ = naive.pairs_of(evidence.state, 0)
+    assert math.fsum(density) * grid.resolution == pytest.approx(1.0, abs=1e-5)

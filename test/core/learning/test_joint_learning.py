@@ -1,0 +1,154 @@
+"""Learning together with the map: what it finds, how it is biased, and that it tells when walls get lost."""
+
+from __future__ import annotations
+
+import dataclasses
+from functools import lru_cache
+
+import numpy as np
+import pytest
+
+from conftest import PLAIN, random_readings
+from forward_grid_mapper.core.common.errors import InputError
+from forward_grid_mapper.core.common.grid import Grid
+from forward_grid_mapper.core.common.parameters import Parameters
+from forward_grid_mapper.core.common.readings import Readings
+from forward_grid_mapper.core.learning.joint_learning import Learned, learn_jointly, settle
+from forward_grid_mapper.core.learning.lost_walls import lost_walls
+from forward_grid_mapper.core.learning.standard_errors import estimates
+from forward_grid_mapper.core.mapping import Mapper
+from forward_grid_mapper.core.maps.map_set import MapSet
+from forward_grid_mapper.simulation.drive import Recording, corridor_drive, door_drive
+from forward_grid_mapper.simulation.score import score_map, visible_surface
+from forward_grid_mapper.simulation.sonar import NoiseModel
+
+
+@lru_cache(maxsize=2)
+def corridor(seed: int) -> Recording:
+    return corridor_drive(seed)
+
+
+def smooth_recall(maps: MapSet, recording: Recording) -> float:
+    visible = visible_surface(recording.world, recording.readings, 0.2)
+    return score_map(maps.ml, maps.grid, recording.world, visible).smooth_recall
+
+
+def walls_of(learned: Learned) -> list[str]:
+    return [warning for warning in learned.warnings if 'loses walls' in warning]
+
+
+@pytest.mark.parametrize('seed', [0, 1])
+def test_values_that_lose_the_smooth_wall_are_refused(seed: int) -> None:
+    recording = corridor(seed)
+    learned = learn_jointly(recording.readings, Parameters.from_flat(PLAIN))
+    last = learned.rounds[-1]
+    refused = Mapper(dataclasses.replace(Parameters.from_flat(PLAIN), model=last.model)).run(recording.readings)
+    assert smooth_recall(refused, recording) < 0.5
+    (warning,) = walls_of(learned)
+    assert 'p_hit rose' in warning and 'refused' in warning and 'smooth walls' in warning
+    assert learned.accepted == len(learned.rounds) - 2
+    assert last.lost_length > 5 and last.unexplained > learned.rounds[0].unexplained
+    # what was given up is the smooth wall, but for a ghost of it
+    row = np.flatnonzero(recording.world.smooth_cells.any(1))[0]
+    smooth = [stretch for stretch in last.lost if abs(stretch.start[1] - (row + 0.5) * 0.1) < 0.25]
+    assert last.lost[0] in smooth and sum(stretch.length for stretch in smooth) > 0.9 * last.lost_length
+    assert smooth_recall(learned.maps, recording) > 0.9
+    assert learned.maps.parameters == learned.parameters
+    assert bool(learned.estimates) == (learned.accepted > 0)
+
+
+def test_they_are_handed_out_on_request() -> None:
+    learned = learn_jointly(corridor(1).readings, Parameters.from_flat(PLAIN), 2, keep_going=True)
+    assert learned.accepted == 2
+    assert learned.parameters.model == learned.rounds[2].model
+    assert 'handed out all the same' in walls_of(learned)[0]
+    assert smooth_recall(learned.maps, corridor(1)) < 0.5
+
+
+def test_without_smooth_walls_nothing_is_refused_and_the_map_fits_too_well() -> None:
+    recording = door_drive(3, NoiseModel(sigma=0.07, p_random=0.08, p_lost=0.1), 0)
+    readings = recording.readings
+    learned = learn_jointly(readings, Parameters.from_flat(PLAIN), 10)
+    assert not walls_of(learned) and learned.accepted == len(learned.rounds) - 1
+    model = learned.parameters.model
+    world = recording.world
+    known = settle(readings, world.grid, world.reference, Parameters.from_flat(PLAIN).model)
+    sure = estimates(readings, world.grid, world.reference, known)
+    for name, truth in (('p_rand', 0.08), ('p_lost', 0.1)):
+        assert sure[name].low < truth < sure[name].high
+    # with cells of 10 cm, distances to their centres are a little off
+    assert known.sigma == pytest.approx(0.07, abs=0.01)
+    # the map that was made from the readings explains by walls what was chance and noise
+    for name in ('p_rand', 'sigma'):
+        assert getattr(model, name) < getattr(known, name) - 2 * learned.estimates[name].error
+    assert known.p_rand / 3 < model.p_rand and model.p_lost == pytest.approx(0.1, abs=0.05)
+    assert learned.rounds[-1].log_likelihood > learned.rounds[0].log_likelihood
+
+
+def test_weak_values_are_called_so() -> None:
+    readings = random_readings(np.random.default_rng(0), Grid(0.1, 0, 0, 30, 30), 150)
+    readings.half_angle[:] = 0.1
+    learned = learn_jointly(readings, Parameters.from_flat(PLAIN), 2, keep_going=True)
+    told = ' '.join(learned.warnings)
+    assert 'inform p_hit; take it as a guess' in told
+    assert (
+        'had not come to rest' in learn_jointly(readings, Parameters.from_flat(PLAIN), 1, keep_going=True).warnings[0]
+    )
+
+
+def test_much_chance_is_called_so() -> None:
+    recording = door_drive(3, NoiseModel(sigma=0.05, p_random=0.6), 0)
+    learned = learn_jointly(recording.readings, Parameters.from_flat({**PLAIN, 'prior': 0.05}), 3)
+    assert any('more than a sonar makes up by itself' in warning for warning in learned.warnings)
+
+
+def test_no_readings() -> None:
+    with pytest.raises(InputError):
+        learn_jointly(
+            Readings.from_columns(z=[], x=[], y=[], yaw=[], z_max=[], half_angle=[]), Parameters.from_flat(PLAIN)
+        )
+
+
+def facing_wall() -> MapSet:
+    """A wall of three metres at y = 1, heard from below."""
+    x = np.repeat(np.arange(0.05, 3.0, 0.1), 4)
+    grid = Grid(0.1, -2, -2, 40, 20)
+    ml = np.zeros(grid.shape, np.int8)
+    ml[12, 2:32] = 1
+    readings = Readings.from_columns(
+        ('a',), x=x, y=0.05, yaw=np.pi / 2, z=np.ones(len(x)), z_max=3.0, half_angle=0.1, stamp=np.arange(len(x))
+    )
+    nothing = np.full(grid.shape, np.nan, np.float32)
+    unexplained = np.zeros(len(x), bool)
+    return MapSet(grid, nothing, ml, nothing, readings, unexplained, 0.0, 0.0, Parameters.from_flat(PLAIN))
+
+
+def test_lost_walls() -> None:
+    before = facing_wall()
+    assert lost_walls(before, before) == []
+    gone = before.ml.copy()
+    gone[12, 12:22] = 0
+    # a cell aside is not lost, and so neither are the ends beside what is left
+    moved = np.roll(before.ml, 1, axis=0)
+    assert lost_walls(before, dataclasses.replace(before, ml=moved)) == []
+    (stretch,) = lost_walls(before, dataclasses.replace(before, ml=gone))
+    assert stretch.cells == 8 and stretch.length == pytest.approx(0.8)
+    assert stretch.start == pytest.approx((1.15, 1.05)) and stretch.end == pytest.approx((1.85, 1.05))
+    assert stretch.echoes > 20
+    gone[:] = before.ml
+    gone[12, 12:17] = 0
+    assert lost_walls(before, dataclasses.replace(before, ml=gone)) == [], 'too short to matter'
+
+
+def test_what_was_driven_over_is_no_wall() -> None:
+    before = facing_wall()
+    path = dataclasses.replace(before.readings, y=np.full(len(before.readings), 1.25), z=np.full(120, 3.0))
+    both = Readings.from_columns(
+        ('a',),
+        **{
+            name: np.concatenate([getattr(before.readings, name), getattr(path, name)])
+            for name in ('x', 'y', 'yaw', 'z', 'z_max', 'half_angle', 'sigma', 'stamp', 'sensor')
+        },
+    )
+    driven = dataclasses.replace(before, readings=both, unexplained=np.zeros(len(both), bool))
+    assert lost_walls(driven, dataclasses.replace(driven, ml=np.zeros_like(before.ml))) == []

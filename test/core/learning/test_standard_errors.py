@@ -1,0 +1,103 @@
+"""Standard errors against what they promise: that the truth lies within them as often as they say."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+from line_world import LINE, TRUTH, drawn, line_map
+
+from forward_grid_mapper.core.common.parameters import ModelParameters
+from forward_grid_mapper.core.common.readings import Readings
+from forward_grid_mapper.core.learning.joint_learning import settle
+from forward_grid_mapper.core.learning.standard_errors import LEARNED, Estimate, estimates, estimating_functions
+from forward_grid_mapper.core.sensor.forward_model import expectations
+
+START = ModelParameters()
+
+
+def learned(readings: Readings, start: ModelParameters = START) -> dict[str, Estimate]:
+    return estimates(readings, LINE, line_map(), settle(readings, LINE, line_map(), start))
+
+
+def test_the_truth_lies_within_the_intervals_as_often_as_they_say() -> None:
+    rng = np.random.default_rng(3)
+    drives, within, distances = 120, dict.fromkeys(LEARNED, 0), {name: [] for name in LEARNED}
+    for _ in range(drives):
+        for name, found in learned(drawn(rng, 600)).items():
+            truth = getattr(TRUTH, name)
+            within[name] += found.low <= truth <= found.high
+            distances[name].append((found.value - truth) / found.error)
+    for name in LEARNED:
+        assert within[name] >= 0.89 * drives, within
+        # nor are they larger than they need to be
+        assert 0.7 < np.std(distances[name]) < 1.3, name
+        assert abs(np.mean(distances[name])) < 0.35, name
+
+
+@pytest.mark.parametrize('name', ['p_hit', 'p_rand', 'p_lost', 'sigma'])
+def test_estimating_functions_are_derivatives_of_the_log_likelihood(name: str) -> None:
+    readings = drawn(np.random.default_rng(4), 300)
+    model = dataclasses.replace(TRUTH, p_hit=0.6, cut=30.0)
+    step = 1e-6
+    high, low = (
+        expectations(
+            readings, LINE, line_map(), dataclasses.replace(model, **{name: getattr(model, name) + d})
+        ).log_likelihood
+        for d in (step, -step)
+    )
+    expected = (high - low) / (2 * step)
+    # without an echo, the normal around max range is no evidence of sigma
+    counts = readings.echo & (readings.z < 5.5) if name == 'sigma' else np.ones(len(readings), bool)
+    found = estimating_functions(readings, LINE, line_map(), model)[name]
+    np.testing.assert_allclose(found[counts], expected[counts], rtol=1e-4, atol=1e-4)
+
+
+def test_they_vanish_where_the_updates_end() -> None:
+    readings = drawn(np.random.default_rng(5), 2000)
+    model = settle(readings, LINE, line_map(), START)
+    for name, found in estimates(readings, LINE, line_map(), model).items():
+        total = estimating_functions(readings, LINE, line_map(), model)[name].sum()
+        spread = estimating_functions(readings, LINE, line_map(), model)[name].std() * math.sqrt(len(readings))
+        assert abs(total) < 0.1 * spread, (name, found)
+
+
+def test_readings_that_repeat_one_another_do_not_make_it_surer() -> None:
+    readings = drawn(np.random.default_rng(6), 600, repeat=1)
+    repeated = drawn(np.random.default_rng(6), 600, repeat=16)
+    for name in LEARNED:
+        once, often = learned(readings)[name].error, learned(repeated)[name].error
+        assert 0.6 * once < often < 1.7 * once, name
+
+
+def test_the_order_of_readings_does_not_matter() -> None:
+    rng = np.random.default_rng(7)
+    readings = drawn(rng, 500, repeat=4)
+    shuffled = readings.select(rng.permutation(len(readings)))
+    for name in LEARNED:
+        assert learned(shuffled)[name].error == pytest.approx(learned(readings)[name].error, rel=1e-6)
+
+
+def test_more_readings_are_surer() -> None:
+    rng = np.random.default_rng(8)
+    few, many = learned(drawn(rng, 500)), learned(drawn(rng, 8000))
+    for name in LEARNED:
+        assert 2.5 < few[name].error / many[name].error < 6.5, name
+        assert few[name].readings < many[name].readings
+
+
+def test_values_that_cannot_move_say_why() -> None:
+    rng = np.random.default_rng(9)
+    readings = drawn(rng, 500, dataclasses.replace(TRUTH, p_lost=0.0, sigma=0.02))
+    found = learned(readings, dataclasses.replace(START, p_lost=0.0))
+    assert 'without lost echoes' in found['p_lost'].bound
+    assert 'half a cell' in found['sigma'].bound
+    assert math.isnan(found['sigma'].error) and math.isfinite(found['p_hit'].error)
+    silent = dataclasses.replace(readings, z=readings.z_max.copy())
+    free = np.zeros(LINE.shape, np.int8)
+    nothing = estimates(silent, LINE, free, START)
+    assert nothing['p_hit'].bound == nothing['sigma'].bound == 'no reading informs it'
+    stated = dataclasses.replace(readings, sigma=np.full(len(readings), 0.05))
+    assert estimates(stated, LINE, line_map(), START)['sigma'].readings == 0

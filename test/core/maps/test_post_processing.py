@@ -1,0 +1,202 @@
+"""What is made of the map that the search found: readings that passed, walls drawn out, free told from unknown."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+
+import naive
+from conftest import plain_model, random_readings
+from forward_grid_mapper.core.common.grid import Grid
+from forward_grid_mapper.core.common.parameters import ModelParameters
+from forward_grid_mapper.core.common.readings import Readings
+from forward_grid_mapper.core.evidence.evidence import Evidence
+from forward_grid_mapper.core.evidence.fixed_point import QUANTUM
+from forward_grid_mapper.core.maps.free_space import passed_readings
+from forward_grid_mapper.core.maps.post_processing import finish
+from forward_grid_mapper.core.maps.wall_extension import MOST_AGAINST, STRAIGHT_RUN, extend
+from forward_grid_mapper.core.runtime import threads
+
+GRID = Grid(0.1, 0, 0, 14, 11)
+NOWHERE = np.zeros(GRID.shape, bool)
+
+
+def off_the_lattice(seed: int, count: int = 40) -> Readings:
+    readings = (naive.awkward_readings, random_readings)[seed % 2](np.random.default_rng(seed), GRID, count)
+    readings.x[:] += 0.001234
+    readings.y[:] -= 0.000777
+    readings.z[:] = np.minimum(readings.z + 0.000345, readings.z_max)
+    readings.sigma[:] *= 1.0017
+    return readings
+
+
+def made(readings: Readings, model: ModelParameters, occupied: np.ndarray, **options: object) -> Evidence:
+    evidence = Evidence(GRID, model, start=occupied.reshape(GRID.shape), **options)
+    evidence.extend(readings)
+    return evidence
+
+
+@pytest.mark.parametrize('seed', range(12))
+@pytest.mark.parametrize('filled', [0.0, 0.1, 0.5])
+def test_readings_that_passed_are_those_of_the_twin(seed: int, filled: float) -> None:
+    rng = np.random.default_rng(seed)
+    readings = off_the_lattice(seed)
+    model = plain_model(
+        p_hit=rng.choice([0.05, 0.6, 0.98]),
+        p_rand=rng.choice([0.01, 0.4]),
+        p_lost=rng.choice([0.0, 0.3]),
+        sigma=0.06,
+        surface_offset=rng.choice([0.0, 0.3]),
+    )
+    occupied = (rng.random(GRID.size) < filled).astype(np.uint8)
+    evidence = made(readings, model, occupied)
+    told = passed_readings(evidence, occupied)
+    expected = naive.passed(readings, GRID, occupied, model)
+    assert np.abs(told - expected).max() < 2e-6 * len(readings)
+    assert (told <= evidence.state.maps.seen + 1e-9).all()
+    again = Evidence(GRID, model, memory=0.0, start=occupied.reshape(GRID.shape))
+    again.extend(readings)
+    assert np.array_equal(passed_readings(again, occupied), told)
+
+
+def test_the_map_asked_about_may_be_another_and_weights_count() -> None:
+    readings, model = off_the_lattice(3), plain_model(sigma=0.06)
+    occupied = (np.random.default_rng(0).random(GRID.size) < 0.2).astype(np.uint8)
+    evidence = made(readings, model, occupied)
+    weight = 1 + np.arange(len(readings)) % 3
+    evidence.weigh(np.repeat(np.arange(len(readings)), weight - 1))
+    told = passed_readings(evidence, occupied)
+    expected = naive.passed(readings, GRID, occupied, model, weight)
+    assert np.abs(told - expected).max() < 2e-6 * weight.sum()
+
+
+def test_neither_threads_nor_what_is_grazed_change_who_passed(monkeypatch: pytest.MonkeyPatch) -> None:
+    readings = random_readings(np.random.default_rng(5), GRID, 300)
+    occupied = (np.random.default_rng(1).random(GRID.size) < 0.1).astype(np.uint8)
+    whole, slanted = plain_model(), plain_model(grazing_angle=0.5)
+    one = passed_readings(made(readings, whole, occupied), occupied)
+    monkeypatch.setattr(threads, 'LEAST_PART', 20)
+    assert np.array_equal(passed_readings(made(readings, whole, occupied, threads=3), occupied), one)
+    two = made(readings, slanted, occupied)
+    assert two.state.facing.known.any()
+    assert np.array_equal(passed_readings(two, occupied), one)
+
+
+STEPS = [(1, 0), (1, 1), (0, 1), (-1, 1), (-1, 0), (-1, -1), (0, -1), (1, -1)]
+
+
+def drawn_out(evidence: Evidence, steps: int, barred: np.ndarray) -> np.ndarray:
+    """The twin of `extend`, from its docstring."""
+    maps = evidence.state.maps
+    occupied, told, seen = (a.reshape(GRID.shape) for a in (maps.occupied, maps.evidence, maps.seen))
+    out = np.zeros(GRID.shape, np.uint8)
+
+    def at(x: int, y: int) -> bool:
+        return 0 <= x < GRID.width and 0 <= y < GRID.height and occupied[y, x] == 1
+
+    for y, x in np.argwhere(occupied):
+        for k, (dx, dy) in enumerate(STEPS):
+            ahead = [STEPS[k], STEPS[(k + 1) % 8], STEPS[k - 1]]
+            straight = all(at(x - n * dx, y - n * dy) for n in range(STRAIGHT_RUN))
+            if not straight or any(at(x + u, y + v) for u, v in ahead):
+                continue
+            for n in range(1, steps + 1):
+                u, v = x + n * dx, y + n * dy
+                if not (0 <= u < GRID.width and 0 <= v < GRID.height):
+                    break
+                if barred[v, u] or occupied[v, u] or not seen[v, u] or told[v, u] * QUANTUM < -MOST_AGAINST:
+                    break
+                out[v, u] = 1
+    return out
+
+
+@pytest.mark.parametrize('seed', range(30))
+def test_walls_go_on_where_the_twin_has_it(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    occupied = (rng.random(GRID.shape) < 0.05).astype(np.uint8)
+    for _ in range(3):
+        x, y, k = int(rng.integers(GRID.width)), int(rng.integers(GRID.height)), int(rng.integers(8))
+        for n in range(int(rng.integers(3, 7))):
+            u, v = x + n * STEPS[k][0], y + n * STEPS[k][1]
+            if 0 <= u < GRID.width and 0 <= v < GRID.height:
+                occupied[v, u] = 1
+    evidence = made(random_readings(rng, GRID, 15), plain_model(), occupied)
+    evidence.state.maps.evidence[:] = rng.uniform(-2 * MOST_AGAINST, 6 * MOST_AGAINST, GRID.size) / QUANTUM
+    barred = (rng.random(GRID.shape) < 0.1).astype(np.uint8)
+    for steps in (1, 3):
+        out = np.zeros(GRID.size, np.uint8)
+        extend(evidence.state, steps, barred.ravel(), out)
+        assert np.array_equal(out.reshape(GRID.shape), drawn_out(evidence, steps, barred))
+
+
+def wall_at(row: int, first: int, last: int) -> np.ndarray:
+    occupied = np.zeros(GRID.shape, np.uint8)
+    occupied[row, first : last + 1] = 1
+    return occupied
+
+
+def seen_by_all(occupied: np.ndarray) -> Evidence:
+    evidence = made(off_the_lattice(1), plain_model(), occupied)
+    evidence.state.maps.seen[:], evidence.state.maps.evidence[:] = 1, 1
+    return evidence
+
+
+def test_finish_draws_walls_out_by_so_many_cells_and_no_farther_than_something_speaks_against_it() -> None:
+    evidence = seen_by_all(wall_at(5, 4, 8))
+    assert np.array_equal(finish(evidence, 0, 0.0, NOWHERE) == 1, wall_at(5, 4, 8) == 1)
+    assert np.array_equal(finish(evidence, 2, 0.0, NOWHERE) == 1, wall_at(5, 2, 10) == 1)
+    evidence.state.maps.evidence.reshape(GRID.shape)[5, 10] = round(-1.1 * MOST_AGAINST / QUANTUM)
+    evidence.state.maps.evidence.reshape(GRID.shape)[5, 2] = round(-0.9 * MOST_AGAINST / QUANTUM)
+    assert np.array_equal(finish(evidence, 3, 0.0, NOWHERE) == 1, wall_at(5, 1, 9) == 1)
+    assert np.array_equal(evidence.observed() == 1, wall_at(5, 4, 8) == 1), 'the search goes on from its own map'
+
+
+def test_no_wall_is_drawn_out_over_where_the_robot_was_or_readings_passed() -> None:
+    driven = NOWHERE.copy()
+    driven[5, 10] = True
+    evidence = seen_by_all(wall_at(5, 4, 8))
+    assert np.array_equal(finish(evidence, 3, 0.0, driven) == 1, wall_at(5, 1, 9) == 1)
+    # ten readings that went through a gap
+    readings = Readings.from_columns(x=1.15, y=0.05, yaw=math.pi / 2, z=np.full(10, 1.0), z_max=1.3, half_angle=0.02)
+    evidence = made(readings, plain_model(sigma=0.05), wall_at(5, 4, 8))
+    evidence.state.maps.seen[:], evidence.state.maps.evidence[:] = 1, 1
+    assert np.array_equal(finish(evidence, 6, 0.0, NOWHERE)[5] == 1, np.arange(14) <= 13)
+    told = finish(evidence, 6, 1.0, NOWHERE)
+    assert told[5, 11] == 0
+    assert (told[5, 9:11] == 1).all(), 'up to what is known'
+
+
+def test_three_cells_are_no_straight_wall() -> None:
+    assert np.array_equal(finish(seen_by_all(wall_at(5, 4, 6)), 3, 0.0, NOWHERE) == 1, wall_at(5, 4, 6) == 1)
+
+
+@pytest.mark.parametrize('seed', range(6))
+def test_cells_through_which_nobody_passed_are_unknown(seed: int) -> None:
+    readings, model = random_readings(np.random.default_rng(seed), GRID, 12), plain_model(sigma=0.06)
+    occupied = (np.random.default_rng(seed).random(GRID.size) < 0.05).astype(np.uint8)
+    evidence = made(readings, model, occupied)
+    driven = np.random.default_rng(seed).random(GRID.shape) < 0.01
+    plain = evidence.observed()
+    plain[driven & (plain < 0)] = 0
+    passed = passed_readings(evidence, occupied).reshape(GRID.shape)
+    assert np.array_equal(finish(evidence, 0, 0.0, driven), plain)
+    for least in (0.5, 1.5):
+        told = finish(evidence, 0, least, driven)
+        known = ((passed >= least) | driven) & (plain == 0)
+        beside = naive.box_sum(known.astype(int)) > 0
+        expected = np.where((plain == 0) & ~beside, -1, plain)
+        assert np.array_equal(told, expected)
+    assert (finish(evidence, 0, 100.0, NOWHERE) != 0).all()
+
+
+def test_behind_a_wall_nothing_is_free() -> None:
+    # fifty echoes of a wall 0.6 m ahead, and one that went through a gap
+    readings = Readings.from_columns(x=0.05, y=0.55, yaw=0.0, z=np.full(50, 0.6), z_max=1.3, half_angle=0.02)
+    evidence = made(readings, dataclasses.replace(plain_model(), sigma=0.05), wall_at(5, 6, 6))
+    told = finish(evidence, 0, 0.9, NOWHERE)
+    assert told[5, :7].tolist() == [0] * 6 + [1]
+    assert (told[5, 9:] == -1).all()
+    assert math.isfinite(evidence.log_likelihood)

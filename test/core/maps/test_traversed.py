@@ -1,0 +1,89 @@
+"""Cells that the robot drove over: points, and what lies between those that belong together."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from forward_grid_mapper.core.common.grid import Grid
+from forward_grid_mapper.core.common.readings import Readings
+from forward_grid_mapper.core.maps.traversed import LONGEST_PAUSE, LONGEST_STEP, STRIDES, driven_cells, mark_driven
+
+GRID = Grid(0.1, -10, 5, 40, 30)
+MS = 1_000_000
+
+
+def readings_at(x: list[float], y: list[float], stamp: list[int]) -> Readings:
+    return Readings.from_columns(x=x, y=y, yaw=0.0, z=np.ones(len(x)), z_max=2.0, half_angle=0.1, stamp=stamp)
+
+
+def cells(*places: tuple[float, float]) -> set[tuple[int, int]]:
+    out = {(math.floor(y / 0.1) - GRID.row, math.floor(x / 0.1) - GRID.column) for x, y in places}
+    return {(r, c) for r, c in out if 0 <= r < GRID.height and 0 <= c < GRID.width}
+
+
+def told(*arguments: list[float]) -> set[tuple[int, int]]:
+    return {(int(r), int(c)) for r, c in np.argwhere(driven_cells(readings_at(*arguments), GRID))}
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.integers(1, 12))
+def test_the_cells_are_those_of_the_points_and_of_the_way_between(seed: int, count: int) -> None:
+    rng = np.random.default_rng(seed)
+    x, y = np.cumsum(rng.uniform(-0.5, 0.5, (2, count)), axis=1) + np.array([[0.5], [2.0]])
+    stamp = np.cumsum(rng.choice([0, 100, 400, 600], count)) * MS
+    shuffle = rng.permutation(count) if len(set(stamp)) == count else np.arange(count)
+    found = told(x[shuffle], y[shuffle], stamp[shuffle])
+    expected = cells(*zip(x, y, strict=True))
+    assert expected <= found
+    near = set(expected)
+    for i, j in ((i, i + stride) for i in range(count) for stride in STRIDES if i + stride < count):
+        step = math.hypot(x[j] - x[i], y[j] - y[i])
+        if stamp[j] - stamp[i] <= LONGEST_PAUSE and step <= LONGEST_STEP:
+            way = [(x[i] + f * (x[j] - x[i]), y[i] + f * (y[j] - y[i])) for f in np.linspace(0, 1, 400)]
+            near |= cells(*way)
+            # no more than a quarter of a cell lies between the points that are set
+            coarse = int(step / 0.1 * 4.0) + 2
+            expected |= cells(
+                *((x[i] + f * (x[j] - x[i]), y[i] + f * (y[j] - y[i])) for f in np.arange(coarse) / (coarse - 1))
+            )
+    assert found <= near | expected
+    assert len(found ^ expected) <= 2, 'but for rounding'
+
+
+@pytest.mark.parametrize('count', [8, 12, 16, 24])
+def test_the_middle_of_a_ring_of_sonars_is_driven_over_before_it_moves(count: int) -> None:
+    yaw = np.arange(2 * count) * 2 * math.pi / count
+    x, y = 0.52 + 0.25 * np.cos(yaw), 1.97 + 0.25 * np.sin(yaw)
+    found = told(x, y, np.arange(2 * count) * 10 * MS)
+    inside = cells(*((0.52 + u, 1.97 + v) for u in (-0.1, 0.0, 0.1) for v in (-0.1, 0.0, 0.1)))
+    # what is free reaches a cell beyond what was driven over
+    beside = {(row + v, column + u) for row, column in found for u in (-1, 0, 1) for v in (-1, 0, 1)}
+    assert inside <= beside
+
+
+@pytest.mark.parametrize(
+    ('pause', 'step', 'joined'), [(400, 0.7, True), (500, 0.7, True), (501, 0.7, False), (400, 0.81, False)]
+)
+def test_gaps_and_jumps_are_not_joined(pause: int, step: float, joined: bool) -> None:
+    found = told([0.05, 0.05 + step], [1.05, 1.05], [0, pause * MS])
+    assert len(found) == (round(step / 0.1) + 1 if joined else 2)
+
+
+def test_readings_are_taken_in_the_order_of_their_stamps() -> None:
+    # there and back again: out of order the ends would be joined
+    x, y, stamp = [0.05, 1.65, 0.85], [1.05, 1.05, 1.05], [0, 600 * MS, 300 * MS]
+    assert told(x, y, stamp) == cells(*((0.05 + 0.1 * k, 1.05) for k in range(17)))
+
+
+def test_what_is_off_the_grid_is_left_out_and_what_was_set_stays() -> None:
+    assert told([-1e6, 1e6, 0.05], [0.0, 0.0, 1.05], [0, 1, 2]) == cells((0.05, 1.05))
+    driven = np.zeros(GRID.shape, bool)
+    driven[3, 4] = True
+    mark_driven(np.zeros(0), np.zeros(0), np.zeros(0, np.int64), GRID, driven)
+    mark_driven(np.array([0.05]), np.array([1.05]), np.array([7]), GRID, driven)
+    assert {(int(r), int(c)) for r, c in np.argwhere(driven)} == {(3, 4)} | cells((0.05, 1.05))

@@ -1,0 +1,450 @@
+"""Placing of readings: REP 117, interpolation, waiting, and the account of every message."""
+
+from __future__ import annotations
+
+import math
+import random
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from forward_grid_mapper.core.common.parameters import Parameters
+from forward_grid_mapper.core.messages.message_types import NANOSECONDS, OdometryMessage, Pose2, RangeMessage
+from forward_grid_mapper.core.messages.pose_association import HISTORY, LATER, MOST_FRAMES, MOST_POINTS, Placer
+from forward_grid_mapper.core.messages.rep117 import REASONS, measure
+
+INF, NAN = math.inf, math.nan
+MOUNT = Pose2(0.2, 0.1, math.pi / 2)
+
+
+def sonar(seconds: float = 0.0, **changes: object) -> RangeMessage:
+    made = RangeMessage(round(seconds * NANOSECONDS), 'sonar', 1.0, 0.1, 4.0, 0.3)
+    return made._replace(**changes)
+
+
+def odometry(seconds: float, x: float = 0.0, y: float = 0.0, yaw: float = 0.0) -> OdometryMessage:
+    return OdometryMessage(round(seconds * NANOSECONDS), 'odom', 'base_link', Pose2(x, y, yaw))
+
+
+class Clock:
+    """A clock that the test moves."""
+
+    now = 0.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+def placer(patient: bool = False, clock: Clock | None = None, **values: object) -> Placer:
+    return Placer(
+        lambda base, frame, stamp: MOUNT if frame.startswith('sonar') else None,
+        Parameters.from_flat(values),
+        patient,
+        clock or Clock(),
+    )
+
+
+def accounted(p: Placer) -> bool:
+    return p.received == len(p.buffer) + p.waiting + sum(p.rejected.values())
+
+
+@pytest.mark.parametrize(
+    ('changes', 'reason'),
+    [
+        ({'range': NAN}, 'nan_range'),
+        ({'range': -INF}, 'too_near'),
+        ({'range': 0.0, 'min_range': 0.0}, 'too_near'),
+        ({'range': 1e-30, 'min_range': 0.0}, 'too_near'),
+        ({'range': 0.0, 'min_range': 4.0}, 'too_near'),
+        ({'range': 0.05}, 'below_min_range'),
+        ({'range': -1.0}, 'below_min_range'),
+        ({'field_of_view': 0.0}, 'bad_field_of_view'),
+        ({'field_of_view': -0.3}, 'bad_field_of_view'),
+        ({'field_of_view': NAN}, 'bad_field_of_view'),
+        ({'field_of_view': 3.2}, 'bad_field_of_view'),
+        ({'max_range': 0.05}, 'bad_limits'),
+        ({'max_range': NAN}, 'bad_limits'),
+        ({'max_range': INF}, 'bad_limits'),
+        ({'max_range': 0.0, 'min_range': 0.0}, 'bad_limits'),
+        ({'min_range': NAN}, 'bad_limits'),
+        ({'min_range': -0.1}, 'bad_limits'),
+        ({'frame_id': ''}, 'empty_frame_id'),
+        ({'frame_id': 'x' * 300}, 'long_frame_id'),
+    ],
+)
+def test_rejections_of_rep_117(changes: dict[str, object], reason: str) -> None:
+    assert measure(sonar(**changes), Parameters().placing) == reason
+    p = placer()
+    p.add_range(sonar(**changes))
+    assert p.rejected == {reason: 1}
+    assert accounted(p)
+
+
+@pytest.mark.parametrize('value', [4.0, 4.5, INF])
+def test_out_of_range_is_no_echo_or_discarded(value: float) -> None:
+    measured = measure(sonar(range=value), Parameters().placing)
+    assert not isinstance(measured, str)
+    assert measured.z == measured.z_max == 4.0
+    discard = Parameters.from_flat({'over_range': 'discard'}).placing
+    assert measure(sonar(range=value), discard) == 'over_range'
+
+
+def test_fixed_distance_rangers() -> None:
+    fixed = sonar(min_range=0.8, max_range=0.8)
+    clear = measure(fixed._replace(range=INF), Parameters().placing)
+    detected = measure(fixed._replace(range=-INF), Parameters().placing)
+    assert not isinstance(clear, str)
+    assert not isinstance(detected, str)
+    assert clear.z == clear.z_max == 0.8
+    assert 0 < detected.z - 5 * detected.sigma < detected.z + 5 * detected.sigma < 0.8
+
+
+def test_variance_and_overrides() -> None:
+    p = Parameters.from_flat({'field_of_view': 0.5, 'max_range': 2.0}).placing
+    measured = measure(sonar(variance=0.04, field_of_view=0.0, range=3.0), p)
+    assert not isinstance(measured, str)
+    assert (measured.sigma, measured.half_angle, measured.z, measured.z_max) == (0.2, 0.25, 2.0, 2.0)
+
+
+def test_poses_are_interpolated_and_the_mount_is_added() -> None:
+    p = placer()
+    p.add_odometry(odometry(10.0, 1.0, 2.0, 3.0))
+    p.add_range(sonar(10.25))
+    assert p.waiting == 1
+    p.add_odometry(odometry(10.5, 2.0, 0.0, -3.0))
+    r = p.readings
+    yaw = 3.0 + 0.5 * (2 * math.pi - 6.0)
+    assert r.x[0] == pytest.approx(1.5 + math.cos(yaw) * 0.2 - math.sin(yaw) * 0.1)
+    assert r.y[0] == pytest.approx(1.0 + math.sin(yaw) * 0.2 + math.cos(yaw) * 0.1)
+    assert math.remainder(r.yaw[0] - yaw - math.pi / 2, 2 * math.pi) == pytest.approx(0.0, abs=1e-12)
+    assert r.sensor_names == ('sonar',)
+    assert (p.map_frame, p.base_frame) == ('odom', 'base_link')
+
+
+def test_reasons_of_time() -> None:
+    clock = Clock()
+    p = placer(clock=clock, max_pose_gap=0.5, pose_timeout=1.0)
+    p.add_range(sonar(0.5))
+    p.add_odometry(odometry(1.0))
+    assert p.rejected['before_odometry'] == 1
+    p.add_range(sonar(1.3))
+    p.add_odometry(odometry(1.7))
+    assert p.rejected['pose_gap'] == 1
+    p.add_range(sonar(1.8))
+    clock.now = 1.5
+    p.add_range(sonar(3.0))
+    assert p.rejected['no_odometry'] == 1
+    p.finish()
+    assert p.rejected['after_odometry'] == 1
+    assert len(p.buffer) == 0
+    assert accounted(p)
+    assert set(p.rejected) <= set(REASONS)
+
+
+def test_a_reading_times_out_by_stamps_and_by_the_clock() -> None:
+    clock = Clock()
+    fast, still = placer(clock=clock), placer(clock=clock)
+    for p in (fast, still):
+        p.add_odometry(odometry(0.0))
+        p.add_range(sonar(0.1))
+    # a bag replayed fast: the stamps run on, the clock hardly
+    fast.add_range(sonar(60.0))
+    assert fast.waiting == 2
+    # a simulation that stands still: the clock runs on
+    clock.now = 100.0
+    still.add_range(sonar(0.1))
+    assert still.waiting == 2
+    for p in (fast, still):
+        p.add_odometry(odometry(0.2))
+        assert len(p.buffer) >= 1
+        assert not p.rejected
+
+
+def test_a_pose_that_becomes_known_later_is_waited_for() -> None:
+    clock, known = Clock(), {'sonar'}
+    p = Placer(lambda base, frame, stamp: MOUNT if frame in known else LATER, clock=clock)
+    p.add_odometry(odometry(0.0))
+    p.add_range(sonar(0.0, frame_id='late'))
+    p.add_range(sonar(0.0, frame_id='never'))
+    assert (p.waiting, len(p.buffer)) == (2, 0)
+    known.add('late')
+    p.add_odometry(odometry(0.5))
+    assert (p.waiting, len(p.buffer)) == (1, 1)
+    clock.now = 10.0
+    p.add_odometry(odometry(10.0))
+    assert p.rejected == {'unknown_mount': 1}
+    assert p.unknown_frames == {'never'}
+    assert accounted(p)
+
+
+def test_an_exact_stamp_needs_no_bracket() -> None:
+    p = placer()
+    p.add_odometry(odometry(5.0, 1.0))
+    p.add_range(sonar(5.0))
+    assert len(p.buffer) == 1
+
+
+def test_unknown_mount_is_counted_and_named() -> None:
+    p = placer()
+    p.add_odometry(odometry(0.0))
+    p.add_range(sonar(0.0, frame_id='mystery'))
+    assert p.rejected == {'unknown_mount': 1}
+    assert p.unknown_frames == {'mystery'}
+    assert p.rejected_by_frame['mystery']['unknown_mount'] == 1
+
+
+def test_a_jump_back_drops_what_waits_and_keeps_the_readings() -> None:
+    p = placer()
+    for second in (100.0, 100.5, 101.0):
+        p.add_odometry(odometry(second))
+        p.add_range(sonar(second + 0.2))
+    kept = len(p.buffer)
+    assert (kept, p.waiting) == (2, 1)
+    p.add_odometry(odometry(2.0, 7.0))
+    assert p.rejected == {'time_jump': 1}
+    p.add_range(sonar(2.1))
+    p.add_odometry(odometry(2.2, 7.0))
+    assert len(p.buffer) == kept + 1
+    assert p.time_jumps == 1
+    assert accounted(p)
+
+
+def test_odometry_that_overtakes_is_sorted_in() -> None:
+    p = placer()
+    for second, x in ((0.0, 0.0), (0.4, 4.0), (0.2, 1.0)):
+        p.add_odometry(odometry(second, x))
+    p.add_range(sonar(0.1))
+    assert p.readings.x[0] == pytest.approx(0.5 + MOUNT.x)
+
+
+def test_bad_odometry_is_counted() -> None:
+    p = placer()
+    p.add_odometry(odometry(0.0)._replace(pose=None))
+    p.add_odometry(odometry(0.0))
+    p.add_odometry(odometry(0.1)._replace(frame_id='other'))
+    assert p.odometry_rejected == {'bad_pose': 1, 'other_frame': 1}
+
+
+def test_an_absurd_pose_is_refused() -> None:
+    p = placer()
+    for second, x in ((0.0, 0.0), (0.1, 1e6), (0.2, 1e9), (0.3, 0.0)):
+        p.add_odometry(odometry(second, x))
+        p.add_range(sonar(second))
+    # nothing was ever half way back from 1e6 m
+    assert p.rejected == {'far_from_map': 1, 'pose_jump': 1}
+    assert p.odometry_rejected == {'bad_pose': 1}
+    assert len(p.buffer) == 2
+
+
+def test_a_long_max_range_does_not_matter_where_echoes_are_near() -> None:
+    p = placer(max_cells=10_000)
+    p.add_odometry(odometry(0.0))
+    p.add_range(sonar(0.0, max_range=3e38))
+    assert len(p.buffer) == 1
+
+
+def test_odometry_kept_is_bounded_unless_patient() -> None:
+    p, q = placer(), placer(patient=True)
+    for k in range(50_000):
+        p.add_odometry(odometry(0.05 * k))
+        q.add_odometry(odometry(0.05 * k))
+    assert len(p._stamps) < 2.2 * HISTORY / (0.05 * NANOSECONDS)
+    assert len(q._stamps) == 50_000
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(0, 2**32 - 1))
+def test_a_patient_placer_does_not_care_about_interleaving(seed: int) -> None:
+    rng = random.Random(seed)
+    poses = [odometry(0.1 * k + 0.01 * rng.random(), k, -k, 0.1 * k) for k in range(30) if rng.random() < 0.8]
+    ranges = [sonar(3.2 * rng.random() - 0.1, range=rng.choice([1.0, 2.0, INF, NAN])) for _ in range(60)]
+
+    def run(messages: list[RangeMessage | OdometryMessage]) -> Placer:
+        p = placer(patient=True, max_pose_gap=0.25)
+        for message in messages:
+            (p.add_range if isinstance(message, RangeMessage) else p.add_odometry)(message)
+            assert accounted(p)
+        p.finish()
+        assert accounted(p)
+        return p
+
+    merged = [*poses, *ranges]
+    merged.sort(key=lambda m: m.stamp)
+    # each stream in order, the two mixed at will
+    mixed, a, b = [], list(poses), sorted(ranges, key=lambda m: m.stamp)
+    while a or b:
+        mixed.append((a if a and (not b or rng.random() < 0.5) else b).pop(0))
+    first = run(merged)
+    for other in (run(mixed), run([*ranges, *poses]), run([*poses, *ranges])):
+        assert sum(other.rejected.values()) == sum(first.rejected.values())
+        order, base = np.argsort(other.readings.stamp), np.argsort(first.readings.stamp)
+        for name in ('x', 'y', 'yaw', 'z', 'stamp'):
+            assert np.array_equal(getattr(other.readings, name)[order], getattr(first.readings, name)[base])
+
+
+@settings(max_examples=200, deadline=None)
+@given(
+    st.lists(
+        st.one_of(
+            st.builds(
+                RangeMessage,
+                st.integers(-(2**62), 2**62),
+                st.sampled_from(['sonar', 'sonar_2', '', 'mystery']),
+                st.floats(),
+                st.floats(),
+                st.floats(),
+                st.floats(),
+                st.floats(),
+            ),
+            st.builds(
+                lambda stamp, x, y, yaw: OdometryMessage(stamp, 'odom', 'base', Pose2(x, y, yaw)),
+                st.integers(-(2**62), 2**62),
+                st.floats(-1e12, 1e12),
+                st.floats(-1e12, 1e12),
+                st.floats(-4, 4),
+            ),
+        ),
+        max_size=40,
+    )
+)
+def test_any_messages_are_accounted_for(messages: list[RangeMessage | OdometryMessage]) -> None:
+    p = placer()
+    for message in messages:
+        (p.add_range if isinstance(message, RangeMessage) else p.add_odometry)(message)
+        assert accounted(p)
+    p.finish()
+    assert p.waiting == 0
+    assert accounted(p)
+    for column in ('x', 'y', 'yaw', 'z', 'z_max', 'half_angle', 'sigma'):
+        assert np.isfinite(getattr(p.readings, column)).all()
+
+
+def test_a_dead_sensor_does_not_wall_in_the_robot() -> None:
+    p = placer()
+    for second in range(5):
+        p.add_odometry(odometry(second))
+        p.add_range(sonar(second, range=0.0, min_range=0.0))
+    assert p.rejected == {'too_near': 5}
+
+
+def test_a_jump_of_ten_kilometres_costs_what_comes_after_it_and_no_memory() -> None:
+    p = placer()
+    for second in range(20):
+        p.add_odometry(odometry(second, 0.1 * second + (10_000.0 if second >= 10 else 0.0)))
+        p.add_range(sonar(second + 0.5))
+    p.finish()
+    assert p.rejected == {'pose_jump': 1, 'far_from_map': 9, 'after_odometry': 1}
+    assert len(p.buffer) == 9
+    assert accounted(p)
+    p.clear()
+    p.add_odometry(odometry(20.0, 10_002.0))
+    p.add_range(sonar(20.0))
+    assert len(p.buffer) == 1
+
+
+def test_a_cone_of_millions_of_cells_is_refused() -> None:
+    p = placer()
+    p.add_odometry(odometry(0.0))
+    p.add_range(sonar(0.0, range=300.0, max_range=1000.0, field_of_view=2.0))
+    p.add_range(sonar(0.0, range=6.0, max_range=1000.0, field_of_view=2.0))
+    assert (p.rejected, len(p.buffer)) == ({'large_cone': 1}, 1)
+
+
+def test_a_sensor_whose_clock_is_ahead_does_not_pile_up() -> None:
+    clock = Clock()
+    p = placer(clock=clock)
+    for tenth in range(200):
+        clock.now = tenth / 10
+        p.add_odometry(odometry(tenth / 10))
+        p.add_range(sonar(tenth / 10 + 3600.0))
+        p.add_range(sonar(tenth / 10))
+    assert p.waiting < 60
+    assert set(p.rejected) <= {'from_the_future', 'no_odometry'}
+    assert len(p.buffer) == 200
+    assert accounted(p)
+
+
+def test_odometry_that_stands_still_lets_readings_wait() -> None:
+    clock = Clock()
+    p = placer(clock=clock)
+    p.add_odometry(odometry(1.0))
+    p.add_range(sonar(1.1))
+    clock.now = 1000.0
+    p.add_odometry(odometry(1.0))
+    p.add_range(sonar(1.2))
+    p.add_odometry(odometry(1.2))
+    assert (len(p.buffer), p.waiting) == (2, 0)
+
+
+@pytest.mark.parametrize('rate', [1, 1000])
+def test_rates_of_odometry(rate: int) -> None:
+    p = placer()
+    for k in range(5 * rate + 1):
+        p.add_odometry(odometry(k / rate, k / rate))
+        for tenth in range(10 // min(rate, 10)):
+            p.add_range(sonar(k / rate + tenth / 10))
+    p.finish()
+    assert set(p.rejected) <= {'after_odometry'}
+    assert p.readings.x == pytest.approx(p.readings.stamp / NANOSECONDS + 0.2)
+
+
+def test_a_gap_of_an_hour_is_not_bridged() -> None:
+    p = placer()
+    for second in (0.0, 0.5, 3600.0, 3600.5):
+        p.add_odometry(odometry(second))
+    for second in (0.25, 1.0, 1800.0, 3599.0, 3600.25):
+        p.add_range(sonar(second))
+    # 0.25 s is so far back that its odometry is forgotten, unless little of it came
+    assert p.rejected == {'pose_gap': 3}
+    assert len(p.buffer) == 2
+
+
+def test_one_stamp_from_the_future_costs_only_what_waits() -> None:
+    p = placer()
+    for second in range(10):
+        p.add_odometry(odometry(1e9 if second == 5 else second))
+        p.add_range(sonar(second - 0.5))
+    assert (p.time_jumps, len(p.buffer)) == (1, 7)
+    assert p.rejected == {'before_odometry': 2, 'pose_gap': 1} or sum(p.rejected.values()) == 3
+    assert accounted(p)
+
+
+def test_what_strangers_can_make_grow_is_bounded() -> None:
+    p = placer()
+    for k in range(2 * MOST_FRAMES):
+        p.reject(sonar(0.0, frame_id=f'frame {k}'), 'paused')
+        p.add_odometry(odometry(k))
+        p.add_range(sonar(k, frame_id=f'unknown {k}'))
+    assert len(p.rejected_by_frame) <= MOST_FRAMES + 1
+    assert len(p.unknown_frames) <= MOST_FRAMES
+    assert sum(sum(counts.values()) for counts in p.rejected_by_frame.values()) == sum(p.rejected.values())
+
+
+def test_a_long_path_is_told_by_fewer_points() -> None:
+    p = placer()
+    for k in range(3 * MOST_POINTS):
+        p.extend_path((0.06 * k, 0.0))
+    assert len(p.path) <= MOST_POINTS
+    assert p.path[-1][0] > 0.06 * 3 * MOST_POINTS - 1.0
+    steps = np.diff(np.array(p.path)[:, 0])
+    assert steps.max() < 2.5 * np.median(steps)
+
+
+def test_a_reset_begins_with_the_odometry_that_comes() -> None:
+    p = placer()
+    p.add_odometry(odometry(0.0)._replace(frame_id='garbage'))
+    for second in (1.0, 1.5):
+        p.add_odometry(odometry(second))
+    p.add_range(sonar(1.2))
+    assert p.odometry_rejected == {'other_frame': 2}
+    p.clear()
+    for second in (2.0, 2.5):
+        p.add_odometry(odometry(second))
+    p.add_range(sonar(2.2))
+    assert (p.map_frame, len(p.buffer), p.odometry_rejected) == ('odom', 1, {})
+    # otherwise it is kept, so that the next reading can be placed
+    p.clear()
+    p.add_range(sonar(2.3))
+    assert (p.map_frame, len(p.buffer)) == ('odom', 1)

@@ -1,0 +1,109 @@
+"""Work shared out to threads; that their number and the memory change no result is told of the search as a whole."""
+
+from __future__ import annotations
+
+import itertools
+import threading
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from conftest import PLAIN_MODEL, PLAIN_SEARCH, random_readings
+from forward_grid_mapper.core.common.grid import Grid
+from forward_grid_mapper.core.common.parameters import ModelParameters, Parameters, SearchParameters
+from forward_grid_mapper.core.evidence.evidence import Evidence
+from forward_grid_mapper.core.mapping import Mapper
+from forward_grid_mapper.core.runtime import threads
+from forward_grid_mapper.core.search.search import Search, SearchResult
+
+AREA = Grid(0.1, -13, 4, 60, 50)
+
+
+@given(st.integers(0, 10**7), st.integers(0, 10**7), st.integers(1, 300))
+def test_parts_are_the_whole_range_in_order_and_none_is_small(begin: int, size: int, workers: int) -> None:
+    parts = threads.parts(begin, begin + size, workers)
+    assert parts[0][0] == begin
+    assert parts[-1][1] == begin + size
+    assert all(a[1] == b[0] for a, b in itertools.pairwise(parts))
+    lengths = [last - first for first, last in parts]
+    assert max(lengths) - min(lengths) <= 1
+    assert len(parts) == min(workers, max(size // threads.LEAST_PART, 1))
+
+
+def test_work_runs_at_the_same_time_and_is_waited_for() -> None:
+    meeting, done = threading.Barrier(3, timeout=20), []
+
+    def work(k: int) -> None:
+        meeting.wait()
+        done.append(k)
+
+    threads.run_each([lambda k=k: work(k) for k in range(3)])
+    assert sorted(done) == [0, 1, 2]
+
+
+def test_one_piece_of_work_needs_no_thread() -> None:
+    seen: list[int] = []
+    threads.run_each([lambda: seen.append(threading.get_ident())])
+    assert seen == [threading.get_ident()]
+
+
+@pytest.mark.parametrize('count', [1, 3])
+def test_an_error_of_a_thread_is_raised(count: int) -> None:
+    def work() -> None:
+        raise ValueError('of the work')
+
+    with pytest.raises(ValueError, match='of the work'):
+        threads.run_each([work] * count)
+
+
+def test_there_is_a_core() -> None:
+    assert threads.cores() >= 1
+
+
+def search(workers: int, memory: float, cell_distance: str, seed: int, plain: bool) -> tuple[SearchResult, Evidence]:
+    readings = random_readings(np.random.default_rng(seed), AREA, 600, z_max=3.0)
+    readings.half_angle[:] *= 0.3
+    surfaces = PLAIN_MODEL if plain else {}
+    model = ModelParameters(p_hit=0.7, p_rand=0.1, sigma=0.06, cell_distance=cell_distance, **surfaces)
+    evidence = Evidence(AREA, model, memory=memory, threads=workers)
+    evidence.extend(readings)
+    assert evidence.state.facing.known.any() != plain
+    return Search(evidence, SearchParameters(**(PLAIN_SEARCH if plain else {}))).run(), evidence
+
+
+@pytest.mark.parametrize('cell_distance', ['center', 'nearest'])
+@pytest.mark.parametrize(('seed', 'plain'), [(0, True), (1, False)], ids=['plain', 'whole'])
+def test_neither_threads_nor_memory_change_a_bit_of_the_search(
+    monkeypatch: pytest.MonkeyPatch, cell_distance: str, seed: int, plain: bool
+) -> None:
+    first, evidence = search(1, np.inf, cell_distance, seed, plain)
+    assert first.progress.shifts > 0
+    assert first.progress.flips > 50
+    monkeypatch.setattr(threads, 'LEAST_PART', 50)
+    half = evidence.state.pairs.cell.nbytes / 2
+    for workers, memory in ((3, np.inf), (1, half), (1, 0.0), (3, half), (3, 0.0)):
+        other, less = search(workers, memory, cell_distance, seed, plain)
+        assert (less.unstored > 0) == (memory < np.inf)
+        assert np.array_equal(other.occupied, first.occupied)
+        assert np.array_equal(other.evidence, first.evidence)
+        assert other.log_prior == first.log_prior
+        assert other.progress == first.progress
+        assert less.log_likelihood == evidence.log_likelihood
+
+
+def test_the_maps_do_not_depend_on_threads_or_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(threads, 'LEAST_PART', 50)
+    readings = random_readings(np.random.default_rng(5), AREA, 1500, z_max=3.0)
+    made = [
+        Mapper(Parameters.from_flat(values)).run(readings)
+        for values in ({'threads': 1}, {'threads': 4}, {'threads': 0, 'max_memory': 0}, {'max_memory': 1})
+    ]
+    assert made[0].statistics['readings_not_stored'] == 0
+    assert made[2].statistics['readings_not_stored'] == len(readings)
+    assert 0 < made[3].statistics['readings_not_stored'] < len(readings)
+    for other in made[1:]:
+        assert np.array_equal(other.ml, made[0].ml)
+        assert np.array_equal(other.uncertainty, made[0].uncertainty, equal_nan=True)
+        assert other.objective == made[0].objective

@@ -1,0 +1,362 @@
+"""Choosing and making moves, against plain twins and against evaluations of whole maps."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import naive
+from conftest import plain_model, random_readings
+from forward_grid_mapper.core.common.grid import Grid
+from forward_grid_mapper.core.common.parameters import ModelParameters
+from forward_grid_mapper.core.common.readings import Readings
+from forward_grid_mapper.core.evidence.evidence import Evidence
+from forward_grid_mapper.core.evidence.fixed_point import QUANTUM
+from forward_grid_mapper.core.evidence.neighbourhood import patterns
+from forward_grid_mapper.core.evidence.updates import flip
+from forward_grid_mapper.core.search.moves import (
+    WORTH_WAITING,
+    best_shifts,
+    flip_in_order,
+    free_needless,
+    highest,
+    promising,
+    see_any,
+    shift_in_order,
+    try_shifts,
+    unsettle,
+)
+from forward_grid_mapper.core.search.prior import Prior
+from forward_grid_mapper.core.search.search import LEAST
+from forward_grid_mapper.core.sensor.forward_model import expectations, log_likelihood
+
+GRID = Grid(0.1, 0, 0, 12, 9)
+NOTHING = (0.0, 0.0)
+seeds = st.integers(0, 2**32 - 1)
+
+
+def random_case(
+    seed: int, count: int = 40, memory: float = math.inf, filled: float = 0.15
+) -> tuple[Evidence, Readings]:
+    rng = np.random.default_rng(seed)
+    readings = (naive.awkward_readings, random_readings)[seed % 2](rng, GRID, count)
+    # off the lattice, so that it is not rounding that tells on which side of the cut a cell lies
+    readings.x[:] += 0.001234
+    readings.y[:] -= 0.000777
+    readings.z[:] = np.minimum(readings.z + 0.000345, readings.z_max)
+    readings.sigma[:] *= 1.0017
+    model = plain_model(
+        p_hit=rng.choice([0.05, 0.6, 0.98]),
+        p_rand=rng.choice([0.001, 0.1, 0.4]),
+        p_lost=rng.choice([0.0, 0.25]),
+        sigma=rng.choice([0.01, 0.06]),
+        cell_distance=str(rng.choice(['center', 'nearest'])),
+    )
+    evidence = Evidence(GRID, model, memory=memory, start=rng.random(GRID.shape) < filled)
+    evidence.extend(readings)
+    return evidence, readings
+
+
+def model_of(evidence: Evidence) -> ModelParameters:
+    return evidence.model
+
+
+def prior_of(name: str) -> Prior:
+    """All in sixteenths of a nat, so that sums are exact in any order."""
+    if name in ('none', 'less'):
+        return Prior(np.full(GRID.size, {'none': 0.0, 'less': -0.5}[name]), np.zeros(256))
+    rng = np.random.default_rng(256)
+    return Prior(rng.integers(-30, -5, GRID.size) / 16, rng.integers(-24, 16, 256) / 16)
+
+
+PRIORS = pytest.mark.parametrize('prior', [prior_of('less'), prior_of('shapes')], ids=['independent', 'shapes'])
+
+
+def height(evidence: Evidence, readings: Readings, prior: Prior) -> float:
+    shaped = evidence.state.maps.occupied.reshape(GRID.shape)
+    return log_likelihood(readings, GRID, shaped, model_of(evidence)) + naive.log_prior(prior, shaped, GRID.shape)
+
+
+def gain(evidence: Evidence, prior: Prior, c: int) -> float:
+    maps = evidence.state.maps
+    return int(maps.evidence[c]) * QUANTUM + naive.prior_gain(prior, maps.occupied, c, GRID.shape)
+
+
+WHOLE = (0, GRID.height, 0, GRID.width)
+
+
+def listed(
+    evidence: Evidence, prior: Prior, least: tuple[float, float] = LEAST, window: tuple[int, int, int, int] = WHOLE
+) -> tuple[np.ndarray, np.ndarray]:
+    cells, gains = np.empty(GRID.size, np.int64), np.empty(GRID.size)
+    n = promising(evidence.state, prior, least, window, cells, gains)
+    return cells[:n], gains[:n]
+
+
+def neighbours(c: int) -> list[int]:
+    row, column = divmod(c, GRID.width)
+    return [
+        y * GRID.width + x
+        for y in range(max(row - 1, 0), min(row + 2, GRID.height))
+        for x in range(max(column - 1, 0), min(column + 2, GRID.width))
+        if (y, x) != (row, column)
+    ]
+
+
+@pytest.mark.parametrize('seed', range(10))
+@pytest.mark.parametrize('name', ['none', 'less', 'shapes'])
+def test_promising_cells_are_those_whose_flip_gains(seed: int, name: str) -> None:
+    prior = prior_of(name)
+    evidence, _ = random_case(seed)
+    least = (0.01, 0.002)
+    seen = evidence.state.maps.seen
+    cells, gains = listed(evidence, prior, least)
+    assert cells.tolist() == [
+        c for c in range(GRID.size) if seen[c] and gain(evidence, prior, c) > least[0] + least[1] * int(seen[c])
+    ]
+    assert gains.tolist() == [gain(evidence, prior, c) for c in cells]
+    assert len(cells) > 0
+    for bottom, top, left, right in ((2, 5, 3, 11), (0, 9, 4, 4), (8, 9, 0, 12)):
+        inside = [c for c in cells if bottom <= c // GRID.width < top and left <= c % GRID.width < right]
+        assert listed(evidence, prior, least, (bottom, top, left, right))[0].tolist() == inside
+
+
+@pytest.mark.parametrize('seed', range(10))
+@PRIORS
+def test_the_highest_are_those_that_no_neighbour_beats(seed: int, prior: Prior) -> None:
+    evidence, _ = random_case(seed)
+    # make ties
+    evidence.state.maps.evidence[:] = evidence.state.maps.evidence >> 23 << 23
+    cells, gains = listed(evidence, prior, NOTHING)
+    room = np.zeros(GRID.size)
+    told = cells[highest(evidence.state, cells, gains, room)].tolist()
+    assert not room.any()
+    expected = []
+    for c in cells:
+        rivals = [(gain(evidence, prior, o), -o) for o in neighbours(c) if o in cells]
+        if all((gain(evidence, prior, c), -c) > rival for rival in rivals):
+            expected.append(int(c))
+    assert told == expected
+    assert len(told) > 0
+    assert not any(set(neighbours(c)) & set(told) for c in told), 'no two that are neighbours'
+
+
+@pytest.mark.parametrize('seed', range(10))
+@pytest.mark.parametrize('memory', [math.inf, 0.0])
+@PRIORS
+def test_flips_in_order_are_made_while_they_gain_and_what_they_gain_is_told(
+    seed: int, memory: float, prior: Prior
+) -> None:
+    evidence, readings = random_case(seed, memory=memory)
+    twin, _ = random_case(seed)
+    cells, gains = listed(evidence, prior)
+    order = np.argsort(-gains, kind='stable')
+    before = height(evidence, readings, prior)
+    flips, total = flip_in_order(evidence.state, prior, LEAST, cells[order], gains[order])
+    assert height(evidence, readings, prior) - before == pytest.approx(total, abs=1e-6 * len(readings) * max(flips, 1))
+    made, expected = 0, 0.0
+    for c, at_first in zip(cells[order].tolist(), gains[order].tolist(), strict=True):
+        now = gain(twin, prior, c)
+        if now > LEAST[0] + LEAST[1] * twin.state.maps.seen[c] and now > WORTH_WAITING * at_first:
+            flip(twin.state, c)
+            made, expected = made + 1, expected + now
+    assert (flips, total) == (made, expected)
+    assert np.array_equal(evidence.state.maps.occupied, twin.state.maps.occupied)
+
+
+@settings(deadline=None)
+@given(seeds, st.sampled_from([0.0, 0.001, 0.1]))
+def test_occupied_cells_that_cost_nothing_to_free_are_freed_one_after_the_other(seed: int, tolerance: float) -> None:
+    evidence, _ = random_case(seed, filled=0.4)
+    twin, _ = random_case(seed, filled=0.4)
+    prior, occupied = prior_of('none'), np.flatnonzero(evidence.state.maps.occupied)
+    made, expected = 0, 0.0
+    for c in occupied.tolist():
+        now = gain(twin, prior, c)
+        if twin.state.maps.seen[c] and now >= -tolerance * twin.state.maps.seen[c]:
+            flip(twin.state, c)
+            made, expected = made + 1, expected + now
+    assert free_needless(evidence.state, prior, (1.0, tolerance), occupied) == (made, expected)
+    assert np.array_equal(evidence.state.maps.occupied, twin.state.maps.occupied)
+
+
+def joints(evidence: Evidence, cells: np.ndarray, readings: np.ndarray | None = None) -> np.ndarray:
+    slot = np.full(GRID.size, -1, np.int32)
+    slot[cells] = np.arange(len(cells))
+    place, joint = np.full(GRID.size, -1, np.int32), np.zeros((len(cells), 9), np.int64)
+    which = np.arange(len(evidence)) if readings is None else readings
+    try_shifts(evidence.state, which, slot, place, joint)
+    assert (place == -1).all()
+    return joint
+
+
+def positions(evidence: Evidence, t: int, c: int, o: int) -> str:
+    """Where reading t has the two cells of a shift."""
+    free, band, _, _ = naive.pairs_of(evidence.state, t)
+    places = ['free' if k in free else 'band' if k in band else 'off' for k in (c, o)]
+    if places == ['band', 'band']:
+        places.append('behind' if band.index(o) > band.index(c) else 'before')
+    return ' '.join(places)
+
+
+@pytest.mark.parametrize('filled', [0.02, 0.15, 0.6])
+def test_the_joint_gain_of_a_reading_is_the_difference_of_two_evaluations(filled: float) -> None:
+    tried: dict[str, int] = {}
+    for seed in range(12):
+        evidence, readings = random_case(seed, 12, filled=filled)
+        maps = evidence.state.maps
+        cells = np.flatnonzero(maps.occupied)[:12]
+        for t in range(len(readings)):
+            one = readings.select(slice(t, t + 1))
+            free, band, _, logs = naive.pairs_of(evidence.state, t)
+            share = evidence.state.shares[t]
+            single = dict(zip(band, logs, strict=True))
+            single |= {c: share['release' if maps.occupied[c] else 'occupy'] for c in free}
+            joint = joints(evidence, cells, np.array([t]))
+
+            def evaluate(*changes: int) -> float:
+                changed = maps.occupied.copy()  # noqa: B023
+                changed[list(changes)] ^= 1
+                shaped = changed.reshape(GRID.shape)
+                return float(expectations(one, GRID, shaped, model_of(evidence)).log_likelihood[0])  # noqa: B023
+
+            before = evaluate()
+            for i, c in enumerate(cells.tolist()):
+                for o in neighbours(c):
+                    if maps.occupied[o]:
+                        continue
+                    k = 3 * (o // GRID.width - c // GRID.width + 1) + o % GRID.width - c % GRID.width + 1
+                    told = (int(single.get(c, 0)) + int(single.get(o, 0)) + int(joint[i, k])) * QUANTUM
+                    # both ratios are rounded, which counts for more the more unlikely the shift makes the reading
+                    exact = evaluate(c, o) - before
+                    ratios = [math.exp(int(single.get(k, 0)) * QUANTUM) for k in (c, o)]
+                    error = 2e-7 * (1 + (ratios[0] + ratios[1] / (1 - model_of(evidence).p_hit)) / math.exp(exact))
+                    assert told == pytest.approx(exact, abs=error), positions(evidence, t, c, o)
+                    place = positions(evidence, t, c, o)
+                    tried[place] = tried.get(place, 0) + 1
+    wanted = {'band band behind', 'band band before', 'free free', 'free band', 'band free', 'off off'}
+    wanted |= {'off band', 'band off', 'off free', 'free off'}
+    assert set(tried) == wanted
+
+
+@pytest.mark.parametrize('memory', [math.inf, 0.0])
+@pytest.mark.parametrize('seed', range(10))
+@PRIORS
+def test_the_best_shifts_are_those_that_brute_force_finds(seed: int, memory: float, prior: Prior) -> None:
+    evidence, readings = random_case(seed, memory=memory)
+    maps = evidence.state.maps
+    cells = np.flatnonzero((maps.occupied == 1) & (maps.seen > 0))
+    kept = maps.occupied.copy()
+    targets, gains = best_shifts(evidence.state, prior, LEAST, cells, joints(evidence, cells))
+    assert np.array_equal(maps.occupied, kept)
+    assert np.array_equal(maps.pattern, patterns(kept, GRID.shape))
+    before = height(evidence, readings, prior)
+    for c, target, told in zip(cells.tolist(), targets.tolist(), gains.tolist(), strict=True):
+        exact = {}
+        for o in neighbours(c):
+            if not maps.occupied[o] and maps.seen[o]:
+                maps.occupied[[c, o]] ^= 1
+                exact[o] = height(evidence, readings, prior) - before
+                maps.occupied[[c, o]] ^= 1
+        best = max(exact.values(), default=-1.0)
+        if target < 0:
+            assert best < 1e-3
+            assert told == 0
+        else:
+            assert exact[target] == pytest.approx(told, abs=1e-4)
+            assert exact[target] == pytest.approx(best, abs=1e-4)
+    assert (targets >= 0).any()
+
+
+@pytest.mark.parametrize('seed', range(4))
+def test_a_reading_of_weight_three_says_of_shifts_what_three_readings_say(seed: int) -> None:
+    heavy, readings = random_case(seed)
+    heavy.weigh(np.repeat(np.arange(len(readings)), 2))
+    thrice = Evidence(GRID, model_of(heavy), start=heavy.state.maps.occupied.reshape(GRID.shape))
+    thrice.extend(readings.select(np.repeat(np.arange(len(readings)), 3)))
+    cells = np.flatnonzero(heavy.state.maps.occupied)
+    assert np.array_equal(joints(heavy, cells), joints(thrice, cells))
+
+
+@pytest.mark.parametrize('seed', range(4))
+def test_what_readings_say_of_shifts_adds_up_and_needs_no_memory(seed: int) -> None:
+    evidence, _ = random_case(seed)
+    cells = np.flatnonzero(evidence.state.maps.occupied)
+    whole = joints(evidence, cells)
+    half = [joints(evidence, cells, part) for part in (np.arange(13), np.arange(13, len(evidence)))]
+    assert np.array_equal(whole, sum(half))
+    for memory in (0.0, 3000.0):
+        assert np.array_equal(whole, joints(random_case(seed, memory=memory)[0], cells))
+
+
+@pytest.mark.parametrize('seed', range(10))
+@PRIORS
+def test_shifts_are_made_while_they_gain_and_what_they_gain_is_told(seed: int, prior: Prior) -> None:
+    evidence, readings = random_case(seed)
+    maps = evidence.state.maps
+    cells = np.flatnonzero((maps.occupied == 1) & (maps.seen > 0))
+    targets, gains = best_shifts(evidence.state, prior, LEAST, cells, joints(evidence, cells))
+    order = np.argsort(-gains, kind='stable')[: int((targets >= 0).sum())]
+    start = before = height(evidence, readings, prior)
+    old = maps.occupied.copy()
+    moves, total = 0, 0.0
+    for k in order:
+        made, told = shift_in_order(evidence.state, prior, LEAST, cells[[k]], targets[[k]])
+        after = height(evidence, readings, prior)
+        assert after - before == pytest.approx(told, abs=1e-4)
+        assert (told > 0) == (made == 1)
+        moves, total, before = moves + made, total + told, after
+    assert moves > 0
+    assert maps.occupied.sum() == old.sum()
+    assert before - start == pytest.approx(total, abs=1e-3)
+    twin, _ = random_case(seed)
+    at_once = shift_in_order(twin.state, prior, LEAST, cells[order], targets[order])
+    assert at_once == (moves, pytest.approx(total))
+    assert np.array_equal(twin.state.maps.occupied, maps.occupied)
+    assert np.array_equal(twin.state.maps.evidence, maps.evidence)
+
+
+def test_shifts_of_what_has_gone_or_to_where_something_is_are_left_out() -> None:
+    evidence, _ = random_case(1)
+    occupied, free = (np.flatnonzero(evidence.state.maps.occupied == v) for v in (1, 0))
+    before = evidence.state.maps.occupied.copy()
+    for cells, targets in ((free[:5], free[5:10]), (occupied[:5], occupied[5:10])):
+        assert shift_in_order(evidence.state, prior_of('none'), LEAST, cells, targets) == (0, 0.0)
+    assert np.array_equal(evidence.state.maps.occupied, before)
+
+
+@settings(max_examples=25, deadline=None)
+@given(seeds, st.lists(st.integers(0, GRID.size - 1), min_size=1, max_size=4), st.sampled_from([math.inf, 0.0]))
+def test_readings_that_see_a_flip_are_found_and_unsettle_all_their_cells(
+    seed: int, cells: list[int], memory: float
+) -> None:
+    evidence, readings = random_case(seed, 25, memory=memory)
+    stored, _ = random_case(seed, 25)
+    flip(evidence.state, 5)
+    since = int(evidence.state.clock[0])
+    for c in cells:
+        flip(evidence.state, c)
+    seen_by = [set().union(*naive.pairs_of(stored.state, t)[:2]) for t in range(len(readings))]
+    sees = np.zeros(len(readings), np.uint8)
+    see_any(evidence.state, np.array(cells), sees)
+    assert sees.tolist() == [int(bool(seen & set(cells))) for seen in seen_by]
+    settled = np.ones(GRID.size, np.uint8)
+    unsettle(evidence.state, since, settled)
+    stirred = set().union(*(seen for seen in seen_by if seen & set(cells)))
+    assert set(np.flatnonzero(settled == 0).tolist()) == stirred
+
+
+def test_stop_ends_every_loop() -> None:
+    evidence, _ = random_case(1)
+    cells, gains = listed(evidence, prior_of('none'))
+    occupied = np.flatnonzero(evidence.state.maps.occupied)
+    before = evidence.state.maps.occupied.copy()
+    evidence.state.stop[0] = 1
+    assert flip_in_order(evidence.state, prior_of('none'), LEAST, cells, gains) == (0, 0.0)
+    assert not joints(evidence, occupied).any()
+    assert shift_in_order(evidence.state, prior_of('none'), LEAST, occupied, occupied + 1) == (0, 0.0)
+    assert np.array_equal(evidence.state.maps.occupied, before)

@@ -1,0 +1,161 @@
+"""The prior of a map against sums over all of its cells."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as arrays
+
+import naive
+from conftest import plain_search
+from forward_grid_mapper.core.common.parameters import SearchParameters
+from forward_grid_mapper.core.evidence.neighbourhood import (
+    EAST,
+    NORTH,
+    NORTH_WEST,
+    SOUTH_EAST,
+    SOUTH_WEST,
+    WEST,
+    neighbour,
+    note_flip,
+    patterns,
+)
+from forward_grid_mapper.core.search.prior import (
+    LEAST_COST,
+    Prior,
+    local_prior,
+    log_prior,
+    odds_given_neighbours,
+    prior_gain,
+    prior_gains,
+    shapes,
+)
+
+sides = st.tuples(st.integers(1, 5), st.integers(1, 5))
+maps = sides.flatmap(lambda shape: arrays.arrays(np.uint8, shape, elements=st.integers(0, 1)))
+seeds = st.integers(0, 2**32 - 1)
+
+
+def random_prior(seed: int, size: int) -> Prior:
+    rng = np.random.default_rng(seed)
+    return Prior(rng.uniform(-3, 1, size), rng.uniform(-3, 3, 256))
+
+
+@settings(deadline=None)
+@given(maps)
+def test_patterns_are_the_occupied_neighbours_on_the_grid(occupied: np.ndarray) -> None:
+    told = patterns(occupied.ravel(), occupied.shape)
+    assert told.tolist() == [naive.pattern_of(occupied, c, occupied.shape) for c in range(occupied.size)]
+    for c in range(occupied.size):
+        for k, o in naive.neighbours_of(c, occupied.shape).items():
+            assert neighbour(c, k, occupied.shape[1]) == o
+
+
+@settings(deadline=None)
+@given(maps, st.lists(st.integers(0, 24), max_size=12))
+def test_patterns_kept_up_to_date_are_those_made_from_scratch(occupied: np.ndarray, cells: list[int]) -> None:
+    shape = occupied.shape
+    pattern = patterns(occupied, shape)
+    for c in cells:
+        if c < occupied.size:
+            occupied.ravel()[c] ^= 1
+            note_flip(pattern, c, *shape)
+    assert np.array_equal(pattern, patterns(occupied, shape))
+
+
+@pytest.mark.parametrize('shape', [(1, 1), (4, 1), (1, 2), (4, 2)])
+def test_on_grids_one_or_two_cells_wide_too(shape: tuple[int, int]) -> None:
+    occupied = np.zeros(shape, np.uint8)
+    pattern = patterns(occupied, shape)
+    occupied[0, 0] = 1
+    note_flip(pattern, 0, *shape)
+    assert np.array_equal(pattern, patterns(occupied, shape))
+
+
+@settings(deadline=None)
+@given(maps, seeds)
+def test_the_log_prior_is_the_sum_over_occupied_cells_and_gains_are_its_differences(
+    occupied: np.ndarray, seed: int
+) -> None:
+    shape, flat = occupied.shape, occupied.ravel()
+    prior, pattern = random_prior(seed, occupied.size), patterns(occupied, shape)
+    before = naive.log_prior(prior, occupied, shape)
+    assert log_prior(prior, flat, pattern) == pytest.approx(before, abs=1e-9)
+    gains = prior_gains(prior, flat, pattern, shape[1])
+    odds = odds_given_neighbours(prior, occupied == 1)
+    for c in range(occupied.size):
+        changed = occupied.copy()
+        changed.ravel()[c] ^= 1
+        exact = naive.log_prior(prior, changed, shape) - before
+        told = prior_gain(prior, flat, pattern, c, shape[1])
+        assert told == pytest.approx(exact, abs=1e-9)
+        assert naive.prior_gain(prior, occupied, c, shape) == pytest.approx(exact, abs=1e-9)
+        assert gains[c] == told
+        assert odds[c] == (-told if flat[c] else told)
+
+
+PARAMETERS = [
+    SearchParameters(),
+    plain_search(prior=0.2),
+    SearchParameters(prior=0.1, line_bonus=1.5, end_cost=0.3, isolated_cost=4.0),
+    SearchParameters(prior=0.5),
+]
+
+
+@settings(deadline=None)
+@given(maps, st.sampled_from(PARAMETERS))
+def test_a_map_turned_or_mirrored_is_as_likely(occupied: np.ndarray, parameters: SearchParameters) -> None:
+    def told(cells: np.ndarray) -> float:
+        prior = Prior(local_prior(parameters, np.zeros(cells.size, bool)), shapes(parameters))
+        return log_prior(prior, np.ascontiguousarray(cells).ravel(), patterns(cells, cells.shape))
+
+    for other in (occupied[::-1], occupied[:, ::-1], occupied.T, np.rot90(occupied)):
+        assert told(other) == pytest.approx(told(occupied), abs=1e-9)
+
+
+def bits(*directions: int) -> int:
+    return sum(1 << k for k in directions)
+
+
+def test_shapes_tell_walls_from_ends_and_dots() -> None:
+    told = shapes(SearchParameters(prior=0.1, line_bonus=0.5, end_cost=1.5, isolated_cost=3.0))
+    assert told[0] == -3.0
+    for wall in ((EAST, WEST), (NORTH_WEST, SOUTH_EAST), (EAST, SOUTH_WEST), (NORTH, SOUTH_EAST), range(8)):
+        assert told[bits(*wall)] == 0.5
+    for end in ((EAST,), (NORTH_WEST,), (EAST, NORTH), (NORTH_WEST, SOUTH_WEST), (NORTH, NORTH_WEST, WEST)):
+        assert told[bits(*end)] == -1.5
+    for pattern in range(1, 256):
+        angles = [k * math.pi / 4 for k in range(8) if pattern >> k & 1]
+        # the bend of the straightest curve from one neighbour through the cell to another
+        bend = min(abs(math.remainder(a - b - math.pi, 2 * math.pi)) for a in angles for b in angles)
+        assert told[pattern] == (0.5 if bend < math.pi / 4 + 1e-9 else -1.5)
+
+
+@pytest.mark.parametrize('prior', [1e-6, 0.1, 0.4, 0.42, 0.49, 0.5])
+@pytest.mark.parametrize('line_bonus', [0.0, 0.3, 10.0])
+def test_walls_are_never_likelier_than_none(prior: float, line_bonus: float) -> None:
+    parameters = SearchParameters(prior=prior, line_bonus=line_bonus)
+    cost = math.log((1 - prior) / prior)
+    line = shapes(parameters).max()
+    assert 0 <= line <= line_bonus
+    assert line == 0 or cost - line >= LEAST_COST - 1e-12
+    if line < line_bonus:
+        assert line == 0 or cost - line == pytest.approx(LEAST_COST)
+
+
+def test_plain_parameters_make_cells_independent() -> None:
+    assert not shapes(plain_search()).any()
+
+
+@pytest.mark.parametrize('cost', [0.0, 7.0])
+def test_cells_driven_over_cost_more(cost: float) -> None:
+    driven = np.array([[True, False, False], [False, False, True]])
+    told = local_prior(SearchParameters(prior=0.3, driven_cost=cost), driven)
+    odds = math.log(0.3 / 0.7)
+    assert told.shape == driven.shape
+    assert told[~driven] == pytest.approx(odds)
+    assert told[driven] == pytest.approx(odds - cost)

@@ -1,0 +1,223 @@
+"""The cells of a cone against a test of every cell of the grid."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+import naive
+from conftest import plain_model, random_readings
+from forward_grid_mapper.core.common.grid import Grid, cone_boxes
+from forward_grid_mapper.core.common.parameters import GridParameters, ModelParameters
+from forward_grid_mapper.core.common.readings import Readings
+from forward_grid_mapper.core.sensor.cone import axis_run, distance, row_runs, within
+from forward_grid_mapper.core.sensor.cone_table import (
+    cone_of,
+    cone_table,
+    effective_sigma,
+    grid_of,
+    reach_of,
+    walk,
+    walk_with_room,
+)
+
+GRID = Grid(0.1, -7, 12, 41, 33)
+
+Make = Callable[[np.random.Generator, Grid, int], Readings]
+
+
+SOME = [naive.awkward_readings, random_readings]
+
+
+def model_of(nearest: bool) -> ModelParameters:
+    return ModelParameters(cell_distance='nearest' if nearest else 'center', surface_offset=0.3)
+
+
+def walked(table: np.ndarray, t: int, grid: Grid, nearest: bool) -> dict[int, float]:
+    """Cells that `walk` finds, and their distances in cells."""
+    cells, distances = np.empty(grid.size, np.int32), np.empty(grid.size)
+    n = walk(table, t, grid.shape, nearest, cells, distances)
+    found = dict(zip(cells[:n].tolist(), distances[:n].tolist(), strict=True))
+    assert len(found) == n, 'a cell is listed twice'
+    return found
+
+
+@pytest.mark.parametrize('make', SOME)
+@pytest.mark.parametrize('nearest', [False, True])
+@pytest.mark.parametrize('grid', [GRID, Grid(0.25, -9, -11, 17, 23)], ids=['fine', 'coarse'])
+def test_cone_has_the_cells_within_the_angle_and_those_on_the_axis(make: Make, nearest: bool, grid: Grid) -> None:
+    readings, model = make(np.random.default_rng(1), grid, 150), model_of(nearest)
+    table = cone_table(readings, grid, model)
+    for t in range(len(readings)):
+        found = walked(table, t, grid, nearest)
+        smaller, larger = (naive.cells_of(readings, t, grid, model, slack) for slack in (-1e-9, 1e-9))
+        assert set(smaller) <= set(found) <= set(larger)
+        for cell, d in found.items():
+            assert d * grid.resolution == pytest.approx(larger[cell] + naive.surface(grid, model), abs=1e-12)
+
+
+@pytest.mark.parametrize('make', SOME)
+@pytest.mark.parametrize('nearest', [False, True])
+def test_runs_of_a_row_are_apart_and_from_left_to_right(make: Make, nearest: bool) -> None:
+    readings = make(np.random.default_rng(2), GRID, 200)
+    two = 0
+    for reading in cone_table(readings, GRID, model_of(nearest)):
+        cone = cone_of(reading, nearest)
+        for row in range(max(cone.bottom, 0), min(cone.top, GRID.height - 1) + 1):
+            a, b, c, d = row_runs(cone, row, reading['reach'], GRID.width, nearest)
+            for first, last in ((a, b), (c, d)):
+                assert last < first or 0 <= first <= last < GRID.width
+            if a <= b and c <= d:
+                two += 1
+                assert c > b + 1
+    assert two > 0, 'none of the cones has its axis apart from its centres'
+
+
+@given(
+    st.floats(-3, 20) | st.integers(-6, 40).map(lambda n: n / 2),
+    st.floats(-15, 15) | st.integers(-30, 30).map(lambda n: n / 2),
+    st.floats(-1, 12) | st.integers(-2, 24).map(lambda n: n / 2),
+    st.booleans(),
+)
+def test_within_is_the_run_of_cells_that_are_near_enough(x: float, v: float, radius: float, nearest: bool) -> None:
+    first, last = within(x, v, radius, nearest)
+    away = {column: distance(column + 0.5 - x, v, nearest) for column in range(-20, 40)}
+    for column, d in away.items():
+        if abs(d - radius) > 1e-9:
+            assert (first <= column <= last) == (d <= radius)
+
+
+@given(st.floats(-40, 40), st.floats(-40, 40), st.booleans())
+def test_distance_is_that_to_the_centre_or_to_the_nearest_point(du: float, dv: float, nearest: bool) -> None:
+    assert distance(du, dv, nearest) == pytest.approx(naive.cell_distance(0, 0, du, dv, 1.0, nearest), abs=1e-12)
+
+
+def test_a_sensor_on_an_edge_of_cells_sees_one_of_the_two_rows_along_it() -> None:
+    # the axis runs between two rows: it belongs to one of them, whichever way it looks
+    grid = Grid(0.1, -10, -10, 20, 20)
+    readings = Readings.from_columns(
+        x=0.0, y=0.0, yaw=[0.0, math.pi, -math.pi, math.pi / 2, -math.pi / 2], z=[0.5] * 5, z_max=2.0, half_angle=1e-9
+    )
+    table = cone_table(readings, grid, ModelParameters(sigma=0.01))
+    for t in range(len(readings)):
+        rows, columns = np.divmod(list(walked(table, t, grid, False)), grid.width)
+        across, along = (rows, columns) if t < 3 else (columns, rows)
+        assert set(across.tolist()) in ({9}, {10})
+        # out to 0.5 m and five times half a cell; it begins on the corner of a cell behind, which belongs or not
+        assert set(along.tolist()) | {10} == set(range(10, 17) if t in (0, 3) else range(3, 11))
+    cone = cone_of(table[0], False)
+    assert [axis_run(cone, row)[1] >= axis_run(cone, row)[0] for row in (9, 10, 11)] == [False, True, False]
+
+
+@pytest.mark.parametrize('half_angle', [1.5, 1.55, math.pi / 2 - 1e-6])
+def test_a_cone_of_nearly_half_a_turn_is_all_that_is_ahead(half_angle: float) -> None:
+    grid = Grid(0.1, -30, -30, 60, 60)
+    rng = np.random.default_rng(3)
+    for _ in range(20):
+        x, y, yaw = rng.uniform(-0.5, 0.5), rng.uniform(-0.5, 0.5), rng.uniform(-4, 4)
+        readings = Readings.from_columns(x=x, y=y, yaw=yaw, z=2.0, z_max=2.0, half_angle=half_angle)
+        found = set(walked(cone_table(readings, grid, plain_model()), 0, grid, False))
+        xs, ys = grid.centers()
+        du, dv = np.meshgrid(xs - x, ys - y)
+        ahead = du * math.cos(yaw) + dv * math.sin(yaw)
+        inside = (np.hypot(du, dv) <= 2.0) & (ahead > np.hypot(du, dv) * math.cos(half_angle) + 1e-9)
+        assert set(np.flatnonzero(inside).tolist()) <= found
+        # but for those that the axis crosses on its first cell
+        behind = np.array([ahead.ravel()[c] for c in found - set(np.flatnonzero(inside).tolist())])
+        assert (np.abs(behind) < 0.16).all()
+
+
+def test_a_walk_says_how_many_cells_there_are_where_it_has_too_little_room() -> None:
+    readings = random_readings(np.random.default_rng(4), GRID, 20)
+    table = cone_table(readings, GRID, ModelParameters())
+    for t in range(len(readings)):
+        whole = walked(table, t, GRID, False)
+        cells, distances = np.full(4, -1, np.int32), np.full(4, -1.0)
+        assert walk(table, t, GRID.shape, False, cells[:3], distances[:3]) == len(whole)
+        assert cells[3] == -1, 'written beyond the end'
+        n, cells, distances = walk_with_room(table, t, GRID.shape, False, cells, distances)
+        assert dict(zip(cells[:n].tolist(), distances[:n].tolist(), strict=True)) == whole
+
+
+@pytest.mark.parametrize('make', SOME)
+@pytest.mark.parametrize('nearest', [False, True])
+def test_the_grid_of_readings_cuts_off_no_cell(make: Make, nearest: bool) -> None:
+    readings, model = make(np.random.default_rng(5), GRID, 150), model_of(nearest)
+    parameters = GridParameters(resolution=GRID.resolution)
+    for t in range(len(readings)):
+        one = readings.select(slice(t, t + 1))
+        made = grid_of(one, model, parameters)
+        wide = Grid(made.resolution, made.column - 5, made.row - 5, made.width + 10, made.height + 10)
+        # what only touches it may fall to either side
+        rows, columns = np.divmod(np.array([*naive.cells_of(one, 0, wide, model, slack=-1e-9)], int), wide.width)
+        assert ((rows >= 5) & (rows < 5 + made.height)).all()
+        assert ((columns >= 5) & (columns < 5 + made.width)).all()
+    assert grid_of(readings, model, parameters, within=Grid(0.1, 900, 900, 2, 2)).column <= GRID.column
+
+
+@pytest.mark.parametrize('offset', [0.0, 0.3])
+def test_cones_are_those_of_the_readings_in_cells(offset: float) -> None:
+    readings, model = random_readings(np.random.default_rng(6), GRID, 30), ModelParameters(surface_offset=offset)
+    table = cone_table(readings, GRID, model)
+    sigma = effective_sigma(readings, model, GRID.resolution)
+    reach = reach_of(readings, sigma, model.cut)
+    for t, cone in enumerate(table):
+        assert sigma[t] == naive.sigma_of(readings, t, GRID, model)
+        assert reach[t] == naive.reach(readings, t, GRID, model)
+        assert cone['x'] == pytest.approx(readings.x[t] / 0.1 + 7)
+        assert cone['y'] == pytest.approx(readings.y[t] / 0.1 - 12)
+        assert math.atan2(cone['axis_y'], cone['axis_x']) == pytest.approx(math.remainder(readings.yaw[t], 2 * math.pi))
+        assert math.atan2(cone['sine'], cone['cosine']) == pytest.approx(readings.half_angle[t])
+        lengths = [readings.z[t], readings.z_max[t], naive.free_end(readings, t, GRID, model), reach[t]]
+        # a surface so far away is that of an obstacle whose centre is farther by the offset
+        expected = pytest.approx([v / 0.1 + offset for v in lengths])
+        assert [cone[k] for k in ('z', 'z_max', 'free', 'reach')] == expected
+        assert cone['sigma'] == pytest.approx(sigma[t] / 0.1)
+
+
+def test_the_nearest_point_of_a_cell_is_its_surface() -> None:
+    readings = random_readings(np.random.default_rng(6), GRID, 30)
+    near = [ModelParameters(cell_distance='nearest', surface_offset=offset) for offset in (0.0, 0.5)]
+    assert np.array_equal(*(cone_table(readings, GRID, model) for model in near))
+
+
+def test_a_thin_cone_has_no_holes() -> None:
+    rng = np.random.default_rng(2)
+    grid = Grid(0.1, -30, -30, 60, 60)
+    model = ModelParameters()
+    readings = random_readings(rng, grid, 50, z_max=2.0)
+    readings.x[:] *= 0.1
+    readings.y[:] *= 0.1
+    readings.half_angle[:] = 0.001
+    table = cone_table(readings, grid, model)
+    cells, distances = np.empty(grid.size, np.int32), np.empty(grid.size)
+    for t in range(len(readings)):
+        n = walk(table, t, grid.shape, False, cells, distances)
+        rows, columns = np.divmod(cells[:n], grid.width)
+        steps = np.arange(0.0, table['reach'][t] - 1, 0.05)
+        on_axis = set(
+            zip(
+                np.floor(table['y'][t] + steps * math.sin(readings.yaw[t])).astype(int).tolist(),
+                np.floor(table['x'][t] + steps * math.cos(readings.yaw[t])).astype(int).tolist(),
+                strict=True,
+            )
+        )
+        assert on_axis <= set(zip(rows.tolist(), columns.tolist(), strict=True))
+
+
+def test_boxes_hold_their_cones_tightly() -> None:
+    rng = np.random.default_rng(3)
+    n = 200
+    x, y, yaw = rng.uniform(-5, 5, n), rng.uniform(-5, 5, n), rng.uniform(-9, 9, n)
+    half, reach = rng.uniform(0.01, 1.5, n), rng.uniform(0.1, 4, n)
+    boxes = cone_boxes(x, y, yaw, half, reach)
+    angles = yaw + np.linspace(-1, 1, 4001)[:, None] * half
+    px = np.concatenate([x[None], x + reach * np.cos(angles)])
+    py = np.concatenate([y[None], y + reach * np.sin(angles)])
+    expected = np.stack([px.min(0), px.max(0), py.min(0), py.max(0)])
+    assert np.abs(boxes - expected).max() < 1e-5

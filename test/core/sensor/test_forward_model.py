@@ -1,0 +1,144 @@
+"""The forward model against an enumeration of everything that may have happened."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+
+import naive
+from conftest import random_readings
+from forward_grid_mapper.core.common.grid import Grid
+from forward_grid_mapper.core.common.parameters import ModelParameters
+from forward_grid_mapper.core.learning.model_update import learn
+from forward_grid_mapper.core.sensor.forward_model import expectations, log_likelihood
+
+GRID = Grid(0.1, 3, -4, 4, 3)
+
+
+def random_model(rng: np.random.Generator) -> ModelParameters:
+    return ModelParameters(
+        p_hit=rng.uniform(0.05, 0.98),
+        p_rand=rng.uniform(0.01, 0.4),
+        p_lost=rng.choice([0.0, rng.uniform(0, 0.4)]),
+        sigma=rng.uniform(0.03, 0.3),
+        cut=rng.choice([4.0, 5.0, 30.0]),
+        cell_distance=str(rng.choice(['center', 'nearest'])),
+    )
+
+
+@pytest.mark.parametrize('seed', range(30))
+def test_log_likelihood_is_that_of_all_correspondences(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    readings, model = random_readings(rng, GRID, 12), random_model(rng)
+    occupied = (rng.random(GRID.shape) < rng.uniform(0, 0.8)).astype(np.int8)
+    expected = naive.log_likelihood(readings, GRID, occupied, model)
+    assert log_likelihood(readings, GRID, occupied, model) == pytest.approx(expected, abs=1e-9)
+
+
+@pytest.mark.parametrize('seed', range(10))
+def test_expectations_are_the_share_of_each_cause(seed: int) -> None:
+    rng = np.random.default_rng(100 + seed)
+    readings, model = random_readings(rng, GRID, 15), random_model(rng)
+    occupied = (rng.random(GRID.shape) < 0.5).astype(np.int8)
+    e = expectations(readings, GRID, occupied, model)
+    assert e.random + e.lost + e.no_echo + e.hit == pytest.approx(1.0, abs=1e-12)
+    for t in range(len(readings)):
+        met = sorted(naive.obstacles(readings, t, GRID, occupied, model))
+        terms = naive.causes(readings.z[t], readings.z_max[t], naive.sigma_of(readings, t, GRID, model), met, model)
+        share = np.array(terms) / sum(terms)
+        assert [e.random[t], e.lost[t], e.no_echo[t]] == pytest.approx(share[:3], abs=1e-10)
+        assert e.rank[t] == pytest.approx(sum((k + 1) * s for k, s in enumerate(share[3:])), abs=1e-9)
+        errors = sum(s * (readings.z[t] - d) ** 2 for s, d in zip(share[3:], met, strict=True))
+        assert e.squared_error[t] == pytest.approx(errors, abs=1e-10)
+        assert e.obstacles[t] == len(met)
+
+
+@pytest.mark.parametrize('seed', range(10))
+def test_the_sum_over_obstacles_is_that_over_all_that_may_have_happened(seed: int) -> None:
+    rng = np.random.default_rng(200 + seed)
+    model = random_model(rng)
+    for met in (rng.uniform(0, 2, n).tolist() for n in range(9)):
+        z, sigma = rng.uniform(0, 2), rng.uniform(0.05, 0.5)
+        enumerated = sum(naive.causes(z, 2.0, sigma, met, model))
+        assert naive.likelihood(z, 2.0, sigma, met, model) == pytest.approx(enumerated, rel=1e-12)
+
+
+@pytest.mark.parametrize('seed', range(6))
+def test_awkward_readings_have_the_likelihood_of_their_cells(seed: int) -> None:
+    rng = np.random.default_rng(300 + seed)
+    grid = Grid(0.1, -7, 2, 13, 11)
+    readings, model = naive.awkward_readings(rng, grid, 60), random_model(rng)
+    occupied = (rng.random(grid.shape) < 0.2).astype(np.int8)
+    told = expectations(readings, grid, occupied, model).log_likelihood
+    for t in range(len(readings)):
+        z, z_max, sigma = readings.z[t], readings.z_max[t], naive.sigma_of(readings, t, grid, model)
+        away = naive.cells_of(readings, t, grid, model, 1e-9)
+        ties = [abs(abs(z - d) - model.cut * sigma) < 1e-9 for d in [*away.values(), z_max]]
+        # where rounding does not tell what belongs to the cone, or to the noise
+        if not any(ties) and set(away) == set(naive.cells_of(readings, t, grid, model, -1e-9)):
+            met = [d for c, d in away.items() if occupied.ravel()[c]]
+            assert told[t] == pytest.approx(math.log(naive.likelihood(z, z_max, sigma, met, model)), abs=1e-9)
+
+
+def test_p_lost_of_zero_is_the_papers_model() -> None:
+    rng = np.random.default_rng(7)
+    readings = random_readings(rng, GRID, 20)
+    occupied = (rng.random(GRID.shape) < 0.3).astype(np.int8)
+    assert (expectations(readings, GRID, occupied, ModelParameters(p_lost=0.0)).lost == 0).all()
+
+
+def test_a_lost_echo_is_a_cause_of_readings_without_echo_alone() -> None:
+    readings = random_readings(np.random.default_rng(7), GRID, 40)
+    readings.z[:10] = readings.z_max[:10] - 0.01
+    readings.z[10:20] = readings.z_max[10:20]
+    lost = expectations(readings, GRID, np.zeros(GRID.shape, np.int8), ModelParameters()).lost
+    assert np.array_equal(lost > 0, ~readings.echo)
+
+
+def sample(rng: np.random.Generator, readings, grid, occupied, model):
+    """Draw the ranges of `readings` from the model itself."""
+    z = []
+    for t in range(len(readings)):
+        met = sorted(naive.obstacles(dataclasses.replace(readings, z=readings.z_max), t, grid, occupied, model))
+        u = rng.random()
+        if u < model.p_rand:
+            z.append(rng.uniform(0, readings.z_max[t]))
+            continue
+        hit = [d for d in met if rng.random() < model.p_hit] if u >= model.p_rand + model.p_lost else []
+        z.append(min(rng.normal(hit[0], model.sigma), readings.z_max[t]) if hit else readings.z_max[t])
+    return dataclasses.replace(readings, z=np.abs(z))
+
+
+def test_learning_recovers_the_truth_when_it_knows_the_map() -> None:
+    rng = np.random.default_rng(5)
+    grid = Grid(0.1, 0, 0, 30, 30)
+    truth = ModelParameters(p_hit=0.4, p_rand=0.1, p_lost=0.2, sigma=0.07)
+    occupied = (rng.random(grid.shape) < 0.03).astype(np.int8)
+    readings = random_readings(rng, grid, 1500, z_max=3.5)
+    readings.half_angle[:] = 0.2
+    readings.sigma[:] = 0
+    readings = sample(rng, readings, grid, occupied, truth)
+    model = ModelParameters(p_hit=0.8, p_rand=0.03, p_lost=0.05, sigma=0.12)
+    for _ in range(40):
+        model = learn(readings, grid, occupied, model)
+    assert model.p_hit == pytest.approx(truth.p_hit, abs=0.05)
+    assert model.p_rand == pytest.approx(truth.p_rand, abs=0.03)
+    assert model.p_lost == pytest.approx(truth.p_lost, abs=0.05)
+    assert model.sigma == pytest.approx(truth.sigma, abs=0.01)
+
+
+def test_learning_never_lowers_the_likelihood() -> None:
+    rng = np.random.default_rng(6)
+    grid = Grid(0.1, 0, 0, 15, 15)
+    readings = random_readings(rng, grid, 200)
+    readings.sigma[:] = 0
+    occupied = (rng.random(grid.shape) < 0.1).astype(np.int8)
+    model = ModelParameters(p_hit=0.7, p_rand=0.2, p_lost=0.1, sigma=0.3, cut=40.0)
+    before = -math.inf
+    for _ in range(10):
+        now = log_likelihood(readings, grid, occupied, model)
+        assert now >= before - 1e-9
+        before, model = now, learn(readings, grid, occupied, model)

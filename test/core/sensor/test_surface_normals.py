@@ -1,0 +1,240 @@
+"""Normals of surfaces, and the pairs that are left out where a reading grazes one."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import naive
+from conftest import plain_model, random_readings
+from forward_grid_mapper.core.common.grid import Grid
+from forward_grid_mapper.core.common.parameters import ModelParameters
+from forward_grid_mapper.core.common.readings import Readings
+from forward_grid_mapper.core.evidence.evidence import Evidence
+from forward_grid_mapper.core.evidence.updates import find_seers, flip
+from forward_grid_mapper.core.runtime import threads
+from forward_grid_mapper.core.sensor.surface_normals import (
+    LEAST_AGREEMENT,
+    LEAST_WEIGHT,
+    QUANTUM,
+    THROUGH,
+    facing_of,
+    gather,
+    grazes,
+    no_facing,
+)
+
+GRID = Grid(0.1, -7, 12, 25, 20)
+MODEL = ModelParameters(sigma=0.06, p_hit=0.6, p_rand=0.1, p_lost=0.1, grazing_angle=0.7)
+
+
+def along_wall(count: int = 150, seed: int = 0) -> Readings:
+    """Readings of a robot that passes a wall at y = 3, at all slants, many of which heard nothing of it."""
+    rng = np.random.default_rng(seed)
+    readings = random_readings(rng, GRID, count, z_max=2.5)
+    readings.y[:] = 1.5 + 0.3 * rng.random(count)
+    readings.yaw[:] = math.pi / 2 + rng.uniform(-1.3, 1.3, count)
+    readings.half_angle[:] = rng.choice([0.02, 0.1, 0.25], count)
+    to_wall = (3.0 - readings.y) / np.sin(readings.yaw)
+    square = np.abs(readings.yaw - math.pi / 2) < 0.3
+    readings.z[:] = np.where(square, to_wall, np.where(rng.random(count) < 0.5, 2.5, 2.3)).clip(0.1, 2.5)
+    return readings
+
+
+def sums_of(evidence: Evidence, part: tuple[int, int]) -> np.ndarray:
+    s = evidence.state
+    sums = np.zeros((3, evidence.grid.size), np.int64)
+    gather(s.cones, evidence.grid.shape, s.lattice.nearest, part, sums, s.stop)
+    return sums
+
+
+def made(readings: Readings, model: ModelParameters = MODEL, **options: object) -> Evidence:
+    evidence = Evidence(GRID, model, **options)
+    evidence.extend(readings)
+    return evidence
+
+
+@pytest.mark.parametrize('readings', [along_wall(), random_readings(np.random.default_rng(1), GRID, 100)])
+def test_normals_are_those_of_the_twin(readings: Readings) -> None:
+    # within 4 sigma of the range, and no cell beyond the cut
+    model = dataclasses.replace(MODEL, cut=5.0)
+    evidence = made(readings, model)
+    sums = sums_of(evidence, (0, len(readings)))
+    expected = naive.normals(readings, GRID, model)
+    for told, exact in zip(sums, expected, strict=True):
+        assert np.abs(told.reshape(GRID.shape) * QUANTUM - exact).max() < 1e-3
+    halves = sums_of(evidence, (0, 37)) + sums_of(evidence, (37, len(readings)))
+    assert np.array_equal(halves, sums)
+    facing = evidence.state.facing
+    cosine, sine, mass = (naive.box_sum(values) for values in expected)
+    for row, column in np.ndindex(GRID.shape):
+        c = row * GRID.width + column
+        m, length = mass[row, column], math.hypot(cosine[row, column], sine[row, column])
+        if abs(m - LEAST_WEIGHT) > 1e-2 and abs(length - LEAST_AGREEMENT * m) > 1e-2:
+            assert facing.known[c] == (m >= LEAST_WEIGHT and length >= LEAST_AGREEMENT * m)
+        if facing.known[c]:
+            normal = 0.5 * math.atan2(sine[row, column], cosine[row, column])
+            along = facing.x[c] * math.cos(normal) + facing.y[c] * math.sin(normal)
+            assert abs(along) == pytest.approx(1.0, abs=1e-4)
+        assert facing.before[row, column] == facing.known.reshape(GRID.shape)[row, :column].sum()
+    assert facing.slant == pytest.approx(math.cos(0.7) ** 2)
+    assert 5 < facing.known.sum() < GRID.size
+
+
+def test_the_normal_of_a_wall_is_across_it() -> None:
+    facing = made(along_wall()).state.facing
+    row = round(3.0 / 0.1) - GRID.row
+    wall = facing.known.reshape(GRID.shape)[row, 5:20]
+    assert wall.sum() > 10
+    assert np.abs(facing.y.reshape(GRID.shape)[row, 5:20][wall == 1]).min() > 0.9
+
+
+def test_readings_without_echo_tell_no_normal() -> None:
+    readings = along_wall()
+    readings.z[:] = readings.z_max
+    assert not made(readings).state.facing.known.any()
+
+
+def test_a_straight_angle_leaves_out_nothing() -> None:
+    readings = along_wall()
+    for angle in (math.pi / 2, 1.5708):
+        evidence = made(readings, dataclasses.replace(MODEL, grazing_angle=angle))
+        assert evidence.state.facing.slant == no_facing().slant == 0.0
+    # all surfaces graze nobody where the angle has hardly any cosine
+    sums = sums_of(evidence, (0, len(readings)))
+    assert facing_of(sums, GRID.shape, math.pi / 2).slant < 1e-12
+
+
+def left_out(evidence: Evidence, readings: Readings, t: int, model: ModelParameters) -> set[int]:
+    """The cells that reading t grazes, by the definition, given the normals."""
+    facing = evidence.state.facing
+    xs, ys = GRID.centers()
+    out = set()
+    for c in naive.cells_of(readings, t, GRID, model):
+        dx, dy = xs[c % GRID.width] - readings.x[t], ys[c // GRID.width] - readings.y[t]
+        d = math.hypot(dx, dy)
+        before = naive.surface(GRID, model)
+        if facing.known[c] and d - before < readings.z[t] - THROUGH * naive.sigma_of(readings, t, GRID, model):
+            slant = abs(facing.x[c] * dx + facing.y[c] * dy) / d
+            if slant < math.cos(model.grazing_angle):
+                out.add(c)
+    return out
+
+
+@pytest.mark.parametrize('cell_distance', ['center', 'nearest'])
+@pytest.mark.parametrize('readings', [along_wall(), random_readings(np.random.default_rng(2), GRID, 120)])
+def test_pairs_are_those_of_the_cone_without_what_is_grazed(cell_distance: str, readings: Readings) -> None:
+    model = dataclasses.replace(MODEL, cell_distance=cell_distance)
+    evidence, plain = made(readings, model), made(readings, dataclasses.replace(model, grazing_angle=math.pi / 2))
+    s = evidence.state
+    found: list[dict[int, int]] = [{} for _ in range(GRID.size)]
+    total = cut = 0
+    for t in range(len(readings)):
+        free, band, density, _ = naive.pairs_of(s, t)
+        whole_free, whole_band, whole_density, _ = naive.pairs_of(plain.state, t)
+        grazed = left_out(evidence, readings, t, model)
+        # in the same order
+        assert free == [c for c in whole_free if c not in grazed]
+        kept = [(c, g) for c, g in zip(whole_band, whole_density, strict=True) if c not in grazed]
+        assert list(zip(band, density, strict=True)) == kept
+        total += len(grazed)
+        cut += s.shares[t]['runs'] > plain.state.shares[t]['runs']
+        for zone, cells in ((0, band), (1, free)):
+            for c in cells:
+                found[c][t] = zone
+    assert total > 50
+    assert cut > 3, 'no run was cut in two'
+    for c in range(GRID.size):
+        n = find_seers(s, c)
+        assert n == len(found[c])
+        assert {int(t): int(zone) for t, zone in s.seers[:n]} == found[c]
+    # a cell that is only grazed is seen all the same
+    assert np.array_equal(s.maps.seen, plain.state.maps.seen)
+
+
+def snapshot(evidence: Evidence) -> list[object]:
+    s = evidence.state
+    kept = ('through', 'runs', 'bands', 'blocking', 'weight', 'occupy', 'release', 'likelihood')
+    return [
+        *(array.tolist() for array in s.maps),
+        *(s.shares[name].tolist() for name in kept),
+        *map(list, s.facing[:3]),
+    ]
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    st.integers(0, 2**32 - 1),
+    st.lists(st.integers(0, GRID.size - 1), max_size=20),
+    st.sampled_from(['center', 'nearest']),
+)
+def test_after_flips_all_is_as_if_built_from_the_new_map(seed: int, cells: list[int], cell_distance: str) -> None:
+    readings, model = along_wall(60, seed), dataclasses.replace(MODEL, cell_distance=cell_distance)
+    start = np.random.default_rng(seed).random(GRID.shape) < 0.1
+    evidence, unstored = (made(readings, model, memory=m, start=start) for m in (math.inf, 0.0))
+    for c in cells:
+        start.ravel()[c] ^= True
+        for each in (evidence, unstored):
+            flip(each.state, c)
+    fresh = snapshot(made(readings, model, start=start))
+    assert snapshot(evidence) == fresh
+    assert snapshot(unstored) == fresh
+    evidence.rebuild()
+    assert snapshot(evidence) == fresh
+
+
+def test_threads_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    one = made(along_wall())
+    monkeypatch.setattr(threads, 'LEAST_PART', 20)
+    assert len(threads.parts(0, 150, 3)) == 3
+    assert snapshot(made(along_wall(), threads=3)) == snapshot(one)
+    half = one.state.pairs.cell.nbytes / 2
+    less = made(along_wall(), threads=3, memory=half)
+    assert 0 < less.unstored < 150
+    assert snapshot(less) == snapshot(one)
+
+
+def test_a_grid_that_grew_faces_as_if_it_had_been_larger_from_the_start() -> None:
+    readings = along_wall()
+    large = Grid(0.1, GRID.column - 11, GRID.row - 3, GRID.width + 30, GRID.height + 17)
+    grown, whole = made(readings), Evidence(large, MODEL)
+    grown.grow(large)
+    whole.extend(readings)
+    assert snapshot(grown) == snapshot(whole)
+
+
+def test_what_is_grazed_is_not_contradicted() -> None:
+    readings = along_wall()
+    row = round(3.0 / 0.1) - GRID.row
+    wall = np.zeros(GRID.shape, np.uint8)
+    wall[row, 5:20] = 1
+    graze, plain = (
+        made(readings, model, start=wall).state.maps.evidence.reshape(GRID.shape)[row, 5:20]
+        for model in (MODEL, plain_model(sigma=0.06, p_hit=0.6, p_rand=0.1, p_lost=0.1))
+    )
+    # what freeing a cell of the wall gains
+    assert graze.sum() < plain.sum()
+
+
+def test_only_what_a_reading_goes_through_can_be_grazed() -> None:
+    facing = no_facing()._replace(
+        known=np.ones(1, np.uint8), x=np.ones(1, np.float32), y=np.zeros(1, np.float32), slant=math.cos(0.7) ** 2
+    )
+    cones = made(along_wall(1)).state.cones.copy()
+    reading = cones[0]
+    reading['z'], reading['sigma'] = 10.0, 1.0
+    for angle in np.linspace(-4, 4, 41):
+        slanted = abs(math.cos(angle)) < math.cos(0.7)
+        for d, through in ((7.9, True), (8.1, False), (0.5, True), (12.0, False)):
+            assert grazes(facing, reading, 0, d * math.cos(angle), d * math.sin(angle)) == (slanted and through)
+    facing.known[:] = 0
+    assert not grazes(facing, reading, 0, 0.0, 5.0)
+    facing.known[:] = 1
+    assert grazes(facing, reading, 0, 0.0, 5.0)
+    reading['z'] = 1.9
+    assert not grazes(facing, reading, 0, 0.0, 0.1), 'within 2 sigma of the range everything is'
