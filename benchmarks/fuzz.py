@@ -78,9 +78,9 @@ class Fuzz:
         self.node.start()
 
     @property
-    def placer(self) -> Any:
+    def associator(self) -> Any:
         """The node's account."""
-        return self.node._placer
+        return self.node._associator
 
     def step(self) -> None:
         """Send one message."""
@@ -96,14 +96,17 @@ class Fuzz:
         self.node._publish_live()
         self.node._journal.take()
         self.node._report()
-        placer = self.placer
-        require(placer.received == self.sent, f'{self.sent} ranges were sent and {placer.received} received')
-        accounted = len(placer.buffer) + placer.waiting + sum(placer.rejected.values())
-        require(accounted == placer.received, f'{placer.received} ranges were received and {accounted} accounted for')
+        associator = self.associator
+        require(associator.received == self.sent, f'{self.sent} ranges were sent and {associator.received} received')
+        accounted = len(associator.buffer) + associator.waiting + sum(associator.rejected.values())
+        require(
+            accounted == associator.received,
+            f'{associator.received} ranges were received and {accounted} accounted for',
+        )
         log_odds = self.node._live.log_odds()
         require(not np.isinf(log_odds).any(), 'the live map has an infinite value')
         self._check_messages()
-        x = placer.readings
+        x = associator.readings
         for name in ('x', 'y', 'yaw', 'z', 'z_max', 'half_angle', 'sigma'):
             require(bool(np.isfinite(getattr(x, name)).all()), f'a reading has a {name} that is not finite')
 
@@ -136,10 +139,10 @@ class Fuzz:
     def run_em(self) -> None:
         """Map from what there is."""
         try:
-            maps = Mapper(self.node.parameters).run(self.placer.readings)
+            maps = Mapper(self.node.parameters).run(self.associator.readings)
         except MapperError as error:
             # readings were placed when sigma and cut may have been less
-            expected = not len(self.placer.readings) or 'more than max_cells' in str(error)
+            expected = not len(self.associator.readings) or 'more than max_cells' in str(error)
             require(expected, f'EM failed: {error}')
             return
         require(bool(np.isin(maps.ml, (-1, 0, 1)).all()), 'the ML map has another value')
@@ -151,12 +154,12 @@ class Fuzz:
 
     def reset(self) -> None:
         """Forget everything, after an account of it."""
-        self.rejected += self.placer.rejected
-        self.accepted += len(self.placer.buffer)
-        self.rejected['(waited at a reset)'] += self.placer.waiting
+        self.rejected += self.associator.rejected
+        self.accepted += len(self.associator.buffer)
+        self.rejected['(waited at a reset)'] += self.associator.waiting
         self.node._reset(Trigger.Request(), Trigger.Response())
         self.sent = 0
-        require(self.placer.received == self.placer.waiting == 0, 'a reset left something')
+        require(self.associator.received == self.associator.waiting == 0, 'a reset left something')
 
     def pause(self, value: bool) -> None:
         """Call the service."""

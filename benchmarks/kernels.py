@@ -24,10 +24,10 @@ from forward_grid_mapper.core.evidence.evidence import Evidence
 from forward_grid_mapper.core.evidence.pairs import WORDS_PER_RUN, make
 from forward_grid_mapper.core.evidence.state import State
 from forward_grid_mapper.core.evidence.tile_index import CHUNK, SHIFT
-from forward_grid_mapper.core.evidence.updates import _push_free, explain, find_seers, flip
+from forward_grid_mapper.core.evidence.updates import _push_free, evaluate, find_observing, flip
 from forward_grid_mapper.core.maps.log_odds_map import arc_depth
-from forward_grid_mapper.core.maps.traversed import driven_cells
-from forward_grid_mapper.core.search.moves import promising
+from forward_grid_mapper.core.maps.traversed import traversed_cells
+from forward_grid_mapper.core.search.flips import promising
 from forward_grid_mapper.core.search.prior import Prior, local_prior, shapes
 from forward_grid_mapper.core.search.search import LEAST, Search
 from forward_grid_mapper.core.sensor.cone_table import grid_of
@@ -42,21 +42,23 @@ SAMPLE = 1000
 
 @loop
 def _make_all(s: State) -> None:
-    for t in range(len(s.shares)):
-        make(s.cones, s.lattice, s.facing, t, s.bench.pairs, 0, s.bench)
+    for t in range(len(s.reading_states)):
+        make(s.cones, s.lattice, s.normals, t, s.workspace.pairs, 0, s.workspace)
 
 
 @loop
 def _explain_all(s: State) -> None:
-    for t in range(len(s.shares)):
-        explain(s.model, s.shares[t], s.maps.occupied, s.pairs, s.shares[t].at, s.ratios, s.bench.new)
+    for t in range(len(s.reading_states)):
+        evaluate(
+            s.model, s.reading_states[t], s.maps.occupied, s.pairs, s.reading_states[t].at, s.ratios, s.workspace.new
+        )
 
 
 @loop
 def _push_bands(s: State, by: int) -> None:
-    for t in range(len(s.shares)):
-        m = np.uint64(s.shares[t].bands)
-        cell = np.uint64(s.shares[t].at + WORDS_PER_RUN * s.shares[t].runs)
+    for t in range(len(s.reading_states)):
+        m = np.uint64(s.reading_states[t].bands)
+        cell = np.uint64(s.reading_states[t].at + WORDS_PER_RUN * s.reading_states[t].runs)
         for k in range(m):
             s.maps.evidence[s.pairs.cell[cell + k]] += by
             s.pairs.log[cell + m + m + k] += by
@@ -64,15 +66,15 @@ def _push_bands(s: State, by: int) -> None:
 
 @loop
 def _push_free_zones(s: State, by: int) -> None:
-    for t in range(len(s.shares)):
-        _push_free(s.shares[t], s.pairs, s.shares[t].at, s.maps, (by, by))
+    for t in range(len(s.reading_states)):
+        _push_free(s.reading_states[t], s.pairs, s.reading_states[t].at, s.maps, (by, by))
 
 
 @loop
 def _seers(s: State, cells: Any) -> int:
     n = 0
     for c in cells:
-        n += find_seers(s, c)
+        n += find_observing(s, c)
     return n
 
 
@@ -87,8 +89,8 @@ def _touched(s: State, cells: Any, sizes: Any) -> int:
     """Return the pairs of all readings that see `cells`, each reading counted for each cell."""
     n = 0
     for c in cells:
-        for i in range(find_seers(s, c)):
-            n += sizes[s.seers[i, 0]]
+        for i in range(find_observing(s, c)):
+            n += sizes[s.observing[i, 0]]
     return n
 
 
@@ -117,8 +119,8 @@ class Steps(Search):
     def _shift(self, watch: Any) -> Any:
         return self._timed('shifts', super()._shift, watch)
 
-    def _bridge(self, watch: Any) -> Any:
-        return self._timed('bridges', super()._bridge, watch)
+    def _close_gaps(self, watch: Any) -> Any:
+        return self._timed('bridges', super()._close_gaps, watch)
 
 
 def profile(name: str, readings: Readings, runs: int) -> None:
@@ -126,18 +128,18 @@ def profile(name: str, readings: Readings, runs: int) -> None:
     p = Parameters()
     readings = in_canonical_order(readings)
     grid = grid_of(readings, p.model, p.grid, beyond=arc_depth(p))
-    driven = driven_cells(readings, grid)
+    traversed = traversed_cells(readings, grid)
     begin = time.perf_counter()
     evidence = Evidence(grid, p.model)
     evidence.extend(readings)
     built = time.perf_counter() - begin
-    search = Steps(evidence, p.search, driven.ravel())
+    search = Steps(evidence, p.search, traversed.ravel())
     begin = time.perf_counter()
     search.run()
     searched = time.perf_counter() - begin
     s, pairs = evidence.state, evidence.pairs
-    s = s._replace(shares=s.shares[: len(evidence)], cones=s.cones[: len(evidence)])
-    bands = int(s.shares['bands'].sum())
+    s = s._replace(reading_states=s.reading_states[: len(evidence)], cones=s.cones[: len(evidence)])
+    bands = int(s.reading_states['bands'].sum())
     free = pairs - bands
     print(
         f'\n{name}: {len(readings)} readings, {pairs} pairs, of which {bands / pairs:.0%} are in bands; '
@@ -145,14 +147,14 @@ def profile(name: str, readings: Readings, runs: int) -> None:
         f'evidence built in {built:.3f} s, search in {searched:.3f} s:'
     )
     for step, (seconds, count, made) in search.steps.items():
-        share = seconds / searched
-        print(f'  {step:10s}{seconds:9.3f} s {share:6.0%}{count:6.0f} times{made:9.0f} flips or moves')
+        reading_state = seconds / searched
+        print(f'  {step:10s}{seconds:9.3f} s {reading_state:6.0%}{count:6.0f} times{made:9.0f} flips or moves')
     cells = np.flatnonzero(s.maps.occupied == 1)
     cells = np.random.default_rng(0).permutation(cells)[:SAMPLE]
-    seers = _seers(s, cells)
-    sizes = s.shares['bands'].astype(np.int64)
+    observing = _seers(s, cells)
+    sizes = s.reading_states['bands'].astype(np.int64)
     for k in range(len(sizes)):
-        words = s.pairs.cell[s.shares['at'][k] :][: 2 * s.shares['runs'][k]].astype(np.int64)
+        words = s.pairs.cell[s.reading_states['at'][k] :][: 2 * s.reading_states['runs'][k]].astype(np.int64)
         sizes[k] += int((words[1::2] - words[::2] + 1).sum())
     touched = _touched(s, cells, sizes)
     scanned = _scanned(s, cells)
@@ -162,15 +164,21 @@ def profile(name: str, readings: Readings, runs: int) -> None:
     n = len(readings)
     kernels: tuple[tuple[str, Callable[[], Any], tuple[tuple[int, str], ...]], ...] = (
         ('make pairs', lambda: _make_all(s), ((n, 'reading'), (pairs, 'pair'))),
-        ('explain', lambda: _explain_all(s), ((n, 'reading'), (bands, 'band pair'))),
+        ('evaluate', lambda: _explain_all(s), ((n, 'reading'), (bands, 'band pair'))),
         ('push to bands', lambda: _push_bands(s, 0), ((bands, 'band pair'),)),
         ('push to free zones', lambda: _push_free_zones(s, 0), ((free, 'free pair'),)),
         ('all readings anew', evidence.rebuild, ((n, 'reading'), (pairs, 'pair'))),
-        ('find seers', lambda: _seers(s, cells), ((len(cells), 'cell'), (scanned, 'candidate'), (seers, 'seer'))),
-        ('flip', lambda: _flip_all(s, cells), ((len(cells), 'flip'), (seers, 'seer'), (touched, 'pair touched'))),
+        (
+            'find observing',
+            lambda: _seers(s, cells),
+            ((len(cells), 'cell'), (scanned, 'candidate'), (observing, 'seer')),
+        ),
+        ('flip', lambda: _flip_all(s, cells), ((len(cells), 'flip'), (observing, 'seer'), (touched, 'pair touched'))),
         ('look for gains', lambda: promising(s, prior, LEAST, window, room, gains), ((grid.size, 'cell'),)),
     )
-    print(f'  a flip has {scanned / len(cells):.0f} candidates, {seers / len(cells):.0f} readings that see the cell')
+    print(
+        f'  a flip has {scanned / len(cells):.0f} candidates, {observing / len(cells):.0f} readings that see the cell'
+    )
     for kernel, work, units in kernels:
         work()
         seconds = timed(work, runs)

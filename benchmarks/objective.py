@@ -130,7 +130,7 @@ def compare(options: argparse.Namespace) -> None:
         for name in ('office_a', 'office_b'):
             bag = options.data / name / 'bag'
             if bag.is_dir():
-                yield name, read_drive(bag, Parameters(), {}, odom_topic='/odom_corrected').placer.readings, None
+                yield name, read_drive(bag, Parameters(), {}, odom_topic='/odom_corrected').associator.readings, None
             else:
                 print(f'{name} is left out: there is no {bag}')
 

@@ -70,7 +70,7 @@ PLAIN: dict[str, Any] = {
 ABLATIONS: dict[str, dict[str, Any]] = {
     'surfaces before the centre': {'surface_offset': 0.0},
     'grazing readings': {'grazing_angle': 1.5708},
-    'driven cells': {'driven_cost': 0.0},
+    'traversed cells': {'driven_cost': 0.0},
     'prior for walls': NO_SHAPES,
     'bridges': {'bridges': 0},
     'extension': {'extend': 0},

@@ -14,7 +14,8 @@ from forward_grid_mapper.commands.experiment import GAINS
 from forward_grid_mapper.core.common.grid import Grid
 from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.mapping import Mapper
-from forward_grid_mapper.files.figure import Tile, write_figure
+from forward_grid_mapper.files.figure import write_figure
+from forward_grid_mapper.files.panels import Tile
 
 SHOWN = ('corridor 15°', 'office 15°', 'clutter 30°', 'office_a', 'office_b')
 MARGIN = 0.3

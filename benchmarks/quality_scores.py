@@ -16,7 +16,7 @@ from quality_worlds import Case
 from forward_grid_mapper.commands.experiment import GAINS
 from forward_grid_mapper.core.common.grid import Grid
 from forward_grid_mapper.core.common.parameters import Parameters
-from forward_grid_mapper.core.maps.log_odds_map import LiveMap
+from forward_grid_mapper.core.maps.log_odds_map import LogOddsMap
 from forward_grid_mapper.simulation.score import score_map
 
 Floats = NDArray[np.float64]
@@ -139,7 +139,7 @@ class Belief(NamedTuple):
 
     @property
     def base(self) -> float:
-        """That of a map that is everywhere at the share of occupied cells."""
+        """That of a map that is everywhere at the reading_state of occupied cells."""
         return Belief(np.full(len(self.p), self.occupied.mean()), self.occupied).loss
 
 
@@ -173,7 +173,7 @@ class Standard:
         for depth in sorted({gains['live_depth'] for gains in GAINS}):
             parts = []
             for name, value in unit.items():
-                live = LiveMap(Parameters.from_flat({**dict.fromkeys(unit, 0.5), name: value, 'live_depth': depth}))
+                live = LogOddsMap(Parameters.from_flat({**dict.fromkeys(unit, 0.5), name: value, 'live_depth': depth}))
                 live.add(case.readings)
                 parts.append(live.log_odds())
             self._parts[depth] = live.grid, parts, [on_truth(part, live.grid, case, tool) for part in parts]

@@ -84,8 +84,8 @@ class Soak:
     """The node in this process, and what is measured of it."""
 
     def __init__(self, max_readings: int, folder: Path, journal: bool) -> None:
-        mounts = corridor_drive(0, passes=1).mounts
-        values: dict[str, Any] = {f'sensors.{frame}.pose': [*map(float, pose)] for frame, pose in mounts}
+        extrinsics = corridor_drive(0, passes=1).extrinsics
+        values: dict[str, Any] = {f'sensors.{frame}.pose': [*map(float, pose)] for frame, pose in extrinsics}
         values |= {'max_readings': max_readings, 'save_directory': str(folder)}
         if journal:
             values['journal'] = str(folder / 'journal')
@@ -116,7 +116,7 @@ class Soak:
 
     def row(self, seconds: float) -> str:
         """Return what was measured since the last row."""
-        buffer = self.node._placer.buffer
+        buffer = self.node._associator.buffer
         worst, typical = 1e3 * max(self.message), 1e6 * float(np.median(self.message))
         update, live = (1e3 * np.percentile(x, 99) for x in (self.update, self.live))
         for measured in (self.message, self.update, self.live):
@@ -150,13 +150,15 @@ def main() -> None:
             if message.stamp >= due:
                 due = message.stamp + TICK
                 soak.tick()
-            if len(soak.node._placer.buffer) >= shown + options.readings // 20:
-                shown = len(soak.node._placer.buffer)
+            if len(soak.node._associator.buffer) >= shown + options.readings // 20:
+                shown = len(soak.node._associator.buffer)
                 print(soak.row((message.stamp - start) / NANOSECONDS), flush=True)
         soak.tick()
-        placer = soak.node._placer
-        print(f'{placer.received} received, {len(placer.buffer)} accepted, {placer.waiting} waiting, ', end='')
-        print(f'rejected: {dict(placer.rejected)}; {time.monotonic() - begin:.0f} s in all')
+        associator = soak.node._associator
+        print(
+            f'{associator.received} received, {len(associator.buffer)} accepted, {associator.waiting} waiting, ', end=''
+        )
+        print(f'rejected: {dict(associator.rejected)}; {time.monotonic() - begin:.0f} s in all')
         soak.node.close()
         if options.journal:
             size = sum(path.stat().st_size for path in (Path(folder) / 'journal').iterdir())
@@ -164,7 +166,7 @@ def main() -> None:
         first = corridor_drive(0, passes=2)
         visible = visible_surface(first.world, first.readings.select(slice(None, None, 20)))
         live = soak.node._live
-        for name, readings in (('first round', first.readings), ('all of it', placer.readings)):
+        for name, readings in (('first round', first.readings), ('all of it', associator.readings)):
             maps = Mapper(soak.node.parameters).run(readings)
             scores = score_map(maps.ml, maps.grid, first.world, visible)
             told = f'ML F1 {scores.f1:.3f}, {scores.doors_open} of 6 doors, {scores.false_dots} false dots'

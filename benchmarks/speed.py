@@ -29,7 +29,7 @@ from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.common.readings import Readings
 from forward_grid_mapper.core.evidence.evidence import Evidence
 from forward_grid_mapper.core.mapping import Mapper
-from forward_grid_mapper.core.maps.log_odds_map import LiveMap
+from forward_grid_mapper.core.maps.log_odds_map import LogOddsMap
 from forward_grid_mapper.core.maps.map_set import MapSet
 from forward_grid_mapper.core.runtime.threads import cores
 from forward_grid_mapper.core.sensor.forward_model import log_likelihood
@@ -170,7 +170,7 @@ def measure_live(readings: Readings, runs: int) -> float:
     if hasattr(os, 'sched_setaffinity'):
         os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
     warm_up()
-    return len(readings) / timed(lambda: LiveMap(Parameters()).add(readings), runs)
+    return len(readings) / timed(lambda: LogOddsMap(Parameters()).add(readings), runs)
 
 
 def live(runs: int) -> None:

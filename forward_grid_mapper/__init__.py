@@ -2,7 +2,7 @@
 
 Rooms, from the bottom up; each imports only from those above it in this list:
 
-``core``        parameters, placing of readings, cone index, EM, live map: numpy and numba only
+``core``        parameters, association of readings, cone index, EM, live map: numpy and numba only
 ``files``       map, report, picture and parameter files
 ``bags``        reading and writing of ROS 1 and ROS 2 bags through rosbags
 ``simulation``  worlds with a ground truth, simulated sonars, scores

@@ -79,10 +79,10 @@ def causes(z: float, z_max: float, sigma: float, distances: list[float], model: 
     would return it explains the reading.
     """
     distances = sorted(distances)
-    share = 1 - model.p_rand - model.p_lost
+    mixture_weight = 1 - model.p_rand - model.p_lost
     out = [model.p_rand / z_max, lost(z, z_max, sigma, model)] + [0.0] * (len(distances) + 1)
     for pattern in itertools.product((True, False), repeat=len(distances)):
-        p = share * math.prod(model.p_hit if answers else 1 - model.p_hit for answers in pattern)
+        p = mixture_weight * math.prod(model.p_hit if answers else 1 - model.p_hit for answers in pattern)
         if any(pattern):
             k = pattern.index(True)
             out[3 + k] += p * normal(z, distances[k], sigma, model.cut)
@@ -102,12 +102,12 @@ def obstacles(readings: Readings, t: int, grid: Grid, occupied: np.ndarray, mode
 
 def likelihood(z: float, z_max: float, sigma: float, distances: list[float], model: ModelParameters) -> float:
     """The density of a reading as the sum over its causes, from near to far."""
-    share = 1 - model.p_rand - model.p_lost
+    mixture_weight = 1 - model.p_rand - model.p_lost
     total = model.p_rand / z_max + lost(z, z_max, sigma, model)
     for d in sorted(distances):
-        total += share * model.p_hit * normal(z, d, sigma, model.cut)
-        share *= 1 - model.p_hit
-    return total + share * normal(z, z_max, sigma, model.cut)
+        total += mixture_weight * model.p_hit * normal(z, d, sigma, model.cut)
+        mixture_weight *= 1 - model.p_hit
+    return total + mixture_weight * normal(z, z_max, sigma, model.cut)
 
 
 def log_likelihood(readings: Readings, grid: Grid, occupied: np.ndarray, model: ModelParameters) -> float:
@@ -195,11 +195,11 @@ def awkward_readings(rng: np.random.Generator, grid: Grid, count: int) -> Readin
 
 def pairs_of(state: State, t: int) -> tuple[list[int], list[int], list[float], list[int]]:
     """What is stored of reading t: the cells of its runs in order; cells, densities and logs of its band."""
-    share = state.shares[t]
-    assert share['stored']
-    words = state.pairs.cell[share['at'] :]
-    free = [c for k in range(share['runs']) for c in range(words[2 * k], words[2 * k + 1] + 1)]
-    begin, m = share['at'] + 2 * share['runs'], share['bands']
+    reading_state = state.reading_states[t]
+    assert reading_state['stored']
+    words = state.pairs.cell[reading_state['at'] :]
+    free = [c for k in range(reading_state['runs']) for c in range(words[2 * k], words[2 * k + 1] + 1)]
+    begin, m = reading_state['at'] + 2 * reading_state['runs'], reading_state['bands']
     return (
         free,
         state.pairs.cell[begin : begin + m].tolist(),
@@ -252,13 +252,13 @@ def prior_gain(prior: Prior, occupied: np.ndarray, c: int, shape: tuple[int, int
 
 def log_likelihoods(readings: Readings, grid: Grid, maps: np.ndarray, model: ModelParameters) -> np.ndarray:
     """Those of many maps, shape (maps, cells), at once."""
-    share = 1 - model.p_rand - model.p_lost
+    mixture_weight = 1 - model.p_rand - model.p_lost
     total = np.zeros(len(maps))
     for t in range(len(readings)):
         z, z_max, sigma = readings.z[t], readings.z_max[t], sigma_of(readings, t, grid, model)
         no_echo = normal(z, z_max, sigma, model.cut)
         unmapped = model.p_rand / z_max + lost(z, z_max, sigma, model)
-        likelihood, left = np.full(len(maps), unmapped), np.full(len(maps), share)
+        likelihood, left = np.full(len(maps), unmapped), np.full(len(maps), mixture_weight)
         for c, d in sorted(cells_of(readings, t, grid, model).items(), key=lambda pair: pair[1]):
             answers = model.p_hit * maps[:, c]
             likelihood += left * answers * normal(z, d, sigma, model.cut)
@@ -276,7 +276,7 @@ def box_sum(values: np.ndarray) -> np.ndarray:
 
 
 def normals(readings: Readings, grid: Grid, model: ModelParameters) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """C, S and M of `facing`, before they are summed over 3 x 3 cells."""
+    """C, S and M of `normals`, before they are summed over 3 x 3 cells."""
     sums = np.zeros((3, *grid.shape))
     xs, ys = grid.centers()
     for t in range(len(readings)):
@@ -298,14 +298,14 @@ def passed(
 ) -> np.ndarray:
     """How many readings are expected to have passed each cell, shape (cells,): the formula of `finishing`."""
     out = np.zeros(grid.size)
-    share = 1 - model.p_rand - model.p_lost
+    mixture_weight = 1 - model.p_rand - model.p_lost
     for t in range(len(readings)):
         z, z_max, sigma = readings.z[t], readings.z_max[t], sigma_of(readings, t, grid, model)
         away = cells_of(readings, t, grid, model)
         chance, no_echo = model.p_rand / z_max, normal(z, z_max, sigma, model.cut)
         met = sorted((d, c) for c, d in away.items() if occupied.ravel()[c])
         free_end = z - model.cut * sigma
-        terms, left = [], share
+        terms, left = [], mixture_weight
         for d, _ in met:
             terms.append((d, left * model.p_hit * normal(z, d, sigma, model.cut)))
             left *= 1 - model.p_hit

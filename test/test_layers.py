@@ -1,4 +1,4 @@
-"""The house: each room imports only from the rooms below it, and core only numpy and numba."""
+"""Layers: each imports only from those below it, no two modules import each other, and the core needs little."""
 
 from __future__ import annotations
 
@@ -9,27 +9,39 @@ from pathlib import Path
 import pytest
 
 PACKAGE = Path(__file__).resolve().parents[1] / 'forward_grid_mapper'
+
 BELOW = {
     'core': set(),
     'files': {'core'},
     'bags': {'core'},
     'simulation': {'core'},
+    'recordings': {'core', 'files', 'bags'},
+    'replay': {'core', 'bags'},
     'node': {'core', 'files'},
-    'commands': {'core', 'files', 'bags', 'simulation', 'node'},
+    'commands': {'core', 'files', 'bags', 'simulation', 'recordings', 'replay', 'node'},
 }
+"""The packages that each package may import from, beside itself."""
+
+CORE = ('common', 'runtime', 'messages', 'sensor', 'evidence', 'search', 'maps', 'learning')
+"""The layers of the core, from the bottom up; the modules beside them are above all."""
+
 OUTSIDE = {
     'core': {'numpy', 'numba'},
     'files': {'numpy', 'yaml', 'matplotlib'},
     'bags': {'numpy', 'rosbags'},
     'simulation': {'numpy'},
+    'recordings': {'numpy'},
 }
+"""What is imported from outside of the standard library; where nothing is named, anything may be."""
+
+MODULES = {'.'.join(path.relative_to(PACKAGE.parent).with_suffix('').parts): path for path in PACKAGE.rglob('*.py')}
 
 
-def imports(path: Path) -> set[str]:
-    """Absolute names of everything that a file imports, at any depth."""
+def imports(module: str) -> set[str]:
+    """Absolute names of everything that a module imports, at any depth: modules, and names in them."""
     names = set()
-    parts = list(path.relative_to(PACKAGE.parent).with_suffix('').parts)
-    for node in ast.walk(ast.parse(path.read_text())):
+    parts = module.split('.')
+    for node in ast.walk(ast.parse(MODULES[module].read_text())):
         if isinstance(node, ast.Import):
             names |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
@@ -39,12 +51,55 @@ def imports(path: Path) -> set[str]:
     return names
 
 
-@pytest.mark.parametrize('room', sorted(BELOW))
-def test_rooms_import_only_from_below(room: str) -> None:
-    for path in (PACKAGE / room).rglob('*.py'):
-        for name in imports(path):
+def modules_of(module: str) -> set[str]:
+    """The modules of the package that a module imports."""
+    found = set()
+    for name in imports(module):
+        for candidate in (name, name.rpartition('.')[0]):
+            if candidate in MODULES:
+                found.add(candidate)
+                break
+    return found - {module}
+
+
+@pytest.mark.parametrize('package', sorted(BELOW))
+def test_packages_import_only_from_below(package: str) -> None:
+    for module in MODULES:
+        if module.split('.')[1:2] != [package]:
+            continue
+        for name in imports(module):
             parts = name.split('.')
             if parts[0] == PACKAGE.name and len(parts) > 2:
-                assert parts[1] == room or parts[1] in BELOW[room], f'{path} imports {name}'
-            elif parts[0] != PACKAGE.name and parts[0] not in sys.stdlib_module_names and room in OUTSIDE:
-                assert parts[0] in OUTSIDE[room], f'{path} imports {name}'
+                assert parts[1] == package or parts[1] in BELOW[package], f'{module} imports {name}'
+            elif parts[0] != PACKAGE.name and parts[0] not in sys.stdlib_module_names and package in OUTSIDE:
+                assert parts[0] in OUTSIDE[package], f'{module} imports {name}'
+
+
+def test_every_package_and_layer_is_listed() -> None:
+    folders = {path.parent.relative_to(PACKAGE).parts for path in MODULES.values()}
+    assert {parts[0] for parts in folders if parts} == set(BELOW)
+    assert {parts[1] for parts in folders if parts[:1] == ('core',) and len(parts) > 1} == set(CORE)
+
+
+@pytest.mark.parametrize('number', range(len(CORE)))
+def test_layers_of_the_core_import_only_from_below(number: int) -> None:
+    prefix = f'{PACKAGE.name}.core.'
+    allowed = CORE[: number + 1]
+    for module in MODULES:
+        if module.startswith(f'{prefix}{CORE[number]}.'):
+            for name in modules_of(module):
+                assert name.removeprefix(prefix).split('.')[0] in allowed, f'{module} imports {name}'
+
+
+def test_no_modules_import_each_other() -> None:
+    left = {module: modules_of(module) for module in MODULES}
+    while left:
+        free = [module for module, needed in left.items() if not needed & left.keys()]
+        assert free, f'these import each other: {sorted(left)}'
+        for module in free:
+            del left[module]
+
+
+def test_tests_of_the_core_stand_where_its_modules_do() -> None:
+    folder = Path(__file__).parent / 'core'
+    assert {path.name for path in folder.iterdir() if path.is_dir() and path.name[0] != '_'} <= set(CORE)

@@ -137,18 +137,18 @@ def test_the_lists_of_parameters_are_up_to_date() -> None:
 
 @pytest.mark.parametrize(('name', 'sonars'), [('ring_24', sonar_ring()), ('front_8', front_array())])
 def test_examples_hold_the_poses_of_the_simulated_sonars(name: str, sonars: SonarArray) -> None:
-    values, mounts, node = load_parameters(ROOT / 'config' / f'{name}.yaml')
+    values, extrinsics, node = load_parameters(ROOT / 'config' / f'{name}.yaml')
     assert Parameters.from_flat(values).node.range_topics == ('sonar',)
     assert not node
-    assert list(mounts) == list(sonars.names)
-    np.testing.assert_allclose(list(mounts.values()), [pose for _, pose in sonars.mounts], atol=1e-4)
+    assert list(extrinsics) == list(sonars.names)
+    np.testing.assert_allclose(list(extrinsics.values()), [pose for _, pose in sonars.extrinsics], atol=1e-4)
 
 
 @pytest.mark.parametrize('name', ['mapper', 'ring_24', 'front_8'])
 def test_ros_loads_the_parameter_files(name: str) -> None:
     rclpy = pytest.importorskip('rclpy', reason='rclpy is not installed (the extra ros, or a sourced ROS 2)')
     path = ROOT / 'config' / f'{name}.yaml'
-    values, mounts, _ = load_parameters(path)
+    values, extrinsics, _ = load_parameters(path)
     context = rclpy.Context()
     rclpy.init(args=['--ros-args', '--params-file', str(path)], context=context)
     try:
@@ -157,7 +157,7 @@ def test_ros_loads_the_parameter_files(name: str) -> None:
             loaded = node.get_parameter(row).value
             assert type(loaded) is type(value) or isinstance(value, tuple)
             assert loaded == (list(value) if isinstance(value, tuple) else value)
-        for frame, pose in mounts.items():
+        for frame, pose in extrinsics.items():
             assert list(node.get_parameter(f'sensors.{frame}.pose').value) == list(pose)
         node.destroy_node()
     finally:

@@ -231,7 +231,7 @@ class BagWriter:
 
 
 def _quality(*, latched: bool) -> Qos:
-    """Return what a recorder would have noted: reliable, and transient local for latched topics."""
+    """Return what a recorder would have noted: reliable, and dynamic local for latched topics."""
     return Qos(
         QosHistory.KEEP_LAST,
         1 if latched else 10,

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import argparse
 import io
-import os
 import sys
 import threading
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from pathlib import Path
 from types import TracebackType
 from typing import TextIO
 
@@ -61,11 +59,6 @@ def _still_printing() -> bool:
             sys.stdout.close()
         return False
     return True
-
-
-def readable(path: Path | str) -> str:
-    """Return a path as text that can be drawn and written as UTF-8, whatever its bytes are."""
-    return os.fsencode(path).decode('utf-8', 'backslashreplace')
 
 
 class Ticker:

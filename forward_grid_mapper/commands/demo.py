@@ -10,14 +10,15 @@ from pathlib import Path
 from ..core.common.errors import MapperError, ParameterError
 from ..core.common.parameters import Parameters
 from ..core.mapping import Mapper
-from ..files.figure import Tile, write_figure
+from ..files.figure import write_figure
 from ..files.map_archive import MapArchive, read_npz
-from ..files.output_folder import free_name, output_errors, output_folder
+from ..files.output_folder import free_name, output_errors, output_folder, readable
+from ..files.panels import Tile
 from ..files.results import write_results
 from ..recordings.read_drive import read_drive
 from ..simulation.drive import Recording
 from ..simulation.score import Scores, score_map, threshold, visible_surface
-from .console import Ticker, readable, run
+from .console import Ticker, run
 from .options import add_mapping_options, chosen_parameters
 from .simulate import SONARS, record, write_recording
 
@@ -65,7 +66,7 @@ def through_node(folder: Path, bag: Path, recording: Recording, options: argpars
 
     ros = {'range_reliability': 'reliable', 'odom_reliability': 'reliable', 'save_directory': str(folder)}
     parameters = Parameters.from_flat(ros, base=chosen_parameters(options)[0])
-    with LiveNode(folder, parameters, recording.mounts) as node:
+    with LiveNode(folder, parameters, recording.extrinsics) as node:
         ticker.say('starting the node')
         node.call('reset')
         ticker.say(f'replaying the bag to the node, {options.rate:g} times as fast as it was recorded')
@@ -83,7 +84,7 @@ def offline(folder: Path, bag: Path, output: Path, options: argparse.Namespace, 
     parameters = chosen_parameters(options)[0]
     drive = read_drive(bag, parameters, {}, progress=ticker.reading)
     drive.source['bag'] = readable(output / bag.name)
-    maps = Mapper(parameters).run(drive.placer.readings, ticker.mapping)
+    maps = Mapper(parameters).run(drive.associator.readings, ticker.mapping)
     write_results(folder / 'maps', maps, drive.source, drive.path_xy, 'The demo, offline')
     return f'{len(maps.readings)} readings, {sum(maps.statistics["seconds"].values()):.2f} seconds'
 

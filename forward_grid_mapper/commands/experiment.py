@@ -15,9 +15,10 @@ import numpy as np
 from ..core.common.errors import ParameterError
 from ..core.common.parameters import Parameters
 from ..core.mapping import Mapper
-from ..core.maps.log_odds_map import LiveMap
-from ..files.figure import Tile, write_figure
+from ..core.maps.log_odds_map import LogOddsMap
+from ..files.figure import write_figure
 from ..files.output_folder import free_name, output_errors, output_folder
+from ..files.panels import Tile
 from ..simulation.drive import Recording, corridor_drive, door_drive
 from ..simulation.score import Mask, Scores, score_map, threshold, visible_surface
 from ..simulation.sonar import NOISE_FREE, NOISY
@@ -104,7 +105,7 @@ def standard(cases: Iterable[Case], gains: dict[str, float], title: str) -> Outc
     """Score the standard map of every case."""
     scores, tiles = [], []
     for case in cases:
-        live = LiveMap(Parameters.from_flat(gains))
+        live = LogOddsMap(Parameters.from_flat(gains))
         live.add(case.recording.readings)
         decided = threshold(live.probability())
         scores.append(score_map(decided, live.grid, case.recording.world, case.visible))

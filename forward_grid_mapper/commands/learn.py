@@ -1,4 +1,4 @@
-"""`learn`: p_hit, p_rand, p_lost and σ from a recorded drive, with standard errors and doubts."""
+"""`learn`: p_hit, p_rand, p_lost and σ from a recorded drive, with standard errors and warnings_."""
 
 from __future__ import annotations
 
@@ -10,12 +10,13 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from ..core.common.errors import OutputError, ParameterError
-from ..core.learning.joint_learning import learn_jointly
+from ..core.joint_learning import learn_jointly
 from ..core.learning.sensor_health import health_warning, sensor_health
 from ..files.learned_text import learned_text, parameter_file_text, write_new_file
+from ..files.output_folder import readable
 from ..files.parameter_file import load_parameters, parse_sensor
 from ..recordings.read_drive import read_drive
-from .console import Ticker, readable, run
+from .console import Ticker, run
 from .options import add_bag_options, add_mapping_options, chosen_parameters
 
 COMMAND = 'learn'
@@ -47,8 +48,8 @@ def parser() -> argparse.ArgumentParser:
 
 def learn(options: argparse.Namespace) -> int:
     """Do what the command line asks for."""
-    parameters, mounts = chosen_parameters(options)
-    mounts |= dict(parse_sensor(text) for text in options.sensor)
+    parameters, extrinsics = chosen_parameters(options)
+    extrinsics |= dict(parse_sensor(text) for text in options.sensor)
     if options.rounds < 1:
         raise ParameterError('--rounds must be a positive number')
     output = Path(options.output) if options.output else None
@@ -60,19 +61,19 @@ def learn(options: argparse.Namespace) -> int:
             raise OutputError(f'{output.parent} is no folder; make it first, or choose another with --output')
     bag = Path(options.bag)
     with Ticker(options.quiet) as ticker:
-        drive = read_drive(bag, parameters, mounts, options.range_topics, options.odom_topic, ticker.reading)
-        found = learn_jointly(drive.placer.readings, parameters, options.rounds, options.keep_going, ticker.mapping)
+        drive = read_drive(bag, parameters, extrinsics, options.range_topics, options.odom_topic, ticker.reading)
+        found = learn_jointly(drive.associator.readings, parameters, options.rounds, options.keep_going, ticker.mapping)
         suspects = health_warning(sensor_health(found.maps))
-    doubts = (*drive.source['warnings'], *found.warnings, *filter(None, [suspects]))
-    found = dataclasses.replace(found, warnings=doubts)
+    warnings_ = (*drive.source['warnings'], *found.warnings, *filter(None, [suspects]))
+    found = dataclasses.replace(found, warnings=warnings_)
     if options.quiet:
-        for warning in doubts:
+        for warning in warnings_:
             print(f'{COMMAND}: warning: {warning}', file=sys.stderr)
     else:
         print(learned_text(found), end='')
     if output is not None:
         ros = load_parameters(options.params).node if options.params else {}
-        write_new_file(output, parameter_file_text(found, mounts, ros, readable(bag)))
+        write_new_file(output, parameter_file_text(found, extrinsics, ros, readable(bag)))
         if not options.quiet:
             print(f'\nthe parameters are in {output}; compare the maps with and without them:')
             print(f'  python3 -m forward_grid_mapper process_bag {readable(bag)} --params {output}')

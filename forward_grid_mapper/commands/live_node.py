@@ -28,12 +28,12 @@ class LiveNode:
     Used as a context manager.
     """
 
-    def __init__(self, folder: Path, parameters: Parameters, mounts: Iterable[tuple[str, Pose2]]) -> None:
+    def __init__(self, folder: Path, parameters: Parameters, extrinsics: Iterable[tuple[str, Pose2]]) -> None:
         """`folder` takes the node's parameters and its log."""
         self._folder = folder
         self._log = folder / 'node.log'
         lines = [dump_parameters(parameters), '\n    # ---- Poses of the sensors on the robot\n\n']
-        lines += [f'    sensors.{frame}.pose: [{p.x!r}, {p.y!r}, {p.yaw!r}]\n' for frame, p in mounts]
+        lines += [f'    sensors.{frame}.pose: [{p.x!r}, {p.y!r}, {p.yaw!r}]\n' for frame, p in extrinsics]
         (folder / 'parameters.yaml').write_text(''.join(lines), encoding='utf-8')
         # neither other robots nor another demo shall hear this one
         domain = str(1 + os.getpid() % 100)

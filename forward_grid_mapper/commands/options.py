@@ -58,9 +58,9 @@ def chosen_parameters(options: argparse.Namespace) -> tuple[Parameters, dict[str
     ParameterError
         If the file or a setting is wrong.
     """
-    values, mounts, _ = load_parameters(options.params) if options.params else ({}, {}, {})
+    values, extrinsics, _ = load_parameters(options.params) if options.params else ({}, {}, {})
     settings = dict(parse_setting(text) for text in options.set)
     for name in settings:
         if find(name).group == 'node':
             raise ParameterError(f'--set {name}: only the node has this parameter; topics have options of their own')
-    return Parameters.from_flat({**values, **settings}), dict(mounts)
+    return Parameters.from_flat({**values, **settings}), dict(extrinsics)

@@ -12,13 +12,13 @@ from ..core.common.errors import ParameterError
 from ..core.mapping import Mapper
 from ..core.maps.map_set import MapSet
 from ..files.map_files import occupancy_values
-from ..files.output_folder import free_name, output_folder
+from ..files.output_folder import free_name, output_folder, readable
 from ..files.parameter_file import parse_sensor
 from ..files.report_text import report_text
 from ..files.results import write_results
 from ..recordings.drive import Drive
 from ..recordings.read_drive import read_drive
-from .console import Ticker, readable, run
+from .console import Ticker, run
 from .options import add_bag_options, add_mapping_options, chosen_parameters
 
 COMMAND = 'process_bag'
@@ -49,8 +49,8 @@ def parser() -> argparse.ArgumentParser:
 
 def process(options: argparse.Namespace) -> int:
     """Do what the command line asks for."""
-    parameters, mounts = chosen_parameters(options)
-    mounts |= dict(parse_sensor(text) for text in options.sensor)
+    parameters, extrinsics = chosen_parameters(options)
+    extrinsics |= dict(parse_sensor(text) for text in options.sensor)
     if options.learn < 0:
         raise ParameterError('--learn: the number of rounds must not be negative')
     bag = Path(options.bag)
@@ -61,13 +61,13 @@ def process(options: argparse.Namespace) -> int:
         drive = read_drive(
             bag,
             parameters,
-            mounts,
+            extrinsics,
             options.range_topics,
             options.odom_topic,
             ticker.reading,
         )
         read = time.perf_counter() - begin
-        maps = Mapper(parameters, options.learn).run(drive.placer.readings, ticker.mapping)
+        maps = Mapper(parameters, options.learn).run(drive.associator.readings, ticker.mapping)
         maps = drive.live.on(maps)
         maps.statistics['seconds'] = {'reading the bag': read, **maps.statistics['seconds']}
         ticker.say('writing')
@@ -102,7 +102,7 @@ def _write_bag(path: Path, maps: MapSet, drive: Drive) -> None:
 
     stamp = drive.source['stamps'][1]
     # ROS 1 frames may begin with a slash, which tf2 refuses
-    frame = drive.placer.map_frame.lstrip('/')
+    frame = drive.associator.map_frame.lstrip('/')
     with BagWriter(path, 'mcap') as writer:
         for name, values in (('live_map', maps.live), ('ml_map', maps.ml), ('uncertainty_map', maps.uncertainty)):
             topic = f'/forward_grid_mapper/{name}'

@@ -75,7 +75,7 @@ def write_recording(folder: Path, recording: Recording, format: str = 'mcap', ea
 
     path = folder / FORMATS[format]
     with BagWriter(path, format) as writer:
-        writer.write_static_transforms([(BASE_FRAME, frame, pose) for frame, pose in recording.mounts], START)
+        writer.write_static_transforms([(BASE_FRAME, frame, pose) for frame, pose in recording.extrinsics], START)
         # both lists are in order of time, and the sort is stable
         messages: list[OdometryMessage | RangeMessage] = [*recording.odometry, *recording.ranges]
         for message in sorted(messages, key=lambda message: message.stamp):

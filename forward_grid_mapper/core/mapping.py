@@ -15,18 +15,17 @@ from .common.parameters import Parameters, SearchParameters
 from .common.readings import Readings, in_canonical_order
 from .evidence.evidence import Evidence
 from .learning.model_update import learn
-from .maps.dynamic import transient_echoes
-from .maps.log_odds_map import LiveMap, arc_depth
+from .maps.dynamic import dynamic_echoes
+from .maps.log_odds_map import LogOddsMap, map_grid
 from .maps.map_set import MapSet
-from .maps.post_processing import finish
-from .maps.traversed import driven_cells
+from .maps.post_processing import post_process
+from .maps.traversed import traversed_cells
 from .maps.uncertainty import uncertainty_map
 from .runtime.cancelling import check
 from .runtime.memory import memory_for_pairs
 from .runtime.threads import cores
 from .search.prior import odds_given_neighbours
 from .search.search import Progress, Search, SearchResult
-from .sensor.cone_table import grid_of
 
 Watch = Callable[[str, Progress | None], None]
 """Hears the name of each stage as it begins, and of every sweep of the search."""
@@ -84,7 +83,7 @@ class Mapper:
                 parameters = dataclasses.replace(parameters, model=learn(readings, evidence.grid, ml, parameters.model))
             evidence, result = self._find(readings, parameters, watch)
         with self._stage('live map', watch):
-            live = LiveMap(parameters)
+            live = LogOddsMap(parameters)
             live.add(readings)
             live_map = live.probability(evidence.grid)
         with self._stage('uncertainty', watch):
@@ -98,7 +97,7 @@ class Mapper:
         start: tuple[Grid, NDArray[np.int8]] | None = None,
     ) -> tuple[Evidence, SearchResult]:
         # the grid of the live map, so that all three maps are of one shape
-        grid = grid_of(readings, parameters.model, parameters.grid, beyond=arc_depth(parameters))
+        grid = map_grid(readings, parameters)
         asked = parameters.search
         with self._stage('index', watch):
             memory, threads = memory_for_pairs(parameters), asked.threads or cores()
@@ -106,19 +105,19 @@ class Mapper:
             evidence = Evidence(grid, parameters.model, memory, threads, self._stop, occupied)
             evidence.extend(readings)
         with self._stage('search', watch):
-            self._search = Search(evidence, asked, self._driven(readings, grid, asked).ravel())
+            self._search = Search(evidence, asked, self._traversed(readings, grid, asked).ravel())
             return evidence, self._search.run(lambda progress: watch('search', progress))
 
     @staticmethod
-    def _driven(readings: Readings, grid: Grid, parameters: SearchParameters) -> NDArray[np.bool_]:
-        return driven_cells(readings, grid) if parameters.driven_cost > 0 else np.zeros(grid.shape, np.bool_)
+    def _traversed(readings: Readings, grid: Grid, parameters: SearchParameters) -> NDArray[np.bool_]:
+        return traversed_cells(readings, grid) if parameters.driven_cost > 0 else np.zeros(grid.shape, np.bool_)
 
     def _collect(
         self, readings: Readings, parameters: Parameters, evidence: Evidence, result: SearchResult, live_map: Any
     ) -> MapSet:
         search, grid = parameters.search, evidence.grid
-        driven = self._driven(readings, grid, search)
-        ml = finish(evidence, search.extend, search.least_passed, driven)
+        traversed = self._traversed(readings, grid, search)
+        ml = post_process(evidence, search.extend, search.least_passed, traversed)
         neighbours = odds_given_neighbours(result.prior, ml == 1)
         unexplained = parameters.model.p_rand / readings.z_max > 0.5 * evidence.likelihoods
         return MapSet(
@@ -128,7 +127,7 @@ class Mapper:
             uncertainty=uncertainty_map(result.evidence, neighbours, ml, search),
             readings=readings,
             unexplained=unexplained,
-            transient=transient_echoes(readings, unexplained, grid, ml, parameters.model),
+            dynamic=dynamic_echoes(readings, unexplained, grid, ml, parameters.model),
             log_likelihood=evidence.log_likelihood,
             objective=evidence.log_likelihood + result.log_prior,
             parameters=parameters,

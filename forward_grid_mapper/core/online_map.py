@@ -21,13 +21,13 @@ from .common.grid import Grid, part_of
 from .common.parameters import Parameters
 from .common.readings import Readings
 from .evidence.evidence import Evidence
-from .maps.log_odds_map import arc_depth
-from .maps.post_processing import finish
-from .maps.traversed import STRIDES, mark_driven
+from .maps.log_odds_map import map_grid
+from .maps.post_processing import post_process
+from .maps.traversed import STRIDES, mark_traversed
 from .maps.uncertainty import uncertainty_map
 from .runtime.memory import memory_for_pairs
 from .runtime.threads import cores
-from .search.moves import flip_in_order, promising
+from .search.flips import flip_in_order, promising
 from .search.prior import Prior, local_prior, odds_given_neighbours, shapes
 from .search.search import LEAST, Search, Window
 from .sensor.cone_table import effective_sigma, grid_of
@@ -62,7 +62,7 @@ class OnlineMap:
         """Forget everything."""
         self._evidence: Evidence | None = None
         self._kept: dict[tuple[float, ...], int] = {}
-        self._driven = np.zeros((0, 0), np.bool_)
+        self._traversed = np.zeros((0, 0), np.bool_)
         self._since: list[Window] = []
         self._count = 0
         self._prior = Prior(np.zeros(0), shapes(self._parameters.search))
@@ -84,17 +84,17 @@ class OnlineMap:
         if not len(readings):
             return
         p = self._parameters
-        self.grid = grid_of(readings, p.model, p.grid, within=self.grid, beyond=arc_depth(p))
+        self.grid = map_grid(readings, p, within=self.grid)
         evidence = self._with_room()
         if p.search.driven_cost > 0:
-            self._drive(readings, evidence.grid)
+            self._mark_traversed(readings, evidence.grid)
         new, known = self._sort_out(readings)
         evidence.extend(readings.select(new))
         # after the new ones, which may be what others of the same call say too
         if len(known):
-            evidence.weigh(known)
+            evidence.add_multiplicity(known)
         if len(new) > MANY:
-            Search(evidence, p.search, self._driven.ravel()).run()
+            Search(evidence, p.search, self._traversed.ravel()).run()
         else:
             window = self._around(evidence.grid, readings)
             self._settle(evidence, window)
@@ -107,7 +107,7 @@ class OnlineMap:
         """Search around all readings since this was done last, in all ways that a search has."""
         bottom, top, left, right = zip(*self._since, strict=True)
         window = min(bottom), max(top), min(left), max(right)
-        Search(evidence, self._parameters.search, self._driven.ravel(), window).refine()
+        Search(evidence, self._parameters.search, self._traversed.ravel(), window).refine()
         self._since.clear()
         self._count = 0
 
@@ -117,17 +117,17 @@ class OnlineMap:
             self._evidence.state.maps.occupied[:] = (part_of(grid, ml, self._evidence.grid) == 1).ravel()
             self._evidence.rebuild()
 
-    def _drive(self, readings: Readings, grid: Grid) -> None:
+    def _mark_traversed(self, readings: Readings, grid: Grid) -> None:
         """Note the cells that sensors were moved over, from the last reading on."""
         x, y, stamp = (
             np.r_[old, new] for old, new in zip(self._last, (readings.x, readings.y, readings.stamp), strict=True)
         )
-        mark_driven(x, y, stamp, grid, self._driven)
+        mark_traversed(x, y, stamp, grid, self._traversed)
         rows, columns = grid.cells_of(x, y)
         # the last reading may be one of before a jump, off this grid
         rows, columns = rows.clip(0, grid.height - 1), columns.clip(0, grid.width - 1)
         near = (slice(rows.min(), rows.max() + 1), slice(columns.min(), columns.max() + 1))
-        self._prior.local.reshape(grid.shape)[near] = local_prior(self._parameters.search, self._driven[near])
+        self._prior.local.reshape(grid.shape)[near] = local_prior(self._parameters.search, self._traversed[near])
         n = STRIDES[-1]
         self._last = x[-n:], y[-n:], stamp[-n:]
 
@@ -169,17 +169,17 @@ class OnlineMap:
             model = dataclasses.replace(p.model, grazing_angle=math.pi / 2)
             threads = p.search.threads or cores()
             self._evidence = evidence = Evidence(larger, model, memory_for_pairs(p), threads)
-            self._driven = np.zeros(larger.shape, np.bool_)
+            self._traversed = np.zeros(larger.shape, np.bool_)
         else:
             larger = larger.union(evidence.grid)
             inner = larger.window(evidence.grid)
-            driven = np.zeros(larger.shape, np.bool_)
-            driven[inner] = self._driven
-            self._driven = driven
+            traversed = np.zeros(larger.shape, np.bool_)
+            traversed[inner] = self._traversed
+            self._traversed = traversed
             up, right = inner[0].start, inner[1].start
             self._since = [(a + up, b + up, c + right, d + right) for a, b, c, d in self._since]
             evidence.grow(larger)
-        self._prior = self._prior._replace(local=local_prior(p.search, self._driven).ravel())
+        self._prior = self._prior._replace(local=local_prior(p.search, self._traversed).ravel())
         return evidence
 
     def _around(self, grid: Grid, readings: Readings) -> Window:
@@ -214,7 +214,7 @@ class OnlineMap:
             return self.grid, np.zeros((0, 0), np.int8), np.zeros((0, 0), np.float32)
         evidence, search = self._evidence, self._parameters.search
         window = evidence.grid.window(self.grid)
-        ml = finish(evidence, search.extend, search.least_passed, self._driven)
+        ml = post_process(evidence, search.extend, search.least_passed, self._traversed)
         neighbours = odds_given_neighbours(self._prior, ml == 1)
         uncertainty = uncertainty_map(evidence.of_occupancy(), neighbours, ml, search)
         return self.grid, ml[window], uncertainty[window]

@@ -21,8 +21,7 @@ from matplotlib.path import Path as Outline
 from matplotlib.ticker import MaxNLocator
 from matplotlib.transforms import Affine2D
 
-from .figure import Tile
-from .picture import Picture
+from .panels import Picture, Tile
 
 # Free is white and unknown a cool tint, so that they differ to every eye; in between runs a warm scale, so that an
 # uncertain cell looks like neither. Path and dots are blue and vermilion of the Okabe-Ito palette.

@@ -4,23 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
-
-from numpy.typing import NDArray
 
 from ..core.common.errors import OutputError
-from ..core.common.grid import Grid
 from .output_folder import output_errors
-
-Box = tuple[float, float, float, float]
-
-
-class Tile(NamedTuple):
-    """One map of the table: `values` are probabilities, or cells 0 and 1, with NaN or -1 where unknown."""
-
-    title: str
-    grid: Grid
-    values: NDArray[Any]
+from .panels import Box, Tile
 
 
 def write_figure(path: Path | str, title: str, rows: Sequence[Sequence[Tile]], view: Box) -> None:

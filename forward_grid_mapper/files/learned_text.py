@@ -11,7 +11,7 @@ from typing import Any
 import yaml
 
 from ..core.common.errors import OutputError
-from ..core.learning.joint_learning import Learned
+from ..core.joint_learning import Learned
 from ..core.learning.standard_errors import LEARNED
 from ..core.messages.message_types import Pose2
 from .output_folder import output_errors
@@ -71,13 +71,15 @@ def _rounds(learned: Learned) -> Iterator[str]:
         )
 
 
-def parameter_file_text(learned: Learned, mounts: Mapping[str, Pose2], ros: Mapping[str, Any], source: str = '') -> str:
+def parameter_file_text(
+    learned: Learned, extrinsics: Mapping[str, Pose2], ros: Mapping[str, Any], source: str = ''
+) -> str:
     """Return a ROS 2 parameter file with the learned values, and the sensor poses that were given.
 
     Parameters
     ----------
     learned : Learned
-    mounts : mapping of str to Pose2
+    extrinsics : mapping of str to Pose2
         Poses of sensors, for the file to hold them as well.
     ros : mapping
         Parameters that ROS itself gives every node.
@@ -92,7 +94,7 @@ def parameter_file_text(learned: Learned, mounts: Mapping[str, Pose2], ros: Mapp
         lines.append(f'#   {name} {value:.4g}{sure}')
     lines += [f'# WARNING: {line}' for line in learned.warnings]
     text = '\n'.join(lines) + '\n' + dump_parameters(learned.parameters)
-    extra = {f'sensors.{frame}.pose': [float(v) for v in pose] for frame, pose in mounts.items()} | dict(ros)
+    extra = {f'sensors.{frame}.pose': [float(v) for v in pose] for frame, pose in extrinsics.items()} | dict(ros)
     for key, value in extra.items():
         # a list on one line, as the rest of the file has it
         flow = None if isinstance(value, list) else False

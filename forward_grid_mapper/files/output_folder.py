@@ -20,6 +20,11 @@ _FULL = {errno.ENOSPC, errno.EDQUOT}
 _WRITE_ONLY = _FULL | {errno.EFBIG, errno.EROFS}
 
 
+def readable(path: Path | str) -> str:
+    """Return a path as text that can be drawn and written as UTF-8, whatever its bytes are."""
+    return os.fsencode(path).decode('utf-8', 'backslashreplace')
+
+
 @contextmanager
 def output_errors(path: Path) -> Iterator[None]:
     """Turn an `OSError` from writing `path` into an `OutputError`.
@@ -40,7 +45,7 @@ def output_folder(path: Path | str) -> Iterator[Path]:
     """Give a temporary folder to write into, which takes the name `path` when the block succeeds.
 
     Nothing appears under the final name before, and the temporary folder is removed if the block fails. Missing
-    parents are made. An empty folder that exists already is filled, not replaced: it may be a mount point or the
+    parents are made. An empty folder that exists already is filled, not replaced: it may be a extrinsic point or the
     shell's working directory.
 
     Parameters

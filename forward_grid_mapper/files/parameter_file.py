@@ -28,14 +28,14 @@ class ParameterFile(NamedTuple):
     ----------
     values : dict
         Checked values of the table's parameters, by name.
-    mounts : dict
+    extrinsics : dict
         Pose of each sensor in the robot's base frame, by `frame_id`.
     node : dict
         Values of the parameters that ROS itself gives every node, unchecked.
     """
 
     values: dict[str, Any]
-    mounts: dict[str, Pose2]
+    extrinsics: dict[str, Pose2]
     node: dict[str, Any]
 
 
@@ -173,8 +173,8 @@ def _flatten(section: Any, prefix: str = '') -> Iterator[tuple[str, Any]]:
 def _sort_out(flat: dict[str, Any]) -> ParameterFile:
     result = ParameterFile({}, {}, {})
     for name, value in flat.items():
-        if mount := _MOUNT.fullmatch(name):
-            result.mounts[mount['frame']] = _pose(name, value)
+        if extrinsic := _MOUNT.fullmatch(name):
+            result.extrinsics[extrinsic['frame']] = _pose(name, value)
         elif _ROS_OWN.fullmatch(name):
             result.node[name] = value
         elif name.partition('.')[0] == 'sensors':

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,31 +12,11 @@ from ..core.common.errors import OutputError
 from ..core.common.grid import UNKNOWN, Grid
 from ..core.maps.map_set import MapSet
 from .output_folder import output_errors
+from .panels import Box, Panel, Picture
 
-Box = tuple[float, float, float, float]
 # More cells than that along a side cannot be told apart in the picture.
 _MAX_SIDE = 2400
 _MARGIN = 0.03
-
-
-class Panel(NamedTuple):
-    """One map of the picture: `values` are probabilities with NaN where unknown, `extent` its box in metres."""
-
-    title: str
-    values: NDArray[np.float32]
-    extent: Box
-
-
-class Picture(NamedTuple):
-    """What is drawn. `view` is the box shown; points are in metres; `overlay` is the panel that bears them."""
-
-    title: str
-    figures: str
-    panels: list[Panel]
-    view: Box
-    overlay: int
-    path_xy: NDArray[np.float64]
-    unexplained_xy: NDArray[np.float64]
 
 
 def write_picture(

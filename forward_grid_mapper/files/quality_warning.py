@@ -13,7 +13,7 @@ ENOUGH = 20
 """Readings below which nothing can be said."""
 
 
-def doubt(maps: MapSet) -> str:
+def quality_warning(maps: MapSet) -> str:
     """Return why the maps should not be trusted; empty if nothing speaks against them."""
     count, unexplained = len(maps.readings), int(np.count_nonzero(maps.unexplained))
     if count < ENOUGH or unexplained <= TOO_MANY * count:

@@ -41,8 +41,8 @@ def _input(data: dict[str, Any]) -> Iterator[str]:
         yield from _line('Odometry', f'{topic}, frame {frame}' if frame else topic)
     if frame := source.get('map_frame'):
         yield from _line('Map frame', frame)
-    if mounts := source.get('mounts_from'):
-        yield from _line('Sensor poses', f'from {mounts}')
+    if extrinsics := source.get('mounts_from'):
+        yield from _line('Sensor poses', f'from {extrinsics}')
     drive = []
     if (path := source.get('path_m')) is not None:
         drive.append(f'{path:.1f} m')

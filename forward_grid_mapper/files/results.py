@@ -15,7 +15,7 @@ from ..core.maps.map_set import MapSet
 from .map_archive import write_npz
 from .map_files import write_raw, write_trinary
 from .output_folder import output_errors, output_folder
-from .quality_warning import doubt
+from .quality_warning import quality_warning
 from .report import report_data, write_report
 
 
@@ -61,7 +61,7 @@ def write_results(
         write_trinary(folder / 'ml_map', maps.grid, maps.ml)
         write_raw(folder / 'uncertainty_map', maps.grid, maps.uncertainty)
         write_npz(folder / 'maps.npz', maps)
-        warnings = [*(source.get('warnings') or []), *filter(None, [doubt(maps)])]
+        warnings = [*(source.get('warnings') or []), *filter(None, [quality_warning(maps)])]
         try:
             from .picture import write_picture
 

@@ -10,7 +10,7 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 
 from ..core.common.grid import Grid
-from ..core.messages.pose_association import Placer
+from ..core.messages.pose_association import PoseAssociator
 from ..core.messages.rep117 import ODOMETRY_REASONS, REASONS
 from .em import Run
 
@@ -41,25 +41,32 @@ class Health:
         self._slowest = max(self._slowest, time.time_ns() - sent)
 
     def statuses(
-        self, name: str, placer: Placer, run: Run | None, last_run: str, grid: Grid, paused: bool, extra: dict[str, Any]
+        self,
+        name: str,
+        associator: PoseAssociator,
+        run: Run | None,
+        last_run: str,
+        grid: Grid,
+        paused: bool,
+        extra: dict[str, Any],
     ) -> list[DiagnosticStatus]:
         """Return the statuses of input and of EM."""
-        level, message = self._judge(placer, paused)
-        bound = placer.parameters.max_readings
-        held = min(placer.buffer.held, bound or placer.buffer.held)
+        level, message = self._judge(associator, paused)
+        bound = associator.parameters.max_readings
+        held = min(associator.buffer.held, bound or associator.buffer.held)
         values = {
-            'readings received': placer.received,
-            'readings accepted': len(placer.buffer),
+            'readings received': associator.received,
+            'readings accepted': len(associator.buffer),
             'readings kept to map from': f'{held} of at most {bound}' if bound else held,
-            'readings waiting for a pose': placer.waiting,
-            'readings rejected': sum(placer.rejected.values()),
-            **{f'rejected: {reason}': count for reason, count in sorted(placer.rejected.items())},
+            'readings waiting for a pose': associator.waiting,
+            'readings rejected': sum(associator.rejected.values()),
+            **{f'rejected: {reason}': count for reason, count in sorted(associator.rejected.items())},
             'longest delay of a reading (ms)': f'{self._slowest / 1e6:.1f}',
-            'odometry received': placer.odometry_received,
-            **{f'odometry rejected: {reason}': count for reason, count in sorted(placer.odometry_rejected.items())},
-            'clock jumps back': placer.time_jumps,
-            'frames without a pose': _listed(placer.unknown_frames),
-            'map frame': placer.map_frame,
+            'odometry received': associator.odometry_received,
+            **{f'odometry rejected: {reason}': count for reason, count in sorted(associator.odometry_rejected.items())},
+            'clock jumps back': associator.time_jumps,
+            'frames without a pose': _listed(associator.unknown_frames),
+            'map frame': associator.map_frame,
             'map size': f'{grid.width} x {grid.height} cells of {grid.resolution} m',
             **extra,
         }
@@ -70,40 +77,40 @@ class Health:
             status(f'{name}: EM', DiagnosticStatus.OK, em['state'], name, em),
         ]
 
-    def _judge(self, placer: Placer, paused: bool) -> tuple[bytes, str]:
-        received, rejected = placer.received, sum(placer.rejected.values())
+    def _judge(self, associator: PoseAssociator, paused: bool) -> tuple[bytes, str]:
+        received, rejected = associator.received, sum(associator.rejected.values())
         new, new_rejected = received - self._received, rejected - self._rejected
         self._received, self._rejected = received, rejected
-        refused = sum(placer.odometry_rejected.values())
-        silent_odometry = self._silence('odometry', placer.odometry_received - refused)
+        refused = sum(associator.odometry_rejected.values())
+        silent_odometry = self._silence('odometry', associator.odometry_received - refused)
         refused_now, self._refused = refused - self._refused, refused
-        silent_ranges = self._silence('range', placer.received)
+        silent_ranges = self._silence('range', associator.received)
         if paused:
             return DiagnosticStatus.OK, 'paused'
         if silent_odometry > SILENCE and refused_now > 0:
-            reason = max(placer.odometry_rejected, key=lambda key: placer.odometry_rejected[key])
+            reason = max(associator.odometry_rejected, key=lambda key: associator.odometry_rejected[key])
             return DiagnosticStatus.WARN, f'odometry is rejected as {reason}: {ODOMETRY_REASONS[reason]}'
         if silent_odometry > SILENCE:
             return DiagnosticStatus.WARN, f'no odometry for {silent_odometry:.0f} s'
         if silent_ranges > SILENCE:
             return DiagnosticStatus.WARN, f'no Range for {silent_ranges:.0f} s'
-        if placer.unknown_frames and new_rejected:
-            return DiagnosticStatus.WARN, f'no pose on the robot for {_listed(placer.unknown_frames)}'
+        if associator.unknown_frames and new_rejected:
+            return DiagnosticStatus.WARN, f'no pose on the robot for {_listed(associator.unknown_frames)}'
         if new and new_rejected > 0.2 * new:
             return DiagnosticStatus.WARN, (
-                f'{new_rejected} of {new} readings were rejected in the last second{self._main_reason(placer)}'
+                f'{new_rejected} of {new} readings were rejected in the last second{self._main_reason(associator)}'
             )
-        bound = placer.parameters.max_readings
-        if bound and NEARLY * bound < len(placer.buffer) <= bound:
+        bound = associator.parameters.max_readings
+        if bound and NEARLY * bound < len(associator.buffer) <= bound:
             return DiagnosticStatus.WARN, (
-                f'{len(placer.buffer)} readings, and max_readings is {bound}: the oldest will go where there are many'
+                f'{len(associator.buffer)} readings, and max_readings is {bound}: the oldest go where there are many'
             )
         return DiagnosticStatus.OK, 'mapping'
 
-    def _main_reason(self, placer: Placer) -> str:
+    def _main_reason(self, associator: PoseAssociator) -> str:
         """Return what most readings were rejected for since the last look."""
-        new = placer.rejected - self._by_reason
-        self._by_reason = placer.rejected.copy()
+        new = associator.rejected - self._by_reason
+        self._by_reason = associator.rejected.copy()
         reason = max(new, key=lambda key: new[key], default='')
         return f', most of them as {reason}: {REASONS[reason]}' if reason else ''
 

@@ -16,10 +16,11 @@ from ..core.common.grid import Grid
 from ..core.common.parameters import Parameters
 from ..core.common.readings import Readings
 from ..core.mapping import Mapper
+from ..core.maps.log_odds_map import map_grid
 from ..core.maps.map_set import MapSet
 from ..core.runtime.memory import shortage
 from ..core.search.search import Progress
-from ..files.quality_warning import doubt
+from ..files.quality_warning import quality_warning
 
 
 @dataclass
@@ -103,7 +104,8 @@ class EmWorker:
             self._watch(run)
 
         try:
-            if lack := shortage(run.readings, parameters):
+            cells = map_grid(run.readings, parameters).size
+            if lack := shortage(cells, len(run.readings)):
                 raise InputError(lack)
             outcome = Outcome(run.mapper.run(run.readings, watch, run.start), '')
         except Cancelled:
@@ -134,5 +136,5 @@ def summary(maps: MapSet, seconds: float) -> str:
         f'objective {maps.objective:.1f}, {s["flips"]} flips, {s["shifts"]} shifts, {s["occupied"]} occupied cells, '
         f'{seconds:.2f} seconds'
         + ('' if s['converged'] else ', NOT converged: raise max_sweeps')
-        + (f'; BUT {told}' if (told := doubt(maps)) else '')
+        + (f'; BUT {told}' if (told := quality_warning(maps)) else '')
     )

@@ -79,7 +79,7 @@ def planar(transform: Any) -> Pose2 | None:
     return Pose2(float(offset.x), float(offset.y), yaw)
 
 
-class Mounts:
+class Extrinsics:
     """Poses of the sensors on the robot: those given as parameters win over TF."""
 
     def __init__(self, given: Mapping[str, Pose2], transforms: Transforms) -> None:
@@ -116,7 +116,7 @@ class MapFrame:
         """Take an odometry message; return those whose pose in the map frame is known now, in order."""
         if not self._map_frame or message.frame_id.lstrip('/') == self._map_frame.lstrip('/'):
             return [message]
-        # the placer sorts in what only overtook
+        # the associator sorts in what only overtook
         if self._held and message.stamp < self._held[-1].stamp - JUMP:
             self.dropped += len(self._held)
             self._held.clear()

@@ -1,4 +1,4 @@
-"""What links the placer to its journal: readings go to disk as they come, and come back after a restart."""
+"""What links the associator to its journal: readings go to disk as they come, and come back after a restart."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.node import Node
 
 from ..core.common.errors import OutputError
-from ..core.messages.pose_association import Placer
+from ..core.messages.pose_association import PoseAssociator
 from ..files.journal import Journal
 from .diagnostics import status
 
@@ -23,15 +23,15 @@ FULL = (errno.ENOSPC, errno.EDQUOT)
 class JournalKeeper:
     """Keeps a node's journal; does nothing where the folder is empty text."""
 
-    def __init__(self, node: Node, folder: str, placer: Placer, clock: Any) -> None:
-        """Open the journal and give its readings to the placer.
+    def __init__(self, node: Node, folder: str, associator: PoseAssociator, clock: Any) -> None:
+        """Open the journal and give its readings to the associator.
 
         Raises
         ------
         OutputError
             If the journal is another node's, or cannot be opened for another reason than a full disk.
         """
-        self._placer = placer
+        self._associator = associator
         self._journal: Journal | None = None
         self._folder = folder
         self._trouble = ''
@@ -51,33 +51,33 @@ class JournalKeeper:
             return
         self._restore(node, self._journal)
         # both before readings go and as they come
-        placer.buffer.before_thinning.append(self.take)
+        associator.buffer.before_thinning.append(self.take)
         node.create_timer(PERIOD, self.take, clock=clock)
 
     def _restore(self, node: Node, journal: Journal) -> None:
-        placer = self._placer
+        associator = self._associator
         for readings in journal.restore():
-            placer.restore(readings)
-        placer.map_frame, placer.base_frame = journal.contents.map_frame, journal.contents.base_frame
+            associator.restore(readings)
+        associator.map_frame, associator.base_frame = journal.contents.map_frame, journal.contents.base_frame
         for point in journal.contents.path:
-            placer.extend_path(point)
-        self._restored = self._taken = len(placer.buffer)
+            associator.extend_path(point)
+        self._restored = self._taken = len(associator.buffer)
         node.get_logger().info(
             f'journal {journal.path}: {self._restored} readings of an earlier run are back, in frame '
-            f'{placer.map_frame or "(none yet)"}'
+            f'{associator.map_frame or "(none yet)"}'
         )
 
     def take(self) -> None:
         """Hand what is new to the journal."""
-        journal, placer = self._journal, self._placer
-        if journal is None or len(placer.buffer) == self._taken:
+        journal, associator = self._journal, self._associator
+        if journal is None or len(associator.buffer) == self._taken:
             return
-        new = placer.buffer.snapshot(self._taken)
-        self._taken = len(placer.buffer)
-        point = placer.path[-1] if placer.path else None
+        new = associator.buffer.snapshot(self._taken)
+        self._taken = len(associator.buffer)
+        point = associator.path[-1] if associator.path else None
         points = [point] if point is not None and point != self._last_point else []
         self._last_point = point
-        journal.put(new, (placer.map_frame, placer.base_frame), points)
+        journal.put(new, (associator.map_frame, associator.base_frame), points)
 
     def reset(self) -> str:
         """Begin a new drive, since readings were forgotten; return where the old ones are."""

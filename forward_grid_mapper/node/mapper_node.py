@@ -1,4 +1,4 @@
-"""The node: subscriptions feed the placer, timers publish, services call the core."""
+"""The node: subscriptions feed the associator, timers publish, services call the core."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ from std_srvs.srv import SetBool, Trigger
 from ..core.common.errors import MapperError
 from ..core.common.grid import Grid
 from ..core.common.parameters import Parameters
-from ..core.maps.log_odds_map import LiveMap
+from ..core.maps.log_odds_map import LogOddsMap
 from ..core.maps.map_set import MapSet
 from ..core.messages.message_types import NANOSECONDS, odometry_message, range_message
-from ..core.messages.pose_association import MOST_FRAMES, Placer
+from ..core.messages.pose_association import MOST_FRAMES, PoseAssociator
 from ..files.output_folder import free_name
-from ..files.quality_warning import doubt, thinned
+from ..files.quality_warning import quality_warning, thinned
 from ..files.results import write_results
 from . import diagnostics, ros_parameters
 from .deferred import DeferredService, Reply
 from .em import EmWorker, Outcome, Run, summary
-from .frames import MapFrame, Mounts, Transforms
+from .frames import Extrinsics, MapFrame, Transforms
 from .grid_message import grid_message
 from .journal_keeper import JournalKeeper
 from .online import OnlineWorker
@@ -61,13 +61,13 @@ class MapperNode(Node):
             If a parameter given at start is not admitted.
         """
         super().__init__(NAME, automatically_declare_parameters_from_overrides=True, **options)
-        self.parameters, mounts, warnings = ros_parameters.declare(self)
+        self.parameters, extrinsics, warnings = ros_parameters.declare(self)
         for warning in warnings:
             self.get_logger().warning(warning)
         self.add_on_set_parameters_callback(ros_parameters.validator(lambda: self.parameters, self._accept))
-        self._given_mounts = mounts
+        self._given_extrinsics = extrinsics
         self._maps: MapSet | None = None
-        self._live = LiveMap(self.parameters)
+        self._live = LogOddsMap(self.parameters)
         self._live_count = self._published = self._explained = 0
         self._paused = False
         self._last_run = 'none yet'
@@ -89,14 +89,14 @@ class MapperNode(Node):
         """Create topics and services; from here on messages are taken."""
         node = self.parameters.node
         transforms = Transforms.of(self)
-        self._mounts = Mounts(self._given_mounts, transforms)
-        self._map_frame = MapFrame(node.map_frame, transforms, self.parameters.placing.pose_timeout)
+        self._extrinsics = Extrinsics(self._given_extrinsics, transforms)
+        self._map_frame = MapFrame(node.map_frame, transforms, self.parameters.association.pose_timeout)
         if node.map_frame and not transforms.available:
             raise MapperError(f'map_frame is {node.map_frame}, but tf2_ros is not installed to look it up')
-        self._placer = Placer(self._mounts, self.parameters)
+        self._associator = PoseAssociator(self._extrinsics, self.parameters)
         # the live map has every reading, also those that max_readings drops
-        self._placer.buffer.before_thinning.append(self._update_live)
-        self._journal = JournalKeeper(self, node.journal, self._placer, self._steady)
+        self._associator.buffer.before_thinning.append(self._update_live)
+        self._journal = JournalKeeper(self, node.journal, self._associator, self._steady)
         self._maps_out = {name: self.create_publisher(OccupancyGrid, f'~/{name}', LATCHED) for name in MAPS}
         self._latest = {name: self._message(Grid(self.parameters.grid.resolution, 0, 0, 0, 0), None) for name in MAPS}
         self._diagnostics_out = self.create_publisher(DiagnosticArray, '/diagnostics', 10)
@@ -117,7 +117,7 @@ class MapperNode(Node):
         if node.online:
             self._online = OnlineWorker(self.parameters, self._publish_online, self.get_logger().error)
             self.create_timer(ONLINE_PERIOD, self._offer, clock=self._steady)
-            self._placer.buffer.before_thinning.append(self._offer)
+            self._associator.buffer.before_thinning.append(self._offer)
         self._live_timer = self.create_timer(1.0 / node.publish_rate, self._publish_live, clock=self._steady)
         topics = ', '.join(self.resolve_topic_name(topic) for topic in node.range_topics)
         self.get_logger().info(
@@ -143,15 +143,15 @@ class MapperNode(Node):
     def _on_range(self, message: Range, info: dict[str, int]) -> None:
         self._health.taken(info['source_timestamp'])
         if self._paused:
-            self._placer.reject(range_message(message), 'paused')
+            self._associator.reject(range_message(message), 'paused')
         else:
-            self._placer.add_range(range_message(message))
+            self._associator.add_range(range_message(message))
 
     def _on_odometry(self, message: Odometry) -> None:
-        jumps = self._placer.time_jumps
+        jumps = self._associator.time_jumps
         for converted in self._map_frame.convert(odometry_message(message)):
-            self._placer.add_odometry(converted)
-        if self._placer.time_jumps != jumps:
+            self._associator.add_odometry(converted)
+        if self._associator.time_jumps != jumps:
             self.get_logger().warning('the clock jumped back: readings that waited were dropped, the map is kept')
 
     # parameters
@@ -160,8 +160,8 @@ class MapperNode(Node):
         before = self.parameters
         rate_changed = parameters.node.publish_rate != self.parameters.node.publish_rate
         self.parameters = parameters
-        if hasattr(self, '_placer'):
-            self._placer.parameters = parameters.placing
+        if hasattr(self, '_associator'):
+            self._associator.parameters = parameters.association
             if self._online:
                 self._online.parameters = parameters
                 if (parameters.model, parameters.search) != (before.model, before.search):
@@ -174,7 +174,7 @@ class MapperNode(Node):
     def _message(self, grid: Grid, values: Any) -> OccupancyGrid:
         values = np.zeros(grid.shape, np.int8) if values is None else values
         # tf2 refuses the leading slash that ROS 1 had
-        frame = (self._placer.map_frame or self.parameters.node.map_frame).lstrip('/')
+        frame = (self._associator.map_frame or self.parameters.node.map_frame).lstrip('/')
         return grid_message(grid, values, frame, self.get_clock().now().to_msg())
 
     def _publish(self, name: str, grid: Grid, values: Any) -> None:
@@ -184,9 +184,9 @@ class MapperNode(Node):
 
     def _update_live(self) -> None:
         """Bring the live map up to date; readings are added in batches, which costs a hundredth of one by one."""
-        count = len(self._placer.buffer)
+        count = len(self._associator.buffer)
         if count > self._live_count:
-            new = self._placer.buffer.snapshot(self._live_count)
+            new = self._associator.buffer.snapshot(self._live_count)
             self._live_count = count
             try:
                 self._live.add(new)
@@ -204,7 +204,7 @@ class MapperNode(Node):
 
     def _offer(self) -> None:
         """Hand the readings that came to the online map."""
-        buffer = self._placer.buffer
+        buffer = self._associator.buffer
         if not self._online or len(buffer) <= self._offered:
             return
         if buffer.bound and self._online.kept > buffer.bound + buffer.bound // 4:
@@ -216,8 +216,8 @@ class MapperNode(Node):
     def _restart_online(self) -> None:
         """Begin the online map anew, from the readings that are kept."""
         if self._online:
-            self._offered = len(self._placer.buffer)
-            self._online.restart(self.parameters, self._placer.buffer.bounded() if self._offered else None)
+            self._offered = len(self._associator.buffer)
+            self._online.restart(self.parameters, self._associator.buffer.bounded() if self._offered else None)
 
     def _publish_online(
         self, generation: int, grid: Grid, ml: NDArray[np.int8], uncertainty: NDArray[np.float32]
@@ -246,7 +246,7 @@ class MapperNode(Node):
     def _start_em(self, done: Any) -> bool:
         with self._lock:
             generation = self._generation
-        count = len(self._placer.buffer)
+        count = len(self._associator.buffer)
 
         def finish(outcome: Outcome) -> None:
             self._sensors.judge(outcome.maps, lambda: generation == self._generation)
@@ -264,14 +264,14 @@ class MapperNode(Node):
                 self.get_logger().warning(f'EM: {outcome.message}')
             else:
                 maps = outcome.maps
-                if told := doubt(maps):
+                if told := quality_warning(maps):
                     self.get_logger().warning(f'EM: {told}')
                 self._last_run = summary(maps, sum(maps.statistics['seconds'].values()))
                 self.get_logger().info(f'EM: {self._last_run}')
             done(outcome)
 
         start = self._online.so_far() if self._online else None
-        if self._em.start(self._placer.readings, self.parameters, finish, start) is None:
+        if self._em.start(self._associator.readings, self.parameters, finish, start) is None:
             return False
         self._run_generation = generation
         return True
@@ -294,12 +294,12 @@ class MapperNode(Node):
 
     def _reset(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         self._em.cancel()
-        forgotten = len(self._placer.buffer)
+        forgotten = len(self._associator.buffer)
         # also what came since it last looked
         self._journal.take()
-        self._placer.clear(self.parameters)
+        self._associator.clear(self.parameters)
         kept = self._journal.reset()
-        self._live = LiveMap(self.parameters)
+        self._live = LogOddsMap(self.parameters)
         self._live_count = self._published = 0
         self._last_run = 'none since the reset'
         self._sensors.clear()
@@ -371,8 +371,8 @@ class MapperNode(Node):
         return maps
 
     def _write(self, maps: MapSet, explained: int) -> str:
-        placer = self._placer
-        newer = len(placer.buffer) - explained
+        associator = self._associator
+        newer = len(associator.buffer) - explained
         warnings = []
         if newer > 0:
             warnings.append(f'{newer} readings came after EM: only the live map has them; call run_em before save_maps')
@@ -385,19 +385,19 @@ class MapperNode(Node):
             'node': self.get_fully_qualified_name(),
             'range_topics': [self.resolve_topic_name(topic) for topic in node.range_topics],
             'odom_topic': self.resolve_topic_name(node.odom_topic),
-            'odom_frame': placer.map_frame,
-            'map_frame': placer.map_frame,
-            'base_frame': placer.base_frame,
+            'odom_frame': associator.map_frame,
+            'map_frame': associator.map_frame,
+            'base_frame': associator.base_frame,
             'counts': {
-                'received': placer.received,
-                'accepted': len(placer.buffer),
-                'waiting': placer.waiting,
-                'rejected': dict(placer.rejected),
+                'received': associator.received,
+                'accepted': len(associator.buffer),
+                'waiting': associator.waiting,
+                'rejected': dict(associator.rejected),
             },
             'warnings': warnings,
         }
         folder = free_name(parent, f'maps_{stamp}')
-        path_xy = np.array(list(placer.path), np.float64).reshape(-1, 2)
+        path_xy = np.array(list(associator.path), np.float64).reshape(-1, 2)
         report = write_results(folder, maps, source, path_xy, f'Maps of {self.get_fully_qualified_name()}')
         for warning in report['warnings']:
             self.get_logger().warning(f'save_maps: {warning}')
@@ -406,22 +406,24 @@ class MapperNode(Node):
     # diagnostics
 
     def _report(self) -> None:
-        placer = self._placer
-        for frame in sorted(placer.unknown_frames - self._told)[: diagnostics.SHOWN]:
+        associator = self._associator
+        for frame in sorted(associator.unknown_frames - self._told)[: diagnostics.SHOWN]:
             if len(self._told) >= MOST_FRAMES:
                 break
             self._told.add(frame)
-            why = 'its axis leaves the plane by more than 60°' if frame in self._mounts.steep else 'neither is known'
+            why = (
+                'its axis leaves the plane by more than 60°' if frame in self._extrinsics.steep else 'neither is known'
+            )
             self.get_logger().warning(
                 f'no pose on the robot for sensor {frame}: set sensors.{frame}.pose: [x, y, yaw], or publish the '
-                f'transform from {placer.base_frame or "the base frame"}; {why}; its readings are rejected'
+                f'transform from {associator.base_frame or "the base frame"}; {why}; its readings are rejected'
             )
         extra = (
             {'odometry without a transform to map_frame': self._map_frame.dropped} if self._map_frame.dropped else {}
         )
         statuses = self._health.statuses(
             self.get_fully_qualified_name().lstrip('/'),
-            placer,
+            associator,
             self._em.current,
             self._last_run,
             self._live.grid,
@@ -430,5 +432,5 @@ class MapperNode(Node):
         )
         diagnostics.add_faults(statuses[0], self._surroundings.faults())
         statuses += self._journal.statuses(self.get_fully_qualified_name().lstrip('/'))
-        statuses.append(self._sensors.status(self.get_fully_qualified_name().lstrip('/'), placer.readings))
+        statuses.append(self._sensors.status(self.get_fully_qualified_name().lstrip('/'), associator.readings))
         self._diagnostics_out.publish(diagnostics.array(statuses, self.get_clock().now().to_msg()))

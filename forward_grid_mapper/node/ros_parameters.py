@@ -57,7 +57,7 @@ def declare(node: Node) -> tuple[Parameters, dict[str, Pose2], list[str]]:
         values[row.name] = value
         stored = list(value) if isinstance(value, tuple) else value
         node.declare_parameter(row.name, stored, descriptor(row), ignore_override=True)
-    return Parameters.from_flat(values), _mounts(given), _strangers(given)
+    return Parameters.from_flat(values), _extrinsics(given), _strangers(given)
 
 
 def validator(current: Callable[[], Parameters], accept: Callable[[Parameters], None]) -> Callable[[Any], Any]:
@@ -85,16 +85,16 @@ def validator(current: Callable[[], Parameters], accept: Callable[[Parameters], 
     return check
 
 
-def _mounts(given: dict[str, RosParameter]) -> dict[str, Pose2]:
-    mounts = {}
+def _extrinsics(given: dict[str, RosParameter]) -> dict[str, Pose2]:
+    extrinsics = {}
     for name, parameter in given.items():
         if name.startswith('sensors.') and name.endswith('.pose'):
             value = parameter.value
             numbers = list(value) if isinstance(value, (list, tuple)) or hasattr(value, 'typecode') else []
             if len(numbers) != 3 or not all(isinstance(v, (int, float)) and math.isfinite(v) for v in numbers):
                 raise ParameterError(f'{name}: {value!r} is not [x, y, yaw], three finite numbers (metres, radians)')
-            mounts[name[len('sensors.') : -len('.pose')]] = Pose2(*(float(v) for v in numbers))
-    return mounts
+            extrinsics[name[len('sensors.') : -len('.pose')]] = Pose2(*(float(v) for v in numbers))
+    return extrinsics
 
 
 def _strangers(given: dict[str, RosParameter]) -> list[str]:

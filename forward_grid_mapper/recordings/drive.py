@@ -9,30 +9,30 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.common.parameters import Parameters
-from ..core.maps.log_odds_map import LiveMap
+from ..core.maps.log_odds_map import LogOddsMap
 from ..core.maps.map_set import MapSet
-from ..core.messages.pose_association import Placer
+from ..core.messages.pose_association import PoseAssociator
 from ..files.quality_warning import thinned
 
 
-class LiveOfAll:
+class LogOddsMapOfAll:
     """The live map of all readings of a drive, where `max_readings` lets EM have only some.
 
     It costs nothing where no reading goes, since EM's result has the same live map then.
     """
 
-    def __init__(self, placer: Placer, parameters: Parameters) -> None:
-        self._placer, self._live = placer, LiveMap(parameters)
+    def __init__(self, associator: PoseAssociator, parameters: Parameters) -> None:
+        self._associator, self._live = associator, LogOddsMap(parameters)
         self._count = 0
-        placer.buffer.before_thinning.append(self._look)
+        associator.buffer.before_thinning.append(self._look)
 
     def _look(self) -> None:
-        self._live.add(self._placer.buffer.snapshot(self._count))
-        self._count = len(self._placer.buffer)
+        self._live.add(self._associator.buffer.snapshot(self._count))
+        self._count = len(self._associator.buffer)
 
     def on(self, maps: MapSet) -> MapSet:
         """Return the maps with the live map of all readings."""
-        if len(maps.readings) == len(self._placer.buffer):
+        if len(maps.readings) == len(self._associator.buffer):
             return maps
         self._look()
         return maps.with_live(self._live.grid, self._live.probability())
@@ -44,24 +44,24 @@ class Drive:
 
     Attributes
     ----------
-    placer : Placer
+    associator : PoseAssociator
         With all readings placed.
     source : dict
         What was read and rejected, for the report.
-    live : LiveOfAll
+    live : LogOddsMapOfAll
     """
 
-    placer: Placer
+    associator: PoseAssociator
     source: dict[str, Any]
-    live: LiveOfAll
+    live: LogOddsMapOfAll
 
     @property
     def path_xy(self) -> NDArray[np.float64]:
         """Where the robot drove, shape (P, 2), metres."""
-        return np.array(self.placer.path, np.float64).reshape(-1, 2)
+        return np.array(self.associator.path, np.float64).reshape(-1, 2)
 
 
-def thinning_note(placer: Placer) -> list[str]:
+def thinning_note(associator: PoseAssociator) -> list[str]:
     """Return what is to be told where `max_readings` lets EM have only some of the readings."""
-    count = len(placer.buffer)
-    return list(filter(None, [thinned(min(count, placer.parameters.max_readings or count), count)]))
+    count = len(associator.buffer)
+    return list(filter(None, [thinned(min(count, associator.parameters.max_readings or count), count)]))

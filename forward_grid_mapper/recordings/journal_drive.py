@@ -6,19 +6,19 @@ import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from ..commands.console import readable
 from ..core.common.errors import InputError, ParameterError
 from ..core.common.parameters import Parameters
 from ..core.messages.message_types import NANOSECONDS, Pose2
-from ..core.messages.pose_association import Placer
+from ..core.messages.pose_association import PoseAssociator
 from ..files.journal_format import Contents, read
-from .drive import Drive, LiveOfAll, thinning_note
+from ..files.output_folder import readable
+from .drive import Drive, LogOddsMapOfAll, thinning_note
 
 
 def read_journal(
     path: Path,
     parameters: Parameters,
-    mounts: Mapping[str, Pose2],
+    extrinsics: Mapping[str, Pose2],
     range_topics: Sequence[str] | None = None,
     odom_topic: str | None = None,
 ) -> Drive:
@@ -35,32 +35,32 @@ def read_journal(
     """
     if range_topics or odom_topic:
         raise ParameterError(f'{path} is a journal, which has no topics; leave out --range-topics and --odom-topic')
-    placer = Placer(lambda base, frame, stamp: None, parameters, patient=True)
-    live = LiveOfAll(placer, parameters)
+    associator = PoseAssociator(lambda base, frame, stamp: None, parameters, patient=True)
+    live = LogOddsMapOfAll(associator, parameters)
     contents = Contents()
     first, last, names = math.inf, -math.inf, set()
     for readings in read(path, contents):
-        placer.restore(readings)
+        associator.restore(readings)
         first, last = min(first, int(readings.stamp.min())), max(last, int(readings.stamp.max()))
         names |= set(readings.sensor_names)
-    if not len(placer.buffer):
+    if not len(associator.buffer):
         raise InputError(f'the journal {path} holds no reading{f": {contents.harm}" if contents.harm else ""}')
-    placer.map_frame, placer.base_frame = contents.map_frame, contents.base_frame
+    associator.map_frame, associator.base_frame = contents.map_frame, contents.base_frame
     for point in contents.path:
-        placer.extend_path(point)
+        associator.extend_path(point)
     warnings = [f'{path.name}: {contents.harm}'] if contents.harm else []
-    if mounts:
+    if extrinsics:
         warnings.append('a journal holds placed readings: the poses of sensors that were given change nothing')
     source = {
         'bag': readable(path),
-        'odom_frame': placer.map_frame,
-        'map_frame': placer.map_frame,
-        'base_frame': placer.base_frame,
+        'odom_frame': associator.map_frame,
+        'map_frame': associator.map_frame,
+        'base_frame': associator.base_frame,
         'mounts_from': 'the journal',
         'stamps': [int(first), int(last)],
         'duration_s': (last - first) / NANOSECONDS,
-        'path_m': sum(math.dist(a, b) for a, b in zip(placer.path, placer.path[1:], strict=False)),
-        'counts': {'received': placer.received, 'accepted': len(placer.buffer), 'rejected': {}},
-        'warnings': warnings + thinning_note(placer),
+        'path_m': sum(math.dist(a, b) for a, b in zip(associator.path, associator.path[1:], strict=False)),
+        'counts': {'received': associator.received, 'accepted': len(associator.buffer), 'rejected': {}},
+        'warnings': warnings + thinning_note(associator),
     }
-    return Drive(placer, source, live)
+    return Drive(associator, source, live)

@@ -8,20 +8,20 @@ from pathlib import Path
 
 from ..bags.reader import Bag
 from ..bags.static_transforms import StaticTransforms
-from ..commands.console import readable
 from ..core.common.errors import BagError, InputError
 from ..core.common.parameters import Parameters
 from ..core.messages.message_types import NANOSECONDS, Pose2, RangeMessage
-from ..core.messages.pose_association import Placer
+from ..core.messages.pose_association import PoseAssociator
 from ..core.messages.rep117 import ODOMETRY_REASONS, REASONS
 from ..files.journal import drive_file
-from .drive import Drive, LiveOfAll, thinning_note
+from ..files.output_folder import readable
+from .drive import Drive, LogOddsMapOfAll, thinning_note
 from .journal_drive import read_journal
 
-__all__ = ['Drive', 'Mounts', 'read_drive']
+__all__ = ['Drive', 'Extrinsics', 'read_drive']
 
 
-class Mounts:
+class Extrinsics:
     """Where the sensors sit: given by the user, who wins, or by the bag's static transforms."""
 
     def __init__(self, given: Mapping[str, Pose2], transforms: StaticTransforms) -> None:
@@ -71,7 +71,7 @@ class Mounts:
 def read_drive(
     path: Path | str,
     parameters: Parameters,
-    mounts: Mapping[str, Pose2],
+    extrinsics: Mapping[str, Pose2],
     range_topics: Sequence[str] | None = None,
     odom_topic: str | None = None,
     progress: Callable[[int, int], None] | None = None,
@@ -82,7 +82,7 @@ def read_drive(
     ----------
     path : Path or str
     parameters : Parameters
-    mounts : mapping
+    extrinsics : mapping
         Poses of sensors in the robot's base frame that win over the bag's `/tf_static`.
     range_topics, odom_topic
         Topics to use; by default those found by type.
@@ -98,12 +98,12 @@ def read_drive(
     """
     journal = drive_file(Path(path))
     if journal is not None:
-        return read_journal(journal, parameters, mounts, range_topics, odom_topic)
+        return read_journal(journal, parameters, extrinsics, range_topics, odom_topic)
     with Bag(path) as bag:
         topics = bag.choose_topics(range_topics, odom_topic)
-        lookup = Mounts(mounts, bag.static_transforms())
-        placer = Placer(lookup, parameters, patient=True)
-        live = LiveOfAll(placer, parameters)
+        lookup = Extrinsics(extrinsics, bag.static_transforms())
+        associator = PoseAssociator(lookup, parameters, patient=True)
+        live = LogOddsMapOfAll(associator, parameters)
         spans: dict[str, list[int]] = {'ranges': [], 'odometry': []}
         for message in bag.messages(topics, progress):
             ranged = isinstance(message, RangeMessage)
@@ -112,66 +112,68 @@ def read_drive(
                 span += [message.stamp, message.stamp]
             span[:] = min(span[0], message.stamp), max(span[1], message.stamp)
             if isinstance(message, RangeMessage):
-                placer.add_range(message)
+                associator.add_range(message)
             else:
-                placer.add_odometry(message)
-        placer.finish()
+                associator.add_odometry(message)
+        associator.finish()
         undecodable = dict(bag.undecodable)
-        warnings = _warnings(bag, placer, lookup)
-    if not len(placer.buffer):
-        raise _nothing_placed(placer, lookup, spans, undecodable)
-    stamps = placer.readings.stamp
+        warnings = _warnings(bag, associator, lookup)
+    if not len(associator.buffer):
+        raise _nothing_placed(associator, lookup, spans, undecodable)
+    stamps = associator.readings.stamp
     source = {
         'bag': readable(path),
         'range_topics': list(topics.range_topics),
         'odom_topic': topics.odom_topic,
-        'odom_frame': placer.map_frame,
-        'map_frame': placer.map_frame,
-        'base_frame': placer.base_frame,
+        'odom_frame': associator.map_frame,
+        'map_frame': associator.map_frame,
+        'base_frame': associator.base_frame,
         'mounts_from': ' and '.join(sorted(set(lookup.used.values()))),
         'stamps': [int(stamps.min()), int(stamps.max())],
         'duration_s': float(stamps.max() - stamps.min()) / NANOSECONDS,
-        'path_m': sum(math.dist(a, b) for a, b in zip(placer.path, placer.path[1:], strict=False)),
+        'path_m': sum(math.dist(a, b) for a, b in zip(associator.path, associator.path[1:], strict=False)),
         'counts': {
-            'received': placer.received,
-            'accepted': len(placer.buffer),
-            'rejected': dict(placer.rejected),
-            'odometry_received': placer.odometry_received,
-            'odometry_rejected': dict(placer.odometry_rejected),
+            'received': associator.received,
+            'accepted': len(associator.buffer),
+            'rejected': dict(associator.rejected),
+            'odometry_received': associator.odometry_received,
+            'odometry_rejected': dict(associator.odometry_rejected),
             'undecodable': undecodable,
         },
-        'rejected_by_frame': {frame: dict(counts) for frame, counts in placer.rejected_by_frame.items()},
-        'warnings': warnings + thinning_note(placer),
+        'rejected_by_frame': {frame: dict(counts) for frame, counts in associator.rejected_by_frame.items()},
+        'warnings': warnings + thinning_note(associator),
     }
-    return Drive(placer, source, live)
+    return Drive(associator, source, live)
 
 
-def _warnings(bag: Bag, placer: Placer, lookup: Mounts) -> list[str]:
+def _warnings(bag: Bag, associator: PoseAssociator, lookup: Extrinsics) -> list[str]:
     warnings = []
     if bag.truncated:
         warnings.append(bag.truncated)
     for topic, count in bag.undecodable.items():
         warnings.append(f'{count} messages on {topic} do not fit their type and were skipped')
-    if placer.unknown_frames:
-        warnings.append(lookup.explain(placer.base_frame, sorted(placer.unknown_frames)))
+    if associator.unknown_frames:
+        warnings.append(lookup.explain(associator.base_frame, sorted(associator.unknown_frames)))
     if unused := lookup.unused:
         warnings.append(
             f'poses were given for {", ".join(unused)}, but no reading has such a frame; is the name right?'
         )
-    if placer.time_jumps:
-        warnings.append(f"odometry's clock jumped back {placer.time_jumps} times; what waited for a pose was dropped")
-    for reason, count in placer.odometry_rejected.items():
+    if associator.time_jumps:
         warnings.append(
-            f'{count} of {placer.odometry_received} odometry messages were rejected: {ODOMETRY_REASONS[reason]}'
+            f"odometry's clock jumped back {associator.time_jumps} times; what waited for a pose was dropped"
         )
-    for reason, count in placer.rejected.items():
-        if count > 0.2 * placer.received and reason != 'unknown_mount':
-            warnings.append(f'{count} of {placer.received} readings were rejected as {reason}: {REASONS[reason]}')
+    for reason, count in associator.odometry_rejected.items():
+        warnings.append(
+            f'{count} of {associator.odometry_received} odometry messages were rejected: {ODOMETRY_REASONS[reason]}'
+        )
+    for reason, count in associator.rejected.items():
+        if count > 0.2 * associator.received and reason != 'unknown_extrinsics':
+            warnings.append(f'{count} of {associator.received} readings were rejected as {reason}: {REASONS[reason]}')
     return warnings
 
 
 def _nothing_placed(
-    placer: Placer, lookup: Mounts, spans: Mapping[str, Sequence[int]], undecodable: Mapping[str, int]
+    associator: PoseAssociator, lookup: Extrinsics, spans: Mapping[str, Sequence[int]], undecodable: Mapping[str, int]
 ) -> Exception:
     """Return the error that says why no reading could be placed, and what to do."""
     ranges, odometry = spans['ranges'], spans['odometry']
@@ -179,15 +181,15 @@ def _nothing_placed(
     if not ranges or not odometry:
         kind = 'Range' if not ranges else 'Odometry'
         return BagError(f'the chosen topics hold no readable {kind} message{f" ({lost})" if lost else ""}')
-    if set(placer.rejected) == {'unknown_mount'}:
-        return InputError(lookup.explain(placer.base_frame, sorted(placer.unknown_frames)))
+    if set(associator.rejected) == {'unknown_extrinsics'}:
+        return InputError(lookup.explain(associator.base_frame, sorted(associator.unknown_frames)))
     if ranges[1] < odometry[0] or ranges[0] > odometry[1]:
         a, b, c, d = (stamp / NANOSECONDS for stamp in (*ranges, *odometry))
         return InputError(
             f'the stamps do not overlap: Range has {a:.3f} … {b:.3f} s, odometry {c:.3f} … {d:.3f} s; '
             f'are the drivers set to the same clock (use_sim_time)?'
         )
-    reasons = '; '.join(f'{count} {reason} ({REASONS[reason]})' for reason, count in placer.rejected.most_common())
-    for reason, count in placer.odometry_rejected.most_common():
+    reasons = '; '.join(f'{count} {reason} ({REASONS[reason]})' for reason, count in associator.rejected.most_common())
+    for reason, count in associator.odometry_rejected.most_common():
         reasons += f'; {count} odometry messages were rejected too: {ODOMETRY_REASONS[reason]}'
-    return InputError(f'all {placer.received} readings were rejected: {reasons}')
+    return InputError(f'all {associator.received} readings were rejected: {reasons}')

@@ -31,12 +31,12 @@ class Recording:
     Attributes
     ----------
     world : World
-    mounts : tuple of (str, Pose2)
+    extrinsics : tuple of (str, Pose2)
         Frame and pose in `BASE_FRAME` of each sonar.
     odometry : list of OdometryMessage
         In order of time; one at each sweep, so interpolation is exact as well.
     ranges : list of RangeMessage
-        Sweep by sweep, in the order of `mounts`; the sonars of a sweep fire at the same time.
+        Sweep by sweep, in the order of `extrinsics`; the sonars of a sweep fire at the same time.
     readings : Readings
         The same measurements, in the same order, with the exact poses of the sonars.
     robot : float64, shape (T, 3)
@@ -44,7 +44,7 @@ class Recording:
     """
 
     world: World
-    mounts: tuple[tuple[str, Pose2], ...]
+    extrinsics: tuple[tuple[str, Pose2], ...]
     odometry: list[OdometryMessage]
     ranges: list[RangeMessage]
     readings: Readings
@@ -103,7 +103,7 @@ def drive_sweeps(
     stamps = START + ticks
     return Recording(
         world,
-        sonars.mounts,
+        sonars.extrinsics,
         _odometry(trajectory, ticks),
         _range_messages(sonars, stamps, ranges),
         _readings(sonars, stamps, robot, ranges),

@@ -56,7 +56,7 @@ class SonarArray:
         return tuple(f'sonar_{k:02d}' for k in range(len(self.yaws)))
 
     @property
-    def mounts(self) -> tuple[tuple[str, Pose2], ...]:
+    def extrinsics(self) -> tuple[tuple[str, Pose2], ...]:
         """Frame and pose in base_link of each sonar."""
         poses = (Pose2(self.radius * math.cos(yaw), self.radius * math.sin(yaw), yaw) for yaw in self.yaws)
         return tuple(zip(self.names, poses, strict=True))
@@ -73,11 +73,11 @@ class SonarArray:
         -------
         float64, shape (T, n, 3)
         """
-        mount = np.array([pose for _, pose in self.mounts])
+        extrinsic = np.array([pose for _, pose in self.extrinsics])
         cos, sin = np.cos(robot[:, 2:]), np.sin(robot[:, 2:])
-        x = robot[:, :1] + cos * mount[:, 0] - sin * mount[:, 1]
-        y = robot[:, 1:2] + sin * mount[:, 0] + cos * mount[:, 1]
-        return np.stack([x, y, robot[:, 2:] + mount[:, 2]], axis=2)
+        x = robot[:, :1] + cos * extrinsic[:, 0] - sin * extrinsic[:, 1]
+        y = robot[:, 1:2] + sin * extrinsic[:, 0] + cos * extrinsic[:, 1]
+        return np.stack([x, y, robot[:, 2:] + extrinsic[:, 2]], axis=2)
 
 
 def sonar_ring(

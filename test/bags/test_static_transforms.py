@@ -1,4 +1,4 @@
-"""Sensor mounts from a tree of fixed transforms."""
+"""Sensor extrinsics from a tree of fixed transforms."""
 
 from __future__ import annotations
 

@@ -27,7 +27,7 @@ Message = OdometryMessage | RangeMessage
 class Tape(NamedTuple):
     """What a bag is written from."""
 
-    mounts: tuple[tuple[str, Pose2], ...]
+    extrinsics: tuple[tuple[str, Pose2], ...]
     odometry: list[OdometryMessage]
     ranges: list[RangeMessage]
 
@@ -54,7 +54,7 @@ def tape() -> Tape:
         )
         for m in recording.ranges
     ]
-    return Tape(recording.mounts, recording.odometry, exact)
+    return Tape(recording.extrinsics, recording.odometry, exact)
 
 
 def in_turn(drive: Tape) -> list[tuple[int, Message]]:
@@ -74,8 +74,8 @@ def write_tape(
 ) -> Path:
     """Write a bag of `logged` messages, by default all of the drive in turn; return its path."""
     with writer(path, kind) as bag:
-        if drive.mounts:
-            bag.write_static_transforms([(BASE_FRAME, frame, pose) for frame, pose in drive.mounts], START)
+        if drive.extrinsics:
+            bag.write_static_transforms([(BASE_FRAME, frame, pose) for frame, pose in drive.extrinsics], START)
         for time, message in in_turn(drive) if logged is None else logged:
             if isinstance(message, OdometryMessage):
                 bag.write_odometry(odometry_topic(message), message, time)

@@ -32,7 +32,7 @@ from forward_grid_mapper.core.messages.message_types import Pose2
 from forward_grid_mapper.files import drawing
 from forward_grid_mapper.recordings.read_drive import read_drive
 
-FRAMES = [frame for frame, _ in tape().mounts]
+FRAMES = [frame for frame, _ in tape().extrinsics]
 COUNT = len(tape().ranges)
 
 
@@ -145,7 +145,7 @@ def test_topics_that_are_not_there(
 
 
 def test_no_frame_has_a_pose(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    said = refused_drive(capsys, tmp_path, tape()._replace(mounts=()))
+    said = refused_drive(capsys, tmp_path, tape()._replace(extrinsics=()))
     assert all(frame in said for frame in FRAMES)
     assert 'no /tf_static' in said and f'--sensor {FRAMES[0]}=x,y,yaw' in said and f'sensors.{FRAMES[0]}.pose' in said
 
@@ -156,10 +156,10 @@ def test_frames_that_do_not_join_the_robot(tmp_path: Path, capsys: pytest.Captur
 
 
 def test_one_frame_without_a_pose_costs_only_its_readings(tmp_path: Path) -> None:
-    bag = write_tape(tmp_path / 'bag', tape()._replace(mounts=tape().mounts[1:]))
+    bag = write_tape(tmp_path / 'bag', tape()._replace(extrinsics=tape().extrinsics[1:]))
     report = mapped(bag, tmp_path / 'maps')
-    assert report['counts']['rejected'] == {'unknown_mount': COUNT // len(FRAMES)}
-    assert report['input']['rejected_by_frame'] == {FRAMES[0]: {'unknown_mount': COUNT // len(FRAMES)}}
+    assert report['counts']['rejected'] == {'unknown_extrinsics': COUNT // len(FRAMES)}
+    assert report['input']['rejected_by_frame'] == {FRAMES[0]: {'unknown_extrinsics': COUNT // len(FRAMES)}}
     (warning,) = report['warnings']
     assert f'--sensor {FRAMES[0]}=x,y,yaw' in warning and FRAMES[1] not in warning.partition(':')[0]
     write_tape(tmp_path / 'rest', tape().of(*FRAMES[1:]))
@@ -273,7 +273,7 @@ def test_the_order_of_logging_does_not_matter(tmp_path: Path, late: type[Message
         bag = write_tape(tmp_path / name, turning(), logged=logged)
         drive = read_drive(bag, Parameters(), {})
         assert not drive.source['warnings']
-        placed.append(in_canonical_order(drive.placer.readings))
+        placed.append(in_canonical_order(drive.associator.readings))
     assert len(placed[0]) == len(placed[1]) == COUNT
     for column in ('stamp', 'x', 'y', 'yaw', 'z'):
         assert getattr(placed[0], column).tolist() == getattr(placed[1], column).tolist(), column

@@ -16,8 +16,9 @@ from drive_samples import FILES, tape, write_tape
 from forward_grid_mapper import __version__
 from forward_grid_mapper.__main__ import COMMANDS
 from forward_grid_mapper.commands import console, process_bag
-from forward_grid_mapper.commands.console import Ticker, readable
+from forward_grid_mapper.commands.console import Ticker
 from forward_grid_mapper.core.search.search import Progress
+from forward_grid_mapper.files.output_folder import readable
 
 MODULE = [sys.executable, '-m', 'forward_grid_mapper']
 

@@ -48,7 +48,7 @@ def test_the_file_is_what_process_bag_takes(
 ) -> None:
     monkeypatch.setattr(drawing, 'draw', lambda path, picture: path.write_bytes(b''))
     given = tmp_path / 'given.yaml'
-    frame, pose = tape().mounts[0]
+    frame, pose = tape().extrinsics[0]
     given.write_text(
         yaml.safe_dump(
             {
@@ -67,9 +67,9 @@ def test_the_file_is_what_process_bag_takes(
     options = ('--rounds', 1, '--params', given, '--set', 'p_rand=0.3', '--sensor', 'other=1,2,90deg')
     text = said(capsys, bag, '-o', output, *options)
     assert str(output) in text
-    values, mounts, node = load_parameters(output)
+    values, extrinsics, node = load_parameters(output)
     assert node == {'use_sim_time': True}
-    assert set(mounts) == {frame, 'other'} and mounts[frame] == pytest.approx(pose)
+    assert set(extrinsics) == {frame, 'other'} and extrinsics[frame] == pytest.approx(pose)
     parameters = Parameters.from_flat(values)
     assert parameters.search.prior == 0.3 and parameters.node.range_topics == ('a', 'b')
     assert parameters.model.p_rand != 0.3

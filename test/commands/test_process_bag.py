@@ -17,14 +17,14 @@ from forward_grid_mapper.commands import process_bag, simulate
 from forward_grid_mapper.core.common.parameters import TABLE, Parameters
 from forward_grid_mapper.core.mapping import Mapper
 from forward_grid_mapper.core.messages.message_types import Pose2
-from forward_grid_mapper.core.messages.pose_association import Placer
+from forward_grid_mapper.core.messages.pose_association import PoseAssociator
 from forward_grid_mapper.files import drawing
 from forward_grid_mapper.files.map_archive import read_npz
 from forward_grid_mapper.files.map_files import occupancy_values, read_map
 from forward_grid_mapper.simulation.drive import door_drive
 from forward_grid_mapper.simulation.sonar import NOISY, front_array
 
-FRAMES = [frame for frame, _ in tape().mounts]
+FRAMES = [frame for frame, _ in tape().extrinsics]
 DRIVE = ('door', '--seen', 1, '--sonars', 'front', '-q')
 
 
@@ -43,16 +43,16 @@ def plain(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def readings_placed(drive: Tape) -> Placer:
+def readings_placed(drive: Tape) -> PoseAssociator:
     """The drive's messages placed without any bag."""
-    mounts = dict(drive.mounts)
-    placer = Placer(lambda base, frame, stamp: mounts[frame], patient=True)
+    extrinsics = dict(drive.extrinsics)
+    associator = PoseAssociator(lambda base, frame, stamp: extrinsics[frame], patient=True)
     for message in drive.odometry:
-        placer.add_odometry(message)
+        associator.add_odometry(message)
     for message in drive.ranges:
-        placer.add_range(message)
-    placer.finish()
-    return placer
+        associator.add_range(message)
+    associator.finish()
+    return associator
 
 
 # ---- what a drive can be recorded as
@@ -259,10 +259,10 @@ def test_a_search_cut_short_says_so(tmp_path: Path, plain: Path, capsys: pytest.
 
 
 def test_sensor_wins_over_file_and_transforms(tmp_path: Path, plain: Path) -> None:
-    wrong = tuple((frame, Pose2(1.0, 2.0, 3.0)) for frame, _ in tape().mounts)
-    bag = write_tape(tmp_path / 'bag', tape()._replace(mounts=wrong))
-    given = {frame: list(pose) for frame, pose in tape().mounts}
-    sensors = [f'--sensor={frame}={x!r},{y!r},{yaw!r}' for frame, (x, y, yaw) in tape().mounts]
+    wrong = tuple((frame, Pose2(1.0, 2.0, 3.0)) for frame, _ in tape().extrinsics)
+    bag = write_tape(tmp_path / 'bag', tape()._replace(extrinsics=wrong))
+    given = {frame: list(pose) for frame, pose in tape().extrinsics}
+    sensors = [f'--sensor={frame}={x!r},{y!r},{yaw!r}' for frame, (x, y, yaw) in tape().extrinsics]
     right, mixed = tmp_path / 'right.yaml', tmp_path / 'mixed.yaml'
     right.write_text(yaml.safe_dump({'sensors': {frame: {'pose': pose} for frame, pose in given.items()}}))
     mixed.write_text(yaml.safe_dump({f'sensors.{frame}.pose': [0.0, 0.0, 0.0] for frame in FRAMES}))
@@ -279,7 +279,7 @@ def test_sensor_wins_over_file_and_transforms(tmp_path: Path, plain: Path) -> No
 
 
 def test_degrees_and_slashes_in_a_sensor(tmp_path: Path) -> None:
-    bag = write_tape(tmp_path / 'bag', tape().of(FRAMES[0])._replace(mounts=()))
+    bag = write_tape(tmp_path / 'bag', tape().of(FRAMES[0])._replace(extrinsics=()))
     mapped(bag, tmp_path / 'a', f'--sensor=/{FRAMES[0]}=0.1,-0.2,90deg')
     mapped(bag, tmp_path / 'b', '--sensor', f'{FRAMES[0]}=0.1,-0.2,{np.pi / 2!r}')
     assert_same_maps(tmp_path / 'a', tmp_path / 'b')

@@ -28,7 +28,7 @@ def test_the_recording(tmp_path: Path, kind: str, name: str, capsys: pytest.Capt
     with Bag(folder / name) as bag:
         assert list(bag.messages(bag.choose_topics())) == [message for _, message in in_turn(tape())]
         transforms = bag.static_transforms()
-    for frame, pose in tape().mounts:
+    for frame, pose in tape().extrinsics:
         assert transforms.lookup('base_link', frame) == pytest.approx(pose)
     grid, cells = read_map(folder / 'reference.yaml')
     world = door_world()

@@ -16,7 +16,7 @@ from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.common.readings import Readings
 from forward_grid_mapper.core.mapping import Mapper
 from forward_grid_mapper.core.maps.map_set import MapSet
-from forward_grid_mapper.core.maps.traversed import driven_cells
+from forward_grid_mapper.core.maps.traversed import traversed_cells
 from forward_grid_mapper.core.search.prior import Prior, local_prior, shapes
 from forward_grid_mapper.core.search.search import ROUNDING
 from forward_grid_mapper.core.sensor.forward_model import expectations, log_likelihood
@@ -101,8 +101,8 @@ def test_with_all_that_makes_maps_better_they_still_know_the_same_grid(values: d
     maps, plain = run(some(), **values), run(some(), **PLAIN)
     assert maps.live.shape == maps.ml.shape == maps.uncertainty.shape == maps.grid.shape
     said = ~np.isnan(maps.uncertainty)
-    driven = driven_cells(maps.readings, maps.grid) & (maps.parameters.search.driven_cost > 0)
-    assert not (said & (plain.ml == -1) & ~driven).any(), 'what nobody saw is unknown'
+    traversed = traversed_cells(maps.readings, maps.grid) & (maps.parameters.search.driven_cost > 0)
+    assert not (said & (plain.ml == -1) & ~traversed).any(), 'what nobody saw is unknown'
     assert not (maps.ml[~said] != -1).any(), 'and so is what the readings say nothing about'
     assert (maps.ml[said] == -1).any(), 'of what was seen, but not gone through, they may say something'
     assert ((plain.ml != -1) & ~said).any()
@@ -135,12 +135,12 @@ def test_the_objective_is_the_likelihood_and_the_prior_of_the_map_that_was_found
     maps = run(some(), **whole)
     likelihood = log_likelihood(maps.readings, maps.grid, maps.ml, maps.parameters.model)
     assert maps.log_likelihood == pytest.approx(likelihood, abs=ROUNDING * len(maps.readings))
-    driven = driven_cells(maps.readings, maps.grid)
+    traversed = traversed_cells(maps.readings, maps.grid)
     search = maps.parameters.search
-    prior = Prior(local_prior(search, driven & (driven_cost > 0)).ravel(), shapes(search))
+    prior = Prior(local_prior(search, traversed & (driven_cost > 0)).ravel(), shapes(search))
     told = naive.log_prior(prior, maps.ml == 1, maps.grid.shape)
     assert maps.objective - maps.log_likelihood == pytest.approx(told, abs=1e-9)
-    assert (maps.ml == 1)[driven].any() == (driven_cost == 0.0)
+    assert (maps.ml == 1)[traversed].any() == (driven_cost == 0.0)
 
 
 @pytest.mark.parametrize('seed', range(3))

@@ -82,7 +82,7 @@ def test_a_grid_that_grows_in_the_middle_loses_nothing() -> None:
     online = in_sweeps(near, Parameters())
     grid, before = online.maps()[:2]
     room = online._evidence.grid
-    driven = online._driven.copy()
+    traversed = online._traversed.copy()
     online.add(away)
     larger, ml = online.maps()[:2]
     assert online._evidence.grid.size > room.size
@@ -90,7 +90,7 @@ def test_a_grid_that_grows_in_the_middle_loses_nothing() -> None:
     assert np.array_equal(part_of(larger, ml, grid), before)
     assert (ml == 1).sum() > (before == 1).sum()
     assert len(online) == len(near) + len(away)
-    assert online._driven[online._evidence.grid.window(room)][driven].all()
+    assert online._traversed[online._evidence.grid.window(room)][traversed].all()
     assert consistent(online)
     again = in_sweeps(near, Parameters())
     assert again._evidence.grid == room
@@ -107,7 +107,7 @@ def test_readings_that_say_the_same_add_weight_and_nothing_else(values: dict[str
     assert len(online) == count
     assert online._evidence.nbytes == taken
     evidence = online._evidence
-    weight = evidence.state.shares['weight'][:count]
+    weight = evidence.state.reading_states['weight'][:count]
     assert weight.sum() == 4 * len(readings)
     # as if each kept reading had come so many times
     often = Evidence(evidence.grid, evidence.model, start=evidence.state.maps.occupied.reshape(evidence.grid.shape))
@@ -215,13 +215,13 @@ def test_a_jump_is_not_driven_over() -> None:
     online = OnlineMap(Parameters())
     for k in range(2):
         online.add(readings.select(slice(k, k + 1)))
-    assert online._driven.sum() == 2
+    assert online._traversed.sum() == 2
     # the second drives on
     near = dataclasses.replace(readings.select(slice(1, 2)), x=np.array([12.5]), stamp=np.array([2 * 10**8]))
     online.add(near)
-    assert online._driven.sum() == 7
+    assert online._traversed.sum() == 7
     local = online._prior.local.reshape(online._evidence.grid.shape)
-    assert np.array_equal(local < local.max(), online._driven)
+    assert np.array_equal(local < local.max(), online._traversed)
 
 
 def test_a_reading_too_far_away_is_refused_and_changes_nothing() -> None:
@@ -271,6 +271,6 @@ def test_readings_that_say_the_same_may_come_in_one_call() -> None:
     apart.add(readings)
     assert len(together) == len(apart) == kept
     states = [online._evidence.state for online in (together, apart) if online._evidence is not None]
-    weights = [state.shares['weight'][:kept].tolist() for state in states]
+    weights = [state.reading_states['weight'][:kept].tolist() for state in states]
     assert weights[0] == weights[1]
     assert sum(weights[0]) == len(twice)

@@ -20,10 +20,10 @@ from forward_grid_mapper.core.evidence.evidence import Evidence
 from forward_grid_mapper.core.evidence.fixed_point import QUANTUM
 from forward_grid_mapper.core.learning.model_update import learn
 from forward_grid_mapper.core.mapping import Mapper
-from forward_grid_mapper.core.maps.log_odds_map import LiveMap
+from forward_grid_mapper.core.maps.log_odds_map import LogOddsMap
 from forward_grid_mapper.core.maps.uncertainty import marginals
+from forward_grid_mapper.core.search.flips import flip_in_order
 from forward_grid_mapper.core.search.flips import gain_of as gain_of_flip
-from forward_grid_mapper.core.search.moves import flip_in_order
 from forward_grid_mapper.core.search.prior import Prior
 from forward_grid_mapper.core.search.search import LEAST, Search
 from forward_grid_mapper.core.sensor.cone_table import effective_sigma
@@ -108,7 +108,7 @@ def terms(readings: Readings, t: int, grid: Grid, occupied: np.ndarray, model: M
 
 def test_one_reading_gives_back_its_inverse_model_and_not_eq_4_as_printed() -> None:
     values = {'resolution': 0.1, 'live_p_occupied': 0.8, 'live_p_free': 0.25, 'live_depth': 0.05}
-    live = LiveMap(Parameters.from_flat({**values, 'cell_distance': 'center'}))
+    live = LogOddsMap(Parameters.from_flat({**values, 'cell_distance': 'center'}))
     live.add(along(0.55))
     p, log_odds = live.probability(LINE)[0], live.log_odds(LINE)[0]
     assert p[2] == pytest.approx(0.25, abs=1e-5)
@@ -119,7 +119,7 @@ def test_one_reading_gives_back_its_inverse_model_and_not_eq_4_as_printed() -> N
 
 def test_readings_that_say_nothing_leave_the_standard_map_at_its_prior() -> None:
     silent = {'live_p_occupied': 0.5, 'live_p_free': 0.5, 'live_p_free_no_echo': 0.5}
-    live = LiveMap(Parameters.from_flat({'resolution': 0.1, **silent}))
+    live = LogOddsMap(Parameters.from_flat({'resolution': 0.1, **silent}))
     live.add(random_readings(np.random.default_rng(0), AREA, 50))
     p = live.probability()
     assert np.isfinite(p).sum() > 50
@@ -465,7 +465,7 @@ def test_walls_near_the_largest_range_are_no_lost_echoes() -> None:
 @pytest.mark.parametrize('seed', range(3))
 def test_the_tails_of_the_noise_cost_work_and_change_no_map(seed: int) -> None:
     readings = random_readings(np.random.default_rng(seed), AREA, 100)
-    pairs = [int(prepare(readings, AREA, model).state.shares['bands'].sum()) for model in (PAPER, WHOLE)]
+    pairs = [int(prepare(readings, AREA, model).state.reading_states['bands'].sum()) for model in (PAPER, WHOLE)]
     assert pairs[0] < 0.8 * pairs[1]
     assert found(readings, AREA, PAPER) == found(readings, AREA, WHOLE)
 

@@ -218,7 +218,7 @@ def test_npz_is_plain_numpy(tmp_path: Path) -> None:
             'live_map': ('f', maps.grid.shape),
             'ml_map': ('f', maps.grid.shape),
             'uncertainty_map': ('f', maps.grid.shape),
-            'transient': ('f', (0, 0)),
+            'dynamic': ('f', (0, 0)),
             'origin': ('f', (2,)),
             'resolution': ('f', ()),
             'log_likelihood': ('f', ()),

@@ -45,7 +45,7 @@ def test_dump_round_trip(tmp_path: Path, values: dict[str, Any]) -> None:
     parameters = Parameters.from_flat(values)
     read = load(tmp_path, dump_parameters(parameters))
     assert Parameters.from_flat(read.values) == parameters
-    assert not read.mounts and not read.node
+    assert not read.extrinsics and not read.node
 
 
 def test_dump_is_commented_and_plain_yaml() -> None:

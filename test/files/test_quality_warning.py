@@ -9,7 +9,7 @@ import numpy as np
 
 from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.mapping import Mapper
-from forward_grid_mapper.files.quality_warning import doubt
+from forward_grid_mapper.files.quality_warning import quality_warning
 from forward_grid_mapper.files.results import write_results
 from forward_grid_mapper.simulation.drive import door_drive
 
@@ -17,12 +17,12 @@ from forward_grid_mapper.simulation.drive import door_drive
 def test_readings_that_no_map_explains(tmp_path: Path) -> None:
     drive = door_drive(2).readings
     maps = Mapper(Parameters()).run(drive)
-    assert doubt(maps) == ''
+    assert quality_warning(maps) == ''
     rng = np.random.default_rng(1)
     # echoes from anywhere, taken from one place
     wild = dataclasses.replace(drive, x=0 * drive.x, y=0 * drive.y, z=rng.uniform(0.2, 1.0, len(drive)) * drive.z_max)
     wild = Mapper(Parameters()).run(wild)
-    told = doubt(wild)
+    told = quality_warning(wild)
     assert 'are the poses of the sensors' in told
     report = write_results(tmp_path / 'maps', wild, {}, np.zeros((0, 2)), 'wild')
     assert told in report['warnings']

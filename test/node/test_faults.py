@@ -148,7 +148,7 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
     """A file system of 400 kB."""
     folder = tmp_path / 'a small disk'
     folder.mkdir()
-    mounted = subprocess.run(['mount', '-t', 'tmpfs', '-o', 'size=400k', 'none', str(folder)], check=False)
+    mounted = subprocess.run(['extrinsic', '-t', 'tmpfs', '-o', 'size=400k', 'none', str(folder)], check=False)
     if mounted.returncode:
         pytest.skip('mounting needs root')
     yield folder

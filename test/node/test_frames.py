@@ -11,9 +11,9 @@ import pytest
 pytest.importorskip('rclpy', reason='stamps are asked for with rclpy')
 
 from forward_grid_mapper.core.messages.message_types import NANOSECONDS, OdometryMessage, Pose2, RangeMessage
-from forward_grid_mapper.core.messages.pose_association import LATER, Placer
+from forward_grid_mapper.core.messages.pose_association import LATER, PoseAssociator
 from forward_grid_mapper.node import frames
-from forward_grid_mapper.node.frames import MapFrame, Mounts, Transforms, planar
+from forward_grid_mapper.node.frames import Extrinsics, MapFrame, Transforms, planar
 
 
 class TransformError(Exception):
@@ -73,13 +73,13 @@ def transforms(buffer: Buffer) -> Transforms:
 
 def test_parameters_win_over_tf(buffer: Buffer, transforms: Transforms) -> None:
     buffer.known['base', 'sonar'] = transform(1.0, 2.0)
-    assert Mounts({}, transforms)('base', 'sonar', 0) == Pose2(1.0, 2.0, 0.0)
-    assert Mounts({'sonar': Pose2(3, 4, 5)}, transforms)('base', '/sonar', 0) == Pose2(3, 4, 5)
-    assert Mounts({}, transforms)('/base', '/sonar', 0) == Pose2(1.0, 2.0, 0.0)
+    assert Extrinsics({}, transforms)('base', 'sonar', 0) == Pose2(1.0, 2.0, 0.0)
+    assert Extrinsics({'sonar': Pose2(3, 4, 5)}, transforms)('base', '/sonar', 0) == Pose2(3, 4, 5)
+    assert Extrinsics({}, transforms)('/base', '/sonar', 0) == Pose2(1.0, 2.0, 0.0)
 
 
 def test_without_tf_an_unknown_frame_is_unknown_at_once() -> None:
-    assert Mounts({}, Transforms())('base', 'sonar', 0) is None
+    assert Extrinsics({}, Transforms())('base', 'sonar', 0) is None
 
 
 def test_poses_are_projected_and_steep_sensors_refused(buffer: Buffer, transforms: Transforms) -> None:
@@ -87,9 +87,9 @@ def test_poses_are_projected_and_steep_sensors_refused(buffer: Buffer, transform
     assert pose is not None
     assert pose.yaw == pytest.approx(2.5)
     buffer.known['base', 'down'] = transform(0.0, 0.0, pitch=1.5)
-    mounts = Mounts({}, transforms)
-    assert mounts('base', 'down', 0) is None
-    assert mounts.steep == {'down'}
+    extrinsics = Extrinsics({}, transforms)
+    assert extrinsics('base', 'down', 0) is None
+    assert extrinsics.steep == {'down'}
 
 
 def test_a_frame_that_is_not_there_is_asked_for_only_now_and_then(
@@ -97,12 +97,12 @@ def test_a_frame_that_is_not_there_is_asked_for_only_now_and_then(
 ) -> None:
     now = 0.0
     monkeypatch.setattr(frames.time, 'monotonic', lambda: now)
-    mounts = Mounts({}, transforms)
-    assert all(mounts('base', 'ghost', k) is LATER for k in range(50))
+    extrinsics = Extrinsics({}, transforms)
+    assert all(extrinsics('base', 'ghost', k) is LATER for k in range(50))
     assert buffer.asked == 1
     now += 1.0
     buffer.known['base', 'ghost'] = transform(1.0, 0.0)
-    assert mounts('base', 'ghost', 99) == Pose2(1.0, 0.0, 0.0)
+    assert extrinsics('base', 'ghost', 99) == Pose2(1.0, 0.0, 0.0)
 
 
 def test_a_moving_mount_is_taken_at_the_readings_stamp_even_if_tf_is_late(
@@ -110,16 +110,16 @@ def test_a_moving_mount_is_taken_at_the_readings_stamp_even_if_tf_is_late(
 ) -> None:
     buffer.known['base', 'servo'] = lambda stamp: transform(0.0, 0.0, yaw=stamp / NANOSECONDS)
     buffer.until = 0
-    placer = Placer(Mounts({}, transforms))
+    associator = PoseAssociator(Extrinsics({}, transforms))
     for tenth in range(5):
         stamp = tenth * NANOSECONDS // 10
-        placer.add_odometry(OdometryMessage(stamp, 'odom', 'base', Pose2(0, 0, 0)))
-        placer.add_range(RangeMessage(stamp, 'servo', 1.0, 0.1, 3.0, 0.3))
-    assert placer.waiting == 4
+        associator.add_odometry(OdometryMessage(stamp, 'odom', 'base', Pose2(0, 0, 0)))
+        associator.add_range(RangeMessage(stamp, 'servo', 1.0, 0.1, 3.0, 0.3))
+    assert associator.waiting == 4
     buffer.until = 1 << 62
-    placer.add_odometry(OdometryMessage(NANOSECONDS, 'odom', 'base', Pose2(0, 0, 0)))
-    assert placer.waiting == 0
-    assert sorted(placer.readings.yaw) == pytest.approx([0.0, 0.1, 0.2, 0.3, 0.4])
+    associator.add_odometry(OdometryMessage(NANOSECONDS, 'odom', 'base', Pose2(0, 0, 0)))
+    assert associator.waiting == 0
+    assert sorted(associator.readings.yaw) == pytest.approx([0.0, 0.1, 0.2, 0.3, 0.4])
 
 
 def test_odometry_is_given_in_the_map_frame_once_tf_knows_it(buffer: Buffer, transforms: Transforms) -> None:

@@ -27,5 +27,5 @@ def test_hostile_messages_are_all_accounted_for(domain: int) -> None:
     assert process.returncode == 0, process.stderr
     assert '8000 messages' in process.stdout
     assert int(re.search(r'^accepted (\d+)', process.stdout, re.MULTILINE)[1]) > 1000
-    assert process.stdout.count('unknown_mount') == 1
+    assert process.stdout.count('unknown_extrinsics') == 1
     assert re.search(r'1500 messages over DDS.*ranges received', process.stdout)

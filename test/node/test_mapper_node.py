@@ -31,9 +31,9 @@ from forward_grid_mapper.simulation.sonar import NOISY
 RELIABLE = ('-p', 'range_reliability:=reliable', '-p', 'odom_reliability:=reliable')
 
 
-def mounts(recording: Recording) -> list[str]:
+def extrinsics(recording: Recording) -> list[str]:
     arguments = []
-    for frame, pose in recording.mounts:
+    for frame, pose in recording.extrinsics:
         arguments += ['-p', f'sensors.{frame}.pose:=[{pose.x!r}, {pose.y!r}, {pose.yaw!r}]']
     return arguments
 
@@ -54,7 +54,7 @@ def values(message: OccupancyGrid) -> np.ndarray:
 def test_a_drive_becomes_three_maps_that_late_subscribers_get(
     start: Any, robot: Robot, door: Recording, tmp_path: Path
 ) -> None:
-    start(*RELIABLE, *mounts(door), '-p', f'save_directory:={tmp_path}/maps here', '-p', 'publish_rate:=5.0')
+    start(*RELIABLE, *extrinsics(door), '-p', f'save_directory:={tmp_path}/maps here', '-p', 'publish_rate:=5.0')
     robot.meet()
     assert robot.get_map('ml_map').info.width == 0
     robot.play(merged(door))
@@ -65,7 +65,7 @@ def test_a_drive_becomes_three_maps_that_late_subscribers_get(
     sensors = robot.until(
         lambda: 'judged' not in robot.diagnostics['sensors']['message'] and robot.diagnostics['sensors']
     )
-    assert {frame for frame, _ in door.mounts} <= set(sensors) and ' short: ' in sensors[door.mounts[0][0]]
+    assert {frame for frame, _ in door.extrinsics} <= set(sensors) and ' short: ' in sensors[door.extrinsics[0][0]]
     robot.listen()
     for name in MAPS:
         message = robot.until(lambda name=name: robot.maps[name] and robot.maps[name][-1], what=name)
@@ -169,7 +169,7 @@ def test_the_grid_lies_where_the_world_does(start: Any, robot: Robot, tmp_path: 
 
 def test_services_during_em_and_reset(start: Any, robot: Robot) -> None:
     recording = corridor_drive(0)
-    node = start(*RELIABLE, *mounts(recording), '-p', 'resolution:=0.02', '-p', 'publish_rate:=4.0')
+    node = start(*RELIABLE, *extrinsics(recording), '-p', 'resolution:=0.02', '-p', 'publish_rate:=4.0')
     robot.meet()
     robot.listen()
     messages = merged(recording)
@@ -209,7 +209,7 @@ def test_services_during_em_and_reset(start: Any, robot: Robot) -> None:
 
 
 def test_parameters_are_checked(start: Any, robot: Robot, door: Recording) -> None:
-    start(*RELIABLE, *mounts(door), '-p', 'prior:=0.5', '-p', 'p_hitt:=0.4', '-p', 'alpha:=1')
+    start(*RELIABLE, *extrinsics(door), '-p', 'prior:=0.5', '-p', 'p_hitt:=0.4', '-p', 'alpha:=1')
     robot.meet()
     assert robot.get_parameter('prior').double_value == 0.5
     for name, value, why in (

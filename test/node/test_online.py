@@ -12,7 +12,7 @@ import pytest
 pytest.importorskip('rclpy', reason='the tests of the node need rclpy')
 
 from robot import Robot
-from test_mapper_node import RELIABLE, merged, mounts, values
+from test_mapper_node import RELIABLE, extrinsics, merged, values
 
 from forward_grid_mapper.core.common.grid import Grid
 from forward_grid_mapper.core.common.parameters import Parameters
@@ -25,7 +25,7 @@ from forward_grid_mapper.simulation.sonar import NOISY
 def test_maps_follow_the_readings_and_em_polishes_them(start: Any, robot: Robot, tmp_path: Path) -> None:
     door = door_drive(16, NOISY, seed=3)
     options = ('-p', 'online:=true', '-p', 'publish_rate:=10.0', '-p', f'save_directory:={tmp_path}')
-    start(*RELIABLE, *mounts(door), *options)
+    start(*RELIABLE, *extrinsics(door), *options)
     robot.meet()
     robot.listen()
     messages = merged(door)
@@ -69,7 +69,7 @@ def test_maps_follow_the_readings_and_em_polishes_them(start: Any, robot: Robot,
 
 def test_parameters_may_change_while_it_runs(start: Any, robot: Robot) -> None:
     door = door_drive(1, NOISY, seed=1)
-    node = start(*RELIABLE, *mounts(door), '-p', 'online:=true', '-p', 'publish_rate:=10.0')
+    node = start(*RELIABLE, *extrinsics(door), '-p', 'online:=true', '-p', 'publish_rate:=10.0')
     robot.meet()
     robot.listen()
     robot.play(merged(door))

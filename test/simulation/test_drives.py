@@ -53,11 +53,11 @@ def test_interpolated_odometry_places_every_reading_exactly(tour):
     robot = np.stack([np.interp(at, seconds, column) for column in poses.T], axis=1)
     assert robot[1:] == pytest.approx(tour.robot[1:], abs=1e-6)  # the first one is a corner itself
     for pose, start in zip(tour.robot, range(0, len(tour.readings), 8), strict=True):
-        for k, (_, mount) in enumerate(tour.mounts):
+        for k, (_, extrinsic) in enumerate(tour.extrinsics):
             c, s = math.cos(pose[2]), math.sin(pose[2])
-            assert tour.readings.x[start + k] == pytest.approx(pose[0] + c * mount.x - s * mount.y)
-            assert tour.readings.y[start + k] == pytest.approx(pose[1] + s * mount.x + c * mount.y)
-            assert tour.readings.yaw[start + k] == pytest.approx(pose[2] + mount.yaw)
+            assert tour.readings.x[start + k] == pytest.approx(pose[0] + c * extrinsic.x - s * extrinsic.y)
+            assert tour.readings.y[start + k] == pytest.approx(pose[1] + s * extrinsic.x + c * extrinsic.y)
+            assert tour.readings.yaw[start + k] == pytest.approx(pose[2] + extrinsic.yaw)
 
 
 def test_motion_never_passes_through_walls():
@@ -90,7 +90,7 @@ def test_door_is_seen_by_n_sweeps(n):
 def test_corridor_drive_has_twelve_thousand_readings_and_a_person():
     recording, alone = corridor_drive(seed=1), corridor_drive(seed=1, noise=NOISE_FREE, person=False)
     assert len(recording.readings) == len(alone.readings) == 12_000
-    assert recording.mounts == alone.mounts
+    assert recording.extrinsics == alone.extrinsics
     behind = recording.readings.z[12::24]
     assert np.median(behind) == pytest.approx(0.5, abs=0.05)
     assert np.median(alone.readings.z[12::24]) > 3.0
@@ -107,7 +107,7 @@ def test_building_has_16_wide_sonars_and_laps_that_differ():
     recording = building_drive(seed=3, laps=2, noise=NOISE_FREE)
     readings = recording.readings
     assert len(readings) == 56_000
-    assert len(recording.mounts) == 16
+    assert len(recording.extrinsics) == 16
     assert 2 * readings.half_angle == pytest.approx(math.radians(30.0))
     first, second = recording.robot[:1750], recording.robot[1750:]
     apart = np.hypot(*(first[:, None, :2] - second[None, ::7, :2]).T).min(axis=1)

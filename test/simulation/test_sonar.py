@@ -170,10 +170,10 @@ def test_mirrored_world_gives_mirrored_ranges(name):
 def test_arrays():
     ring, front = sonar_ring(16, radius=0.3), front_array()
     assert ring.names[:2] == ('sonar_00', 'sonar_01')
-    name, pose = ring.mounts[4]
+    name, pose = ring.extrinsics[4]
     assert name == 'sonar_04'
     assert pose == pytest.approx((0.0, 0.3, math.pi / 2))
-    assert len(front.mounts) == 8
-    assert all(abs(pose.yaw) <= math.pi / 2 for _, pose in front.mounts)
+    assert len(front.extrinsics) == 8
+    assert all(abs(pose.yaw) <= math.pi / 2 for _, pose in front.extrinsics)
     poses = ring.poses(np.array([[1.0, 2.0, math.pi / 2]]))
     assert poses[0, 0] == pytest.approx((1.0, 2.3, math.pi / 2))

@@ -39,7 +39,7 @@ def _param(
 
 
 @dataclass(frozen=True)
-class PlacingParameters:
+class AssociationParameters:
     """From messages to readings in the map frame."""
 
     max_pose_gap: float = _param(
@@ -150,7 +150,7 @@ class ModelParameters:
     def __post_init__(self) -> None:
         if self.p_rand + self.p_lost > 0.99:
             raise ParameterError(
-                f'p_rand = {self.p_rand:g} and p_lost = {self.p_lost:g} leave nothing for the map to explain; '
+                f'p_rand = {self.p_rand:g} and p_lost = {self.p_lost:g} leave nothing for the map to evaluate; '
                 f'their sum must not exceed 0.99'
             )
 
@@ -357,7 +357,7 @@ class Parameter:
 class Parameters:
     """All parameters, in groups."""
 
-    placing: PlacingParameters = PlacingParameters()
+    association: AssociationParameters = AssociationParameters()
     grid: GridParameters = GridParameters()
     model: ModelParameters = ModelParameters()
     search: SearchParameters = SearchParameters()

@@ -18,16 +18,16 @@ from ..runtime.jit import kernel
 from ..runtime.threads import parts, run_each
 from ..sensor.cone import row_runs, within
 from ..sensor.cone_table import CONE, Floats, cone_of, cone_table, offset_of
-from ..sensor.surface_normals import facing_of, gather, no_facing
-from .fixed_point import QUANTUM, ratios_for
+from ..sensor.surface_normals import gather, no_normals, normals_of
+from .fixed_point import QUANTUM, ratio_workspace_for
 from .neighbourhood import patterns
-from .pairs import WORD, WORDS_PER_BAND_PAIR, WORDS_PER_RUN, Lattice, bench_for, room_for_words
-from .state import SHARE, Maps, Model, State
-from .tile_index import SHIFT, enter, more_chunks, no_tiles
-from .updates import enter_all, weigh
+from .pairs import WORD, WORDS_PER_BAND_PAIR, WORDS_PER_RUN, Lattice, empty_pairs, workspace_for
+from .state import READING_STATE, Maps, Model, State
+from .tile_index import SHIFT, insert, more_chunks, no_tiles
+from .updates import add_multiplicity, evaluate_all
 
-STRAIGHT = 1.5707
-"""Radians off the normal from where on no reading grazes."""
+NO_INCIDENCE_LIMIT = 1.5707
+"""Radians off the normal from where on no reading exceeds_incidence_angle."""
 
 FREE, BAND, LARGEST, WORDS, UNSTORED = range(5)
 """Of the totals: pairs in free zones and in bands, cells of the largest cone, words stored, readings not stored."""
@@ -35,7 +35,7 @@ FREE, BAND, LARGEST, WORDS, UNSTORED = range(5)
 
 @kernel
 def _index(s: State, limits: tuple[int, int, int], totals: Any) -> int:
-    """Count the pairs of readings and enter these in the tiles; return the reading at which chunks ran out, or the end.
+    """Count the pairs of readings, and insert these into the tiles; return the reading at which chunks ran out.
 
     Parameters
     ----------
@@ -45,7 +45,7 @@ def _index(s: State, limits: tuple[int, int, int], totals: Any) -> int:
         Added to.
     """
     begin, end, words = limits
-    cones, lattice, tiles, seen, before = s.cones, s.lattice, s.tiles, s.maps.seen, s.facing.before
+    cones, lattice, tiles, seen, before = s.cones, s.lattice, s.tiles, s.maps.seen, s.normals.before
     for t in range(begin, end):
         reading = cones[t]
         cone = cone_of(reading, lattice.nearest)
@@ -61,21 +61,21 @@ def _index(s: State, limits: tuple[int, int, int], totals: Any) -> int:
             for left, right in ((a, b), (c, d)):
                 if left > right:
                     continue
-                enter(tiles, row, left, right, t)
+                insert(tiles, row, left, right, t)
                 inside = max(min(right, last) - max(left, first) + 1, 0)
                 runs += inside > 0
-                if s.facing.slant > 0.0 and inside > 0:
+                if s.normals.cos2_limit > 0.0 and inside > 0:
                     # a surface that is grazed may cut a run in two
                     runs += before[row, min(right, last) + 1] - before[row, max(left, first)]
                 for c in range(np.uint64(row * lattice.width + left), np.uint64(row * lattice.width + right + 1)):
                     seen[c] += 1
                 free += inside
                 band += right - left + 1 - inside
-        share = s.shares[t]
+        reading_state = s.reading_states[t]
         size = WORDS_PER_RUN * runs + WORDS_PER_BAND_PAIR * band
-        share.at = totals[WORDS]
-        share.stored = totals[WORDS] + size <= words
-        if share.stored:
+        reading_state.at = totals[WORDS]
+        reading_state.stored = totals[WORDS] + size <= words
+        if reading_state.stored:
             totals[WORDS] += size
         else:
             totals[UNSTORED] += 1
@@ -85,15 +85,15 @@ def _index(s: State, limits: tuple[int, int, int], totals: Any) -> int:
     return end
 
 
-def share_table(readings: Readings, sigma: Floats, model: ModelParameters) -> NDArray[np.void]:
-    """Return records of `SHARE`, shape (N,), with all that no map changes; `sigma` is that of `effective_sigma`."""
-    shares = np.zeros(len(readings), SHARE)
+def reading_state_table(readings: Readings, sigma: Floats, model: ModelParameters) -> NDArray[np.void]:
+    """Return records of `READING_STATE`, shape (N,), with what no map changes; `sigma` is that of `effective_sigma`."""
+    reading_states = np.zeros(len(readings), READING_STATE)
     error = (readings.z_max - readings.z) / sigma
     density = np.where(error <= model.cut, np.exp(-0.5 * error**2) / (math.sqrt(2 * math.pi) * sigma), 0.0)
-    shares['floor'] = model.p_rand / readings.z_max + np.where(readings.echo, 0.0, model.p_lost * density)
-    shares['no_echo'] = density
-    shares['weight'] = 1
-    return shares
+    reading_states['floor'] = model.p_rand / readings.z_max + np.where(readings.echo, 0.0, model.p_lost * density)
+    reading_states['no_echo'] = density
+    reading_states['weight'] = 1
+    return reading_states
 
 
 def _maps(grid: Grid, occupied: NDArray[np.uint8]) -> Maps:
@@ -142,17 +142,17 @@ class Evidence:
         self._totals = np.zeros(5, np.int64)
         self._size = 0
         self.state = State(
-            facing=no_facing(),
+            normals=no_normals(),
             lattice=Lattice(grid.height, grid.width, model.cell_distance == 'nearest', model.cut, grid.resolution),
             model=Model(model.p_hit, 1.0 - model.p_rand - model.p_lost),
             cones=np.empty(0, CONE),
-            shares=np.empty(0, SHARE),
-            pairs=room_for_words(0),
+            reading_states=np.empty(0, READING_STATE),
+            pairs=empty_pairs(0),
             tiles=no_tiles(grid.height, grid.width),
             maps=_maps(grid, np.zeros(grid.shape, np.uint8) if start is None else np.array(start, np.uint8)),
-            bench=bench_for(0),
-            ratios=ratios_for(0),
-            seers=np.empty((0, 2), np.int32),
+            workspace=workspace_for(0),
+            ratios=ratio_workspace_for(0),
+            observing=np.empty((0, 2), np.int32),
             clock=np.zeros(1, np.int64),
             stop=np.zeros(1, np.uint8) if stop is None else stop,
         )
@@ -174,14 +174,14 @@ class Evidence:
     def nbytes(self) -> int:
         """Memory of the pairs and of what is kept for readings and cells, bytes."""
         s = self.state
-        kept = (s.cones, s.shares, s.pairs.cell, s.tiles.chunks, s.seers, *s.maps)
+        kept = (s.cones, s.reading_states, s.pairs.cell, s.tiles.chunks, s.observing, *s.maps)
         return sum(int(array.nbytes) for array in kept)
 
     @property
     def log_likelihood(self) -> float:
         """Log p(Z | m) in nats."""
-        shares = self.state.shares[: self._size]
-        return float((shares['likelihood'].astype(np.int64) * shares['weight']).sum() * QUANTUM)
+        reading_states = self.state.reading_states[: self._size]
+        return float((reading_states['likelihood'].astype(np.int64) * reading_states['weight']).sum() * QUANTUM)
 
     def of_occupancy(self) -> Floats:
         """Return log p(Z | cell occupied, rest of the map) − log p(Z | cell free, rest of the map) in nats.
@@ -202,7 +202,7 @@ class Evidence:
     @property
     def likelihoods(self) -> Floats:
         """p(z | m) of every reading in 1/m, shape (N,)."""
-        out: Floats = np.exp(self.state.shares['likelihood'][: self._size] * QUANTUM)
+        out: Floats = np.exp(self.state.reading_states['likelihood'][: self._size] * QUANTUM)
         return out
 
     def observed(self) -> NDArray[np.int8]:
@@ -220,15 +220,15 @@ class Evidence:
         """
         begin, end = self._size, self._size + len(readings)
         cones = cone_table(readings, self.grid, self.model)
-        shares = share_table(readings, cones['sigma'] * self.grid.resolution, self.model)
+        reading_states = reading_state_table(readings, cones['sigma'] * self.grid.resolution, self.model)
         self._reserve(end)
         s = self.state
-        s.cones[begin:end], s.shares[begin:end] = cones, shares
+        s.cones[begin:end], s.reading_states[begin:end] = cones, reading_states
         self._take_in(begin, end)
 
-    def weigh(self, readings: NDArray[np.int64]) -> None:
+    def add_multiplicity(self, readings: NDArray[np.int64]) -> None:
         """Let each of `readings` (indices, shape (N,)) stand for one more reading that says the same."""
-        weigh(self.state, readings)
+        add_multiplicity(self.state, readings)
 
     def grow(self, grid: Grid) -> None:
         """Go on with a larger grid, whose new cells are free; all readings are taken in anew.
@@ -258,7 +258,7 @@ class Evidence:
         maps = self.state.maps
         maps.evidence[:] = 0
         maps.pattern[:] = patterns(maps.occupied, self.grid.shape)
-        self._enter(0, self._size, new=False)
+        self._evaluate_and_add(0, self._size, new=False)
 
     def each(self, begin: int, end: int, work: Callable[[State, int, int], None]) -> None:
         """Have several threads work on parts of the readings `begin` to `end`, each with room of its own."""
@@ -267,12 +267,12 @@ class Evidence:
         for k, (first, last) in enumerate(parts(begin, end, self._threads)):
             s = self.state
             if k:
-                s = s._replace(bench=bench_for(largest), ratios=ratios_for(largest))
+                s = s._replace(workspace=workspace_for(largest), ratios=ratio_workspace_for(largest))
             jobs.append(partial(work, s, first, last))
         run_each(jobs)
         check(self.state.stop)
 
-    def _enter(self, begin: int, end: int, new: bool) -> None:
+    def _evaluate_and_add(self, begin: int, end: int, new: bool) -> None:
         maps = self.state.maps
         own: list[Maps] = []
 
@@ -280,7 +280,7 @@ class Evidence:
             if first > begin:
                 s = s._replace(maps=maps._replace(evidence=np.zeros_like(maps.evidence)))
                 own.append(s.maps)
-            enter_all(s, first, last, new)
+            evaluate_all(s, first, last, new)
 
         self.each(begin, end, work)
         for other in own:
@@ -288,7 +288,7 @@ class Evidence:
 
     def _take_in(self, begin: int, end: int) -> None:
         """Index readings whose cones are in place, and add what they say to the evidence."""
-        if not begin and self.model.grazing_angle < STRAIGHT:
+        if not begin and self.model.grazing_angle < NO_INCIDENCE_LIMIT:
             self._face(end)
         done = begin
         while done < end:
@@ -299,7 +299,7 @@ class Evidence:
                 self.state = s._replace(tiles=more_chunks(s.tiles))
         self._size = end
         self._make_room()
-        self._enter(begin, end, new=True)
+        self._evaluate_and_add(begin, end, new=True)
 
     def _face(self, end: int) -> None:
         """Learn from the first readings which way surfaces face."""
@@ -310,18 +310,18 @@ class Evidence:
             gather(s.cones, self.grid.shape, s.lattice.nearest, (first, last), sums[-1], s.stop)
 
         self.each(0, end, work)
-        facing = facing_of(np.sum(sums, axis=0), self.grid.shape, self.model.grazing_angle)
-        self.state = self.state._replace(facing=facing)
+        normals = normals_of(np.sum(sums, axis=0), self.grid.shape, self.model.grazing_angle)
+        self.state = self.state._replace(normals=normals)
 
     def _reserve(self, size: int) -> None:
         """Make room for `size` readings; more than that where they come in small numbers."""
         s = self.state
-        if size <= len(s.shares):
+        if size <= len(s.reading_states):
             return
         room = size if not self._size else max(size, self._size * 3 // 2)
-        cones, shares = np.empty(room, CONE), np.zeros(room, SHARE)
-        cones[: self._size], shares[: self._size] = s.cones[: self._size], s.shares[: self._size]
-        self.state = s._replace(cones=cones, shares=shares, seers=np.empty((room, 2), np.int32))
+        cones, reading_states = np.empty(room, CONE), np.zeros(room, READING_STATE)
+        cones[: self._size], reading_states[: self._size] = s.cones[: self._size], s.reading_states[: self._size]
+        self.state = s._replace(cones=cones, reading_states=reading_states, observing=np.empty((room, 2), np.int32))
 
     def _make_room(self) -> None:
         """Make room for the pairs that were counted."""
@@ -329,9 +329,9 @@ class Evidence:
         words, largest = int(self._totals[WORDS]), int(self._totals[LARGEST])
         if words > len(s.pairs.cell):
             kept = len(s.pairs.cell)
-            pairs = room_for_words(words if not kept else max(words, min(words * 3 // 2, self._words)))
+            pairs = empty_pairs(words if not kept else max(words, min(words * 3 // 2, self._words)))
             pairs.cell[:kept] = s.pairs.cell
             s = s._replace(pairs=pairs)
-        if largest + 3 > len(s.bench.new):
-            s = s._replace(bench=bench_for(largest), ratios=ratios_for(largest))
+        if largest + 3 > len(s.workspace.new):
+            s = s._replace(workspace=workspace_for(largest), ratios=ratio_workspace_for(largest))
         self.state = s

@@ -23,7 +23,7 @@ _ROOT_HALF = np.int32(0x3F3504F3)  # the bits of float32 √½
 _EXPONENT = np.int32(23)
 
 
-class Ratios(NamedTuple):
+class RatioWorkspace(NamedTuple):
     """Room for the likelihood ratios of one cone, and the bits that they are stored as; arrays of one length."""
 
     ratio: NDArray[np.float32]
@@ -32,14 +32,14 @@ class Ratios(NamedTuple):
     mantissa_bits: NDArray[np.int32]
 
 
-def ratios_for(largest: int) -> Ratios:
+def ratio_workspace_for(largest: int) -> RatioWorkspace:
     """Return room for cones of up to `largest` cells."""
     ratio, mantissa = np.empty(largest + 3, np.float32), np.empty(largest + 3, np.float32)
-    return Ratios(ratio, ratio.view(np.int32), mantissa, mantissa.view(np.int32))
+    return RatioWorkspace(ratio, ratio.view(np.int32), mantissa, mantissa.view(np.int32))
 
 
 @kernel
-def quantise_logs(ratios: Ratios, m: int, out: Any) -> None:
+def quantise_logs(ratios: RatioWorkspace, m: int, out: Any) -> None:
     """Write the logs of the first m ratios (positive, normal) into `out` (int32), in units of QUANTUM.
 
     The method is that of Cephes' logf: the number's bits give x = 2ᵉ (1 + f) with 1 + f in [√½, √2), and a polynomial

@@ -1,7 +1,7 @@
 """The cells of every reading, as the search wants them: runs of the free zone, and the band from near to far.
 
 In the free zone it only matters how many occupied cells there are, so rows of cells are kept as runs. Each cell of the
-band is kept with its density and with its share of the evidence. Everything of one reading lies together in one block
+band is kept with its density and with its term of the evidence. Everything of one reading lies together in one block
 of memory, since readings are come upon at random: 12 bytes a band pair and 8 a run, which is about one a free pair.
 
 Readings for which there is no memory are kept as nothing but their cone: their pairs are made anew each time that they
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from ..runtime.jit import kernel
 from ..sensor.cone import distance, row_runs, within
 from ..sensor.cone_table import Cones, cone_of
-from ..sensor.surface_normals import Facing, grazes
+from ..sensor.surface_normals import SurfaceNormals, exceeds_incidence_angle
 
 WORD = 4
 """Bytes in a word of a block."""
@@ -51,13 +51,13 @@ class Pairs(NamedTuple):
     log: NDArray[np.int32]
 
 
-def room_for_words(words: int) -> Pairs:
+def empty_pairs(words: int) -> Pairs:
     """Return room for so many words."""
     block = np.empty(words, np.uint32)
     return Pairs(block, block.view(np.float32), block.view(np.int32))
 
 
-class Bench(NamedTuple):
+class Workspace(NamedTuple):
     """Room to work on one reading at a time.
 
     Attributes
@@ -80,12 +80,12 @@ class Bench(NamedTuple):
     bucket: NDArray[np.int32]
 
 
-def bench_for(largest: int) -> Bench:
+def workspace_for(largest: int) -> Workspace:
     """Return room for cones of up to `largest` cells."""
     n = largest + 3
     ints = [np.empty(n, np.int32) for _ in range(3)]
-    return Bench(
-        pairs=room_for_words((WORDS_PER_RUN + WORDS_PER_BAND_PAIR) * n),
+    return Workspace(
+        pairs=empty_pairs((WORDS_PER_RUN + WORDS_PER_BAND_PAIR) * n),
         new=ints[0],
         cell=np.empty(n, np.uint32),
         key=np.empty(n),
@@ -98,11 +98,11 @@ def bench_for(largest: int) -> Bench:
 
 @kernel
 def make(
-    cones: Cones, lattice: Lattice, facing: Facing, t: int, pairs: Pairs, at: int, bench: Bench
+    cones: Cones, lattice: Lattice, normals: SurfaceNormals, t: int, pairs: Pairs, at: int, workspace: Workspace
 ) -> tuple[int, int]:
     """Write the runs, cells and densities of reading t into `pairs` from `at`; return its runs and band pairs.
 
-    Surfaces that the reading grazes are left out, which may cut a run in two.
+    Surfaces that the reading exceeds_incidence_angle are left out, which may cut a run in two.
     """
     reading = cones[t]
     cone = cone_of(reading, lattice.nearest)
@@ -115,7 +115,7 @@ def make(
         for begin, end in ((a, b), (c, d)):
             if begin > end:
                 continue
-            slanted = facing.slant > 0.0 and facing.before[row, end + 1] > facing.before[row, begin]
+            slanted = normals.cos2_limit > 0.0 and normals.before[row, end + 1] > normals.before[row, begin]
             inner, outer = max(begin, first), min(end, last)
             if inner > outer:
                 inner, outer = end + 1, end
@@ -126,7 +126,9 @@ def make(
             else:
                 left = inner
                 for column in range(inner, outer + 2):
-                    if column > outer or grazes(facing, reading, start + column, column + 0.5 - cone.x, v):
+                    if column > outer or exceeds_incidence_angle(
+                        normals, reading, start + column, column + 0.5 - cone.x, v
+                    ):
                         if left < column:
                             pairs.cell[n] = start + left
                             pairs.cell[n + 1] = start + column - 1
@@ -135,21 +137,21 @@ def make(
             for side_first, side_last in ((begin, inner - 1), (outer + 1, end)):
                 for column in range(side_first, side_last + 1):
                     u = column + 0.5 - cone.x
-                    if not slanted or not grazes(facing, reading, start + column, u, v):
-                        bench.unsorted[m] = start + column
-                        bench.unsorted_key[m] = distance(u, v, lattice.nearest)
+                    if not slanted or not exceeds_incidence_angle(normals, reading, start + column, u, v):
+                        workspace.unsorted[m] = start + column
+                        workspace.unsorted_key[m] = distance(u, v, lattice.nearest)
                         m += 1
-    _sort(bench, m)
+    _sort(workspace, m)
     peak = 1.0 / (math.sqrt(2.0 * math.pi) * reading.sigma * lattice.resolution)
     for k in range(m):
-        error = (reading.z - bench.key[k]) / reading.sigma
-        pairs.cell[n + k] = bench.cell[k]
+        error = (reading.z - workspace.key[k]) / reading.sigma
+        pairs.cell[n + k] = workspace.cell[k]
         pairs.density[n + m + k] = peak * math.exp(-0.5 * error * error) if abs(error) <= lattice.cut else 0.0
     return (n - at) // WORDS_PER_RUN, m
 
 
 @kernel
-def _sort(bench: Bench, m: int) -> None:
+def _sort(workspace: Workspace, m: int) -> None:
     """Sort the first m of `unsorted` by key, into `cell` and `key`; equal keys keep their order.
 
     The keys of a band are spread evenly, so that m buckets leave next to nothing to the insertion sort.
@@ -158,26 +160,26 @@ def _sort(bench: Bench, m: int) -> None:
         return
     low, high = math.inf, -math.inf
     for k in range(m):
-        low, high = min(low, bench.unsorted_key[k]), max(high, bench.unsorted_key[k])
+        low, high = min(low, workspace.unsorted_key[k]), max(high, workspace.unsorted_key[k])
     scale = (m - 1) / (high - low) if high > low else 0.0
-    bench.tally[: m + 1] = 0
+    workspace.tally[: m + 1] = 0
     for k in range(m):
-        bucket = int((bench.unsorted_key[k] - low) * scale)
-        bench.bucket[k] = bucket
-        bench.tally[bucket + 1] += 1
+        bucket = int((workspace.unsorted_key[k] - low) * scale)
+        workspace.bucket[k] = bucket
+        workspace.tally[bucket + 1] += 1
     for k in range(m):
-        bench.tally[k + 1] += bench.tally[k]
+        workspace.tally[k + 1] += workspace.tally[k]
     for k in range(m):
-        at = bench.tally[bench.bucket[k]]
-        bench.tally[bench.bucket[k]] += 1
-        bench.key[at] = bench.unsorted_key[k]
-        bench.cell[at] = bench.unsorted[k]
+        at = workspace.tally[workspace.bucket[k]]
+        workspace.tally[workspace.bucket[k]] += 1
+        workspace.key[at] = workspace.unsorted_key[k]
+        workspace.cell[at] = workspace.unsorted[k]
     for k in range(1, m):
-        key, cell = bench.key[k], bench.cell[k]
+        key, cell = workspace.key[k], workspace.cell[k]
         at = k
-        while at > 0 and bench.key[at - 1] > key:
-            bench.key[at] = bench.key[at - 1]
-            bench.cell[at] = bench.cell[at - 1]
+        while at > 0 and workspace.key[at - 1] > key:
+            workspace.key[at] = workspace.key[at - 1]
+            workspace.cell[at] = workspace.cell[at - 1]
             at -= 1
-        bench.key[at] = key
-        bench.cell[at] = cell
+        workspace.key[at] = key
+        workspace.cell[at] = cell

@@ -8,12 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..sensor.cone_table import Cones
-from ..sensor.surface_normals import Facing
-from .fixed_point import Ratios
-from .pairs import Bench, Lattice, Pairs
+from ..sensor.surface_normals import SurfaceNormals
+from .fixed_point import RatioWorkspace
+from .pairs import Lattice, Pairs, Workspace
 from .tile_index import Tiles
 
-SHARE = np.dtype(
+READING_STATE = np.dtype(
     [
         ('floor', np.float64),
         ('no_echo', np.float64),
@@ -37,7 +37,7 @@ floor, no_echo
     The densities p_rand / z_max, with p_lost · N(z; z_max, σ) where there is no echo, and N(z; z_max, σ) in 1/m, which
     no map changes.
 blocking, through
-    Occupied cells in the free zone, and the share of the reading that they leave to the band,
+    Occupied cells in the free zone, and the mixture weight that they leave to the band,
     (1 − p_rand − p_lost) (1 − p_hit)^blocking.
 stored, at, runs, bands
     Whether its pairs are stored, where in `Pairs`, and how many runs and band pairs there are.
@@ -53,10 +53,10 @@ changed
 
 
 class Model(NamedTuple):
-    """p_hit, and the share of readings that the map explains, 1 − p_rand − p_lost."""
+    """p_hit, and the mixture weight of the causes that the map explains, 1 − p_rand − p_lost."""
 
     p_hit: float
-    share: float
+    mixture_weight: float
 
 
 class Maps(NamedTuple):
@@ -85,8 +85,8 @@ class State(NamedTuple):
 
     Attributes
     ----------
-    cones, shares : records of `CONE` and `SHARE`, shape (N,)
-    seers : int32, shape (N, 2)
+    cones, reading_states : records of `CONE` and `READING_STATE`, shape (N,)
+    observing : int32, shape (N, 2)
         The readings that see the cell at hand, and 1 if it is in their free zone.
     clock : int64, shape (1,)
         Counts flips.
@@ -95,15 +95,15 @@ class State(NamedTuple):
     """
 
     lattice: Lattice
-    facing: Facing
+    normals: SurfaceNormals
     model: Model
     cones: Cones
-    shares: NDArray[np.void]
+    reading_states: NDArray[np.void]
     pairs: Pairs
     tiles: Tiles
     maps: Maps
-    bench: Bench
-    ratios: Ratios
-    seers: NDArray[np.int32]
+    workspace: Workspace
+    ratios: RatioWorkspace
+    observing: NDArray[np.int32]
     clock: NDArray[np.int64]
     stop: NDArray[np.uint8]

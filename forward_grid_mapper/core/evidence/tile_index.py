@@ -58,7 +58,7 @@ def more_chunks(tiles: Tiles) -> Tiles:
 
 
 @kernel
-def enter(tiles: Tiles, row: int, first: int, last: int, t: Any) -> None:
+def insert(tiles: Tiles, row: int, first: int, last: int, t: Any) -> None:
     """Enter reading t for the cells `first` to `last` of a row; there must be room for a chunk a tile."""
     line = (row >> SHIFT) * tiles.across
     for tile in range(line + (first >> SHIFT), line + (last >> SHIFT) + 1):

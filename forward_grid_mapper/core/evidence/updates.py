@@ -1,8 +1,8 @@
 """Flips of single cells: the M-step with an exact mini E-step in both directions, and what every cell would gain by it.
 
 Write p(z_t | m) = c + T, where c gathers the causes that no map changes and T the obstacles and max range. For a cell
-at distance d, let A be the share of T from occupied cells before it, W = share · (1 − p_hit)^(occupied cells before it)
-and g = N(z; d, σ). Then flipping the cell makes of T
+at distance d, let A be the part of T from occupied cells before it, n the number of these,
+W = (1 − p_rand − p_lost) (1 − p_hit)ⁿ and g = N(z; d, σ). Then flipping the cell makes of T
 
     occupy   T' = A + W p_hit g + (T − A) (1 − p_hit)
     free     T' = A + (T − A − W p_hit g) / (1 − p_hit)
@@ -25,8 +25,8 @@ import numpy as np
 from ..runtime.jit import kernel
 from ..sensor.cone import row_runs, within
 from ..sensor.cone_table import cone_of
-from ..sensor.surface_normals import grazes
-from .fixed_point import Ratios, quantise_logs
+from ..sensor.surface_normals import exceeds_incidence_angle
+from .fixed_point import RatioWorkspace, quantise_logs
 from .neighbourhood import note_flip
 from .pairs import WORDS_PER_RUN, Lattice, Pairs, make
 from .state import Maps, Model, State
@@ -40,25 +40,27 @@ LEAST_RATIO = 1e-30
 
 
 @kernel
-def explain(model: Model, share: Any, occupied: Any, pairs: Pairs, at: int, ratios: Ratios, out: Any) -> None:
+def evaluate(
+    model: Model, reading_state: Any, occupied: Any, pairs: Pairs, at: int, ratios: RatioWorkspace, out: Any
+) -> None:
     """Compute the log ratios of a reading from the map into `out`, in the order of its band.
 
     Those of occupying and freeing a cell of the free zone, and the log-likelihood of the reading, come after them.
 
     Parameters
     ----------
-    share : record of SHARE
+    reading_state : record of READING_STATE
         Of which `through` must be right.
     pairs, at
         Where its pairs begin.
     """
     # unsigned, so that an index need not be asked whether it counts from the end
-    one, m = np.uint64(1), np.uint64(share.bands)
-    cell = np.uint64(at + WORDS_PER_RUN * share.runs)
+    one, m = np.uint64(1), np.uint64(reading_state.bands)
+    cell = np.uint64(at + WORDS_PER_RUN * reading_state.runs)
     density = cell + m
     p, q = model.p_hit, 1.0 - model.p_hit
-    floor, ratio = share.floor, ratios.ratio
-    weight, total = share.through, 0.0
+    floor, ratio = reading_state.floor, ratios.ratio
+    weight, total = reading_state.through, 0.0
     obstacles = np.uint64(0)
     for k in range(m):
         if occupied[pairs.cell[cell + k]]:
@@ -67,9 +69,9 @@ def explain(model: Model, share: Any, occupied: Any, pairs: Pairs, at: int, rati
             obstacles += one
             total += weight * p * pairs.density[density + k]
             weight *= q
-    total += weight * share.no_echo
+    total += weight * reading_state.no_echo
     scale = 1.0 / (floor + total)
-    before, weight = 0.0, share.through
+    before, weight = 0.0, reading_state.through
     begin = np.uint64(0)
     for i in range(obstacles + one):
         end = np.uint64(out[i]) if i < obstacles else m
@@ -86,81 +88,83 @@ def explain(model: Model, share: Any, occupied: Any, pairs: Pairs, at: int, rati
     ratio[m] = (floor + total * q) * scale
     ratio[m + one] = (floor + total / q) * scale
     ratio[m + one + one] = floor + total
-    quantise_logs(ratios, share.bands + 3, out)
+    quantise_logs(ratios, reading_state.bands + 3, out)
 
 
 @kernel
-def _push_free(share: Any, pairs: Pairs, at: int, maps: Maps, steps: tuple[int, int]) -> None:
+def _push_free(reading_state: Any, pairs: Pairs, at: int, maps: Maps, steps: tuple[int, int]) -> None:
     """Add steps[0] to the evidence of the free cells of the free zone, steps[1] to that of the occupied."""
-    for k in range(np.uint64(at), np.uint64(at + WORDS_PER_RUN * share.runs), np.uint64(WORDS_PER_RUN)):
+    for k in range(np.uint64(at), np.uint64(at + WORDS_PER_RUN * reading_state.runs), np.uint64(WORDS_PER_RUN)):
         for c in range(np.uint64(pairs.cell[k]), np.uint64(pairs.cell[k + np.uint64(1)]) + np.uint64(1)):
             maps.evidence[c] += steps[1] if maps.occupied[c] else steps[0]
 
 
 @kernel
-def _note(share: Any, new: Any) -> None:
-    """Keep what `explain` left after the band."""
-    m = share.bands
-    share.occupy, share.release, share.likelihood = new[m], new[m + 1], new[m + 2]
+def _note(reading_state: Any, new: Any) -> None:
+    """Keep what `evaluate` left after the band."""
+    m = reading_state.bands
+    reading_state.occupy, reading_state.release, reading_state.likelihood = new[m], new[m + 1], new[m + 2]
 
 
 @kernel
-def _enter(model: Model, share: Any, maps: Maps, pairs: Pairs, at: int, room: tuple[Ratios, Any]) -> None:
+def _evaluate_and_add(
+    model: Model, reading_state: Any, maps: Maps, pairs: Pairs, at: int, room: tuple[RatioWorkspace, Any]
+) -> None:
     """Explain a reading, and add all that it says to the evidence."""
     ratios, new = room
     blocking = 0
-    for k in range(np.uint64(at), np.uint64(at + WORDS_PER_RUN * share.runs), np.uint64(WORDS_PER_RUN)):
+    for k in range(np.uint64(at), np.uint64(at + WORDS_PER_RUN * reading_state.runs), np.uint64(WORDS_PER_RUN)):
         for c in range(np.uint64(pairs.cell[k]), np.uint64(pairs.cell[k + np.uint64(1)]) + np.uint64(1)):
             blocking += maps.occupied[c]
-    share.blocking = blocking
-    share.through = model.share * (1.0 - model.p_hit) ** blocking
-    explain(model, share, maps.occupied, pairs, at, ratios, new)
-    _note(share, new)
-    weight = share.weight
-    _push_free(share, pairs, at, maps, (weight * share.occupy, weight * share.release))
-    cell = np.uint64(at + WORDS_PER_RUN * share.runs)
-    log = cell + np.uint64(2 * share.bands)
-    for k in range(np.uint64(share.bands)):
+    reading_state.blocking = blocking
+    reading_state.through = model.mixture_weight * (1.0 - model.p_hit) ** blocking
+    evaluate(model, reading_state, maps.occupied, pairs, at, ratios, new)
+    _note(reading_state, new)
+    weight = reading_state.weight
+    _push_free(reading_state, pairs, at, maps, (weight * reading_state.occupy, weight * reading_state.release))
+    cell = np.uint64(at + WORDS_PER_RUN * reading_state.runs)
+    log = cell + np.uint64(2 * reading_state.bands)
+    for k in range(np.uint64(reading_state.bands)):
         maps.evidence[pairs.cell[cell + k]] += weight * new[k]
         pairs.log[log + k] = new[k]
 
 
 @kernel
-def enter_all(s: State, begin: int, end: int, new: bool) -> None:
+def evaluate_all(s: State, begin: int, end: int, new: bool) -> None:
     """Explain the readings `begin` to `end` by the map, and add all that they say to the evidence.
 
     The pairs of new ones are made first.
     """
-    room = (s.ratios, s.bench.new)
+    room = (s.ratios, s.workspace.new)
     for t in range(begin, end):
         if s.stop[0]:
             break
-        share = s.shares[t]
-        pairs, at = (s.pairs, share.at) if share.stored else (s.bench.pairs, 0)
-        if new or not share.stored:
-            share.runs, share.bands = make(s.cones, s.lattice, s.facing, t, pairs, at, s.bench)
-        _enter(s.model, share, s.maps, pairs, at, room)
-        share.changed = s.clock[0]
+        reading_state = s.reading_states[t]
+        pairs, at = (s.pairs, reading_state.at) if reading_state.stored else (s.workspace.pairs, 0)
+        if new or not reading_state.stored:
+            reading_state.runs, reading_state.bands = make(s.cones, s.lattice, s.normals, t, pairs, at, s.workspace)
+        _evaluate_and_add(s.model, reading_state, s.maps, pairs, at, room)
+        reading_state.changed = s.clock[0]
 
 
 @kernel
-def weigh(s: State, readings: Any) -> None:
+def add_multiplicity(s: State, readings: Any) -> None:
     """Let each of `readings` stand for one more that says the same."""
-    maps, bench = s.maps, s.bench
+    maps, workspace = s.maps, s.workspace
     for t in readings:
-        share = s.shares[t]
-        share.weight += 1
-        share.changed = s.clock[0]
-        pairs, at = (s.pairs, share.at) if share.stored else (bench.pairs, 0)
-        if not share.stored:
-            make(s.cones, s.lattice, s.facing, t, bench.pairs, 0, bench)
-        explain(s.model, share, maps.occupied, pairs, at, s.ratios, bench.new)
-        _push_free(share, pairs, at, maps, (share.occupy, share.release))
-        cell = np.uint64(at + WORDS_PER_RUN * share.runs)
-        for k in range(np.uint64(share.bands)):
-            maps.evidence[pairs.cell[cell + k]] += bench.new[k]
+        reading_state = s.reading_states[t]
+        reading_state.weight += 1
+        reading_state.changed = s.clock[0]
+        pairs, at = (s.pairs, reading_state.at) if reading_state.stored else (workspace.pairs, 0)
+        if not reading_state.stored:
+            make(s.cones, s.lattice, s.normals, t, workspace.pairs, 0, workspace)
+        evaluate(s.model, reading_state, maps.occupied, pairs, at, s.ratios, workspace.new)
+        _push_free(reading_state, pairs, at, maps, (reading_state.occupy, reading_state.release))
+        cell = np.uint64(at + WORDS_PER_RUN * reading_state.runs)
+        for k in range(np.uint64(reading_state.bands)):
+            maps.evidence[pairs.cell[cell + k]] += workspace.new[k]
             maps.seen[pairs.cell[cell + k]] += 1
-        for k in range(at, at + WORDS_PER_RUN * share.runs, WORDS_PER_RUN):
+        for k in range(at, at + WORDS_PER_RUN * reading_state.runs, WORDS_PER_RUN):
             for c in range(np.uint64(pairs.cell[k]), np.uint64(pairs.cell[k + 1]) + np.uint64(1)):
                 maps.seen[c] += 1
 
@@ -192,8 +196,8 @@ def _zone(reading: Any, lattice: Lattice, row: int, column: int) -> int:
 
 
 @kernel
-def find_seers(s: State, c: int) -> int:
-    """List the readings that see cell c in `seers`; return their number."""
+def find_observing(s: State, c: int) -> int:
+    """List the readings that see cell c in `observing`; return their number."""
     row, column = c // s.lattice.width, c % s.lattice.width
     tile = (row >> SHIFT) * s.tiles.across + (column >> SHIFT)
     chunk, end = s.tiles.head[tile], s.tiles.fill[tile]
@@ -203,65 +207,75 @@ def find_seers(s: State, c: int) -> int:
             t = s.tiles.chunks[chunk, k]
             reading = s.cones[t]
             zone = _zone(reading, s.lattice, row, column)
-            if zone and s.facing.slant > 0.0 and s.facing.known[c]:
-                slanted = grazes(s.facing, reading, c, column + 0.5 - reading.x, row + 0.5 - reading.y)
+            if zone and s.normals.cos2_limit > 0.0 and s.normals.known[c]:
+                slanted = exceeds_incidence_angle(
+                    s.normals, reading, c, column + 0.5 - reading.x, row + 0.5 - reading.y
+                )
                 zone = 0 if slanted else zone
             if zone:
-                s.seers[n, 0] = t
-                s.seers[n, 1] = zone - 1
+                s.observing[n, 0] = t
+                s.observing[n, 1] = zone - 1
                 n += 1
         chunk, end = s.tiles.chunks[chunk, CHUNK], CHUNK
     return n
 
 
 @kernel
-def _renew(model: Model, share: Any, maps: Maps, pairs: Pairs, at: int, room: tuple[Ratios, Any]) -> None:
+def _reevaluate(
+    model: Model, reading_state: Any, maps: Maps, pairs: Pairs, at: int, room: tuple[RatioWorkspace, Any]
+) -> None:
     """Explain a reading anew, and push what changed to the evidence."""
     ratios, new = room
-    explain(model, share, maps.occupied, pairs, at, ratios, new)
-    m, weight = share.bands, share.weight
-    cell = np.uint64(at + WORDS_PER_RUN * share.runs)
+    evaluate(model, reading_state, maps.occupied, pairs, at, ratios, new)
+    m, weight = reading_state.bands, reading_state.weight
+    cell = np.uint64(at + WORDS_PER_RUN * reading_state.runs)
     log = cell + np.uint64(2 * m)
     for k in range(np.uint64(m)):
         maps.evidence[pairs.cell[cell + k]] += weight * (new[k] - pairs.log[log + k])
         pairs.log[log + k] = new[k]
-    _push_free(share, pairs, at, maps, (weight * (new[m] - share.occupy), weight * (new[m + 1] - share.release)))
-    _note(share, new)
+    _push_free(
+        reading_state,
+        pairs,
+        at,
+        maps,
+        (weight * (new[m] - reading_state.occupy), weight * (new[m + 1] - reading_state.release)),
+    )
+    _note(reading_state, new)
 
 
 @kernel
 def flip(s: State, c: int) -> None:
     """Flip cell c and bring the evidence of all cells up to date."""
-    n = find_seers(s, c)
-    maps, bench = s.maps, s.bench
+    n = find_observing(s, c)
+    maps, workspace = s.maps, s.workspace
     own = 0
     for i in range(n):
-        if s.seers[i, 1]:
-            share = s.shares[s.seers[i, 0]]
-            own += share.weight * (share.release - share.occupy)
-    # where the cell is in the free zone, its own share is that of an occupied cell from now on, or of a free one
+        if s.observing[i, 1]:
+            reading_state = s.reading_states[s.observing[i, 0]]
+            own += reading_state.weight * (reading_state.release - reading_state.occupy)
+    # where the cell is in the free zone, its own ratio is that of an occupied cell from now on, or of a free one
     maps.evidence[c] += -own if maps.occupied[c] else own
     maps.occupied[c] ^= 1
     note_flip(maps.pattern, c, s.lattice.height, s.lattice.width)
     step = 1 if maps.occupied[c] else -1
     s.clock[0] += 1
-    room = (s.ratios, bench.new)
+    room = (s.ratios, workspace.new)
     for i in range(n):
-        t = s.seers[i, 0]
-        share = s.shares[t]
-        if not share.stored:
-            make(s.cones, s.lattice, s.facing, t, bench.pairs, 0, bench)
+        t = s.observing[i, 0]
+        reading_state = s.reading_states[t]
+        if not reading_state.stored:
+            make(s.cones, s.lattice, s.normals, t, workspace.pairs, 0, workspace)
             maps.occupied[c] ^= 1
-            explain(s.model, share, maps.occupied, bench.pairs, 0, s.ratios, bench.new)
+            evaluate(s.model, reading_state, maps.occupied, workspace.pairs, 0, s.ratios, workspace.new)
             maps.occupied[c] ^= 1
-            log = WORDS_PER_RUN * share.runs + 2 * share.bands
-            for k in range(share.bands):
-                bench.pairs.log[log + k] = bench.new[k]
-        if s.seers[i, 1]:
-            share.blocking += step
-            share.through = s.model.share * (1.0 - s.model.p_hit) ** share.blocking
-        if share.stored:
-            _renew(s.model, share, maps, s.pairs, share.at, room)
+            log = WORDS_PER_RUN * reading_state.runs + 2 * reading_state.bands
+            for k in range(reading_state.bands):
+                workspace.pairs.log[log + k] = workspace.new[k]
+        if s.observing[i, 1]:
+            reading_state.blocking += step
+            reading_state.through = s.model.mixture_weight * (1.0 - s.model.p_hit) ** reading_state.blocking
+        if reading_state.stored:
+            _reevaluate(s.model, reading_state, maps, s.pairs, reading_state.at, room)
         else:
-            _renew(s.model, share, maps, bench.pairs, 0, room)
-        share.changed = s.clock[0]
+            _reevaluate(s.model, reading_state, maps, workspace.pairs, 0, room)
+        reading_state.changed = s.clock[0]

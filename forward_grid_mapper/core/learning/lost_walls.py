@@ -72,10 +72,10 @@ def lost_walls(before: MapSet, after: MapSet) -> list[Stretch]:
     heard = expectations(readings, before.grid, before.ml, before.parameters.model).hit > 0.5
     candidates = old & ~_grown(new, 1)
     rows, columns = whole.cells_of(readings.x, readings.y)
-    driven = np.zeros(whole.shape, bool)
+    traversed = np.zeros(whole.shape, bool)
     inside = (rows >= 0) & (rows < whole.height) & (columns >= 0) & (columns < whole.width)
-    driven[rows[inside], columns[inside]] = True
-    candidates &= ~_grown(driven, round(_DRIVEN / whole.resolution))
+    traversed[rows[inside], columns[inside]] = True
+    candidates &= ~_grown(traversed, round(_DRIVEN / whole.resolution))
     reading, cell = _arcs(readings, np.flatnonzero(heard & readings.echo), whole, candidates)
     lost = candidates & (np.bincount(cell, minlength=whole.size).reshape(whole.shape) >= LEAST_ECHOES)
     now = expectations(readings, after.grid, after.ml, after.parameters.model)

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from ..common.grid import Grid
 from ..common.readings import Floats, Readings
-from ..maps.log_odds_map import LiveMap
+from ..maps.log_odds_map import LogOddsMap
 from ..maps.map_set import MapSet
 from ..runtime.jit import kernel
 
@@ -176,7 +176,7 @@ def _from_free_space(maps: MapSet, sensor: int) -> NDArray[np.bool_]:
     """Return which echoes of a sensor come from where the live map of the other sensors is free, shape (N,)."""
     readings = maps.readings
     mine = (readings.sensor == sensor) & readings.echo
-    live = LiveMap(maps.parameters)
+    live = LogOddsMap(maps.parameters)
     live.add(readings.select(readings.sensor != sensor))
     chosen = readings.select(mine)
     rows, columns = live.grid.cells_of(

@@ -38,10 +38,10 @@ def _count(cones: Cones, unexplained: Any, nearest: bool, out: Any) -> None:
                         out[row, column] += 1.0
 
 
-def transient_echoes(
+def dynamic_echoes(
     readings: Readings, unexplained: NDArray[np.bool_], grid: Grid, ml: NDArray[np.int8], model: ModelParameters
 ) -> NDArray[np.float32]:
-    """Return how many echoes that the map does not explain end in each of its free cells, shape `grid.shape`.
+    """Return how many echoes that the map does not evaluate end in each of its free cells, shape `grid.shape`.
 
     Parameters
     ----------

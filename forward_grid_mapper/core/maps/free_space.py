@@ -30,7 +30,7 @@ def _obstacles(s: State, t: int, occupied: Any, squares: Any, left: Any) -> tupl
     Writes the squares of their distances, and into `left` (longer by one) what of T is left in front of each and
     behind the last. Returns how many there are, how many are in the free zone, and the least square of these.
     """
-    reading, share = s.cones[t], s.shares[t]
+    reading, reading_state = s.cones[t], s.reading_states[t]
     cone = cone_of(reading, s.lattice.nearest)
     n, blocking, near = 0, 0, np.inf
     for row in range(max(cone.bottom, 0), min(cone.top, s.lattice.height - 1) + 1):
@@ -52,20 +52,20 @@ def _obstacles(s: State, t: int, occupied: Any, squares: Any, left: Any) -> tupl
                         squares[k] = u * u + v * v
                         n += 1
     p = s.model.p_hit
-    weight = s.model.share * (1.0 - p) ** blocking
+    weight = s.model.mixture_weight * (1.0 - p) ** blocking
     peak = 1.0 / (math.sqrt(2.0 * math.pi) * reading.sigma * s.lattice.resolution)
     for k in range(n):
         error = (reading.z - math.sqrt(squares[k])) / reading.sigma
         left[k] = weight * p * peak * math.exp(-0.5 * error * error) if abs(error) <= s.lattice.cut else 0.0
         weight *= 1.0 - p
-    left[n] = weight * share.no_echo
+    left[n] = weight * reading_state.no_echo
     for k in range(n - 1, -1, -1):
         left[k] += left[k + 1]
     return n, blocking, near
 
 
 @kernel
-def count_passed(s: State, begin: int, end: int, random: Floats, lost: Floats, occupied: Any, passed: Any) -> None:
+def add_passes(s: State, begin: int, end: int, random: Floats, lost: Floats, occupied: Any, passed: Any) -> None:
     """Add to `passed` (int64, in units of UNIT) how likely the readings `begin` to `end` passed each of their cells.
 
     This looks at whole cones, what they graze included. `random` and `lost` are the densities p_rand / z_max and
@@ -75,9 +75,9 @@ def count_passed(s: State, begin: int, end: int, random: Floats, lost: Floats, o
     for t in range(begin, end):
         if s.stop[0]:
             break
-        reading, share = s.cones[t], s.shares[t]
+        reading, reading_state = s.cones[t], s.reading_states[t]
         n, blocking, near = _obstacles(s, t, occupied, squares, left)
-        scale = share.weight / ((random[t] + lost[t] + left[0]) * UNIT)
+        scale = reading_state.weight / ((random[t] + lost[t] + left[0]) * UNIT)
         chance = random[t] * scale if reading.z < reading.z_max else 0.0
         in_front = left[0] * scale + chance
         hidden = left[0] * scale + chance * (1.0 - s.model.p_hit) ** blocking
@@ -102,17 +102,17 @@ def count_passed(s: State, begin: int, end: int, random: Floats, lost: Floats, o
                         line[column] += int(weight * left[k] * scale)
 
 
-def passed_readings(evidence: Evidence, occupied: NDArray[np.uint8]) -> Floats:
+def expected_passes(evidence: Evidence, occupied: NDArray[np.uint8]) -> Floats:
     """Return how many readings are expected to have passed each cell of a map, shape (cells,)."""
     model = evidence.model
     random = model.p_rand / evidence.z_max
     # of an echo from almost as far as z_max too, so that it frees little more than a reading without any
-    lost = model.p_lost * evidence.state.shares['no_echo'][: len(evidence)]
+    lost = model.p_lost * evidence.state.reading_states['no_echo'][: len(evidence)]
     sums: list[NDArray[np.int64]] = []
 
     def work(s: State, begin: int, end: int) -> None:
         sums.append(np.zeros(evidence.grid.size, np.int64))
-        count_passed(s, begin, end, random, lost, occupied, sums[-1])
+        add_passes(s, begin, end, random, lost, occupied, sums[-1])
 
     evidence.each(0, len(evidence), work)
     total: Floats = np.sum(sums, axis=0) * UNIT

@@ -89,7 +89,19 @@ def arc_depth(parameters: Parameters) -> float:
     return max(parameters.live.live_depth, parameters.grid.resolution / 2)
 
 
-class LiveMap:
+def map_grid(readings: Readings, parameters: Parameters, within: Grid | None = None) -> Grid:
+    """Return the grid on which all maps of `readings` lie: every cell that a reading touches, and all of `within`.
+
+    Raises
+    ------
+    InputError
+        If there are no readings, or the grid would exceed `max_cells`.
+    """
+    p = parameters
+    return grid_of(readings, p.model, p.grid, within=within, beyond=arc_depth(p))
+
+
+class LogOddsMap:
     """The log-odds of every cell, NaN where not observed, on a grid that grows as readings come; 8 bytes a cell."""
 
     def __init__(self, parameters: Parameters) -> None:
@@ -115,7 +127,7 @@ class LiveMap:
             return
         p = self._parameters
         depth = arc_depth(p)
-        self.grid = grid_of(readings, p.model, p.grid, within=self.grid, beyond=depth)
+        self.grid = map_grid(readings, p, within=self.grid)
         self._grow()
         table = cone_table(readings, self._stored, dataclasses.replace(p.model, surface_offset=0.0))
         depth /= p.grid.resolution

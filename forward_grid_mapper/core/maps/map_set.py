@@ -27,7 +27,7 @@ class MapSet:
     uncertainty : float32
         The α-mixed marginals of eq 45; NaN where `ml` is unknown and the readings say next to nothing.
     readings : Readings
-        The readings that the maps explain.
+        The readings that the maps evaluate.
     unexplained : bool, shape (N,)
         Readings whose most likely cause, given the ML map, is chance (e_* above one half).
     log_likelihood : float
@@ -35,8 +35,8 @@ class MapSet:
     objective : float
         The log-likelihood plus the log prior odds of the occupied cells.
     parameters : Parameters
-    transient : float32
-        Echoes that the map does not explain and that end in free space: people, say (`transient`).
+    dynamic : float32
+        Echoes that the map does not evaluate and that end in free space: people, say (`dynamic`).
     statistics : dict
         Plain numbers about the run: pairs, flips, shifts, sweeps, converged, seconds by stage.
     """
@@ -50,7 +50,7 @@ class MapSet:
     log_likelihood: float
     objective: float
     parameters: Parameters
-    transient: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 0), np.float32))
+    dynamic: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 0), np.float32))
     statistics: dict[str, Any] = field(default_factory=dict)
 
     def with_live(self, grid: Grid, live: NDArray[np.float32]) -> MapSet:
@@ -68,7 +68,7 @@ class MapSet:
         uncertainty, shown = (np.full(whole.shape, np.nan, np.float32) for _ in range(2))
         uncertainty[whole.window(self.grid)] = self.uncertainty
         shown[whole.window(grid)] = live
-        transient = np.zeros(whole.shape, np.float32)
-        if self.transient.size:
-            transient[whole.window(self.grid)] = self.transient
-        return replace(self, grid=whole, live=shown, ml=ml, uncertainty=uncertainty, transient=transient)
+        dynamic = np.zeros(whole.shape, np.float32)
+        if self.dynamic.size:
+            dynamic[whole.window(self.grid)] = self.dynamic
+        return replace(self, grid=whole, live=shown, ml=ml, uncertainty=uncertainty, dynamic=dynamic)

@@ -2,7 +2,7 @@
 
 The search says of a cell that it is free where nothing makes it occupied. Whether anything went through it is another
 question. Given the map, each reading tells how likely it passed a cell on its way to whatever explains it: for a cell
-at distance d, with A the share of T from occupied cells up to d,
+at distance d, with A the part of T from occupied cells up to d,
 
     p(passed) = (T − A) / (c + T)
 
@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..evidence.evidence import Evidence
-from .free_space import passed_readings
+from .free_space import expected_passes
 from .wall_extension import extend
 
 
@@ -33,7 +33,7 @@ def _grown(cells: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return out
 
 
-def finish(evidence: Evidence, steps: int, least_passed: float, driven: NDArray[np.bool_]) -> NDArray[np.int8]:
+def post_process(evidence: Evidence, steps: int, least_passed: float, traversed: NDArray[np.bool_]) -> NDArray[np.int8]:
     """Return the ML map that is handed out, shape `grid.shape`: 1 occupied, 0 free, -1 not observed.
 
     Parameters
@@ -44,15 +44,15 @@ def finish(evidence: Evidence, steps: int, least_passed: float, driven: NDArray[
         Cells by which to draw walls out.
     least_passed : float
         Readings that must have passed a cell, or one beside it, for it to be free; 0 takes all cells that were seen.
-    driven : bool, shape `grid.shape`
+    traversed : bool, shape `grid.shape`
         Cells that are known to be free, though no reading may see them.
     """
     ml = evidence.observed()
     # no cone holds the middle of the robot
-    ml[driven & (ml < 0)] = 0
-    known = driven & (ml == 0)
+    ml[traversed & (ml < 0)] = 0
+    known = traversed & (ml == 0)
     if least_passed > 0:
-        passed = passed_readings(evidence, evidence.state.maps.occupied).reshape(ml.shape)
+        passed = expected_passes(evidence, evidence.state.maps.occupied).reshape(ml.shape)
         known |= (passed >= least_passed) & (ml == 0)
     if steps:
         ahead = np.zeros(ml.shape, np.uint8)

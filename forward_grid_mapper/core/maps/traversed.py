@@ -51,8 +51,8 @@ def _mark(x: Any, y: Any, stamp: Any, longest: float, out: Any) -> None:
                     out[row, column] = 1
 
 
-def mark_driven(x: Floats, y: Floats, stamp: NDArray[np.int64], grid: Grid, driven: NDArray[np.bool_]) -> None:
-    """Set in `driven` the cells where sensors were, and those between where they were at about the same time.
+def mark_traversed(x: Floats, y: Floats, stamp: NDArray[np.int64], grid: Grid, traversed: NDArray[np.bool_]) -> None:
+    """Set in `traversed` the cells where sensors were, and those between where they were at about the same time.
 
     Parameters
     ----------
@@ -61,15 +61,15 @@ def mark_driven(x: Floats, y: Floats, stamp: NDArray[np.int64], grid: Grid, driv
     stamp : int64, shape (N,)
         Nanoseconds.
     grid : Grid
-    driven : bool, shape `grid.shape`
+    traversed : bool, shape `grid.shape`
     """
     order = np.argsort(stamp, kind='stable')
     u, v = x[order] / grid.resolution - grid.column, y[order] / grid.resolution - grid.row
-    _mark(u, v, stamp[order], LONGEST_STEP / grid.resolution, driven.view(np.uint8))
+    _mark(u, v, stamp[order], LONGEST_STEP / grid.resolution, traversed.view(np.uint8))
 
 
-def driven_cells(readings: Readings, grid: Grid) -> NDArray[np.bool_]:
+def traversed_cells(readings: Readings, grid: Grid) -> NDArray[np.bool_]:
     """Return which cells lie where sensors were, or between where they were about then, shape `grid.shape`."""
     out = np.zeros(grid.shape, np.bool_)
-    mark_driven(readings.x, readings.y, readings.stamp, grid, out)
+    mark_traversed(readings.x, readings.y, readings.stamp, grid, out)
     return out

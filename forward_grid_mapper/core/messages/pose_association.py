@@ -1,7 +1,7 @@
-"""Placing of readings: messages in any interleaving → readings in the map frame, every rejection counted by reason.
+"""Pose association: messages in any interleaving → readings in the map frame, every rejection counted by reason.
 
-One `Placer` serves the offline tool and the node. Where a reading goes is decided by message stamps alone, so the
-same messages give the same readings however fast they arrive; a clock is asked only how long one has waited already.
+One `PoseAssociator` serves the offline tool and the node. Message stamps alone decide where a reading goes, so the same
+messages give the same readings however fast they arrive. A clock is asked only how long a reading has waited already.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ class Later:
 
 LATER = Later()
 
-MountLookup = Callable[[str, str, int], 'Pose2 | Later | None']
+ExtrinsicsLookup = Callable[[str, str, int], 'Pose2 | Later | None']
 """(base frame, sensor frame, stamp in ns) → pose of the sensor in the base frame, `LATER`, or None if unknown."""
 
 
@@ -87,7 +87,7 @@ def _possible(pose: Pose2) -> bool:
     return abs(pose.x) < FARTHEST and abs(pose.y) < FARTHEST and math.isfinite(pose.yaw)
 
 
-class Placer:
+class PoseAssociator:
     """Takes Range and Odometry one at a time, in any interleaving, and keeps the readings it could place.
 
     Attributes
@@ -110,7 +110,7 @@ class Placer:
 
     def __init__(
         self,
-        mounts: MountLookup,
+        extrinsics: ExtrinsicsLookup,
         parameters: Parameters | None = None,
         patient: bool = False,
         clock: Callable[[], float] = time.monotonic,
@@ -119,7 +119,7 @@ class Placer:
 
         Parameters
         ----------
-        mounts : callable
+        extrinsics : callable
             Tells where a sensor sits on the robot.
         parameters : Parameters, optional
         patient : bool
@@ -130,8 +130,8 @@ class Placer:
             and by this clock: so neither a bag that is replayed fast nor a simulation that stands still loses any.
         """
         self._clock = clock
-        self._mounts = mounts
-        self.parameters = (parameters or Parameters()).placing
+        self._extrinsics = extrinsics
+        self.parameters = (parameters or Parameters()).association
         self._all = parameters or Parameters()
         self._box = (math.inf, -math.inf, math.inf, -math.inf)
         self._patient = patient
@@ -289,7 +289,7 @@ class Placer:
     def _reject_unknown(self, measured: _Measurement) -> None:
         if len(self.unknown_frames) < MOST_FRAMES:
             self.unknown_frames.add(measured.frame_id)
-        self._reject(measured.frame_id, 'unknown_mount')
+        self._reject(measured.frame_id, 'unknown_extrinsics')
 
     def _jump_back(self) -> None:
         self._settle_up_to(self._stamps[-1])
@@ -330,7 +330,7 @@ class Placer:
                 if measured.stamp < limit and measured.arrival < oldest:
                     self._reject_unknown(measured)
                 else:
-                    self._mount(measured, pose)
+                    self._add_extrinsics(measured, pose)
 
     def _drop_the_future(self, newest: int, patience: float) -> None:
         """Reject what odometry should have reached by now, by its own stamps and by the clock."""
@@ -370,18 +370,18 @@ class Placer:
                 return
             fraction = (measured.stamp - stamps[after - 1]) / gap
             pose = interpolate(self._poses[after - 1], self._poses[after], fraction)
-        self._mount(measured, pose)
+        self._add_extrinsics(measured, pose)
 
-    def _mount(self, measured: _Measurement, pose: Pose2) -> None:
+    def _add_extrinsics(self, measured: _Measurement, pose: Pose2) -> None:
         """Add the sensor's pose on the robot to the robot's, and keep the reading."""
-        mount = self._mounts(self.base_frame, measured.frame_id, measured.stamp)
-        if isinstance(mount, Later):
+        extrinsic = self._extrinsics(self.base_frame, measured.frame_id, measured.stamp)
+        if isinstance(extrinsic, Later):
             self._held.append((measured, pose))
             return
-        if mount is None:
+        if extrinsic is None:
             self._reject_unknown(measured)
             return
-        sensor = pose.compose(mount)
+        sensor = pose.compose(extrinsic)
         reason = self._misfit(sensor, measured)
         if reason:
             self._reject(measured.frame_id, reason)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from ..common.parameters import PlacingParameters
+from ..common.parameters import AssociationParameters
 from .message_types import RangeMessage
 
 REASONS = {
@@ -16,7 +16,7 @@ REASONS = {
     'bad_field_of_view': 'the field of view is not between 0 and 180 degrees; parameter field_of_view overrides it',
     'empty_frame_id': 'the header has no frame_id, so the sensor is unknown',
     'long_frame_id': 'the frame_id has more than 255 characters',
-    'unknown_mount': 'nothing tells where this frame is on the robot: give --sensor, a YAML or a transform',
+    'unknown_extrinsics': 'nothing tells where this frame is on the robot: give --sensor, a YAML or a transform',
     'before_odometry': 'the stamp is before the first odometry, or the message came minutes late',
     'after_odometry': 'the recording ended before odometry reached the stamp',
     'no_odometry': 'odometry did not reach the stamp within pose_timeout',
@@ -64,7 +64,7 @@ class _Measurement:
         return (self.stamp, self.number) < (other.stamp, other.number)
 
 
-def measure(message: RangeMessage, parameters: PlacingParameters) -> _Measurement | str:
+def measure(message: RangeMessage, parameters: AssociationParameters) -> _Measurement | str:
     """Apply REP 117 and the overrides to one Range message; return what it says, or the reason of its rejection.
 
     A fixed-distance ranger (min_range = max_range) answers -inf for "something within max_range" and +inf for

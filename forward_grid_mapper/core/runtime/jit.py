@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import hashlib
 import os
+import shutil
 import tempfile
+import time
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
@@ -13,6 +16,15 @@ import numba
 
 config: Any = numba.config
 F = TypeVar('F', bound=Callable[..., Any])
+
+CORE = Path(__file__).parents[1]
+"""The folder below which all kernels are."""
+
+PREFIX = 'kernels_'
+
+UNUSED = 24 * 3600
+"""Seconds after its last start from which on machine code of other sources is removed; a process that runs longer has
+all of its kernels in memory."""
 
 
 def _writable(folder: Path) -> bool:
@@ -31,11 +43,10 @@ def _cache_folder() -> str:
     depends on all sources. It lies beside them, in the user's cache where they are read-only, or in a temporary folder
     where the home is as well, which still spares later starts the compilation.
     """
-    here = Path(__file__).parent
-    sources = b''.join(path.read_bytes() for path in sorted(here.glob('*.py')))
-    name = f'kernels_{hashlib.sha256(sources).hexdigest()[:16]}'
+    sources = b''.join(path.read_bytes() for path in sorted(CORE.rglob('*.py')))
+    name = f'{PREFIX}{hashlib.sha256(sources).hexdigest()[:16]}'
     home = Path(os.environ.get('XDG_CACHE_HOME') or Path(os.environ.get('HOME', '/')) / '.cache')
-    for folder in (config.CACHE_DIR, here / '__pycache__', home / 'forward_grid_mapper'):
+    for folder in (config.CACHE_DIR, CORE / '__pycache__', home / 'forward_grid_mapper'):
         if folder and _writable(Path(folder)):
             return str(Path(folder) / name)
     shared = Path(tempfile.gettempdir()) / f'forward_grid_mapper_{os.getuid()}'
@@ -47,7 +58,19 @@ def _cache_folder() -> str:
     return str(shared / name)
 
 
+def _remove_unused(cache: Path) -> None:
+    """Remove the machine code of other sources beside `cache` that no process has started with for a day."""
+    with suppress(OSError):
+        cache.mkdir(parents=True, exist_ok=True)
+        # numba reads the folder, and does not touch it
+        os.utime(cache)
+        for other in cache.parent.glob(f'{PREFIX}*'):
+            if other != cache and time.time() - other.stat().st_mtime > UNUSED:
+                shutil.rmtree(other, ignore_errors=True)
+
+
 CACHE = _cache_folder()
+_remove_unused(Path(CACHE))
 
 
 def kernel(function: F) -> F:

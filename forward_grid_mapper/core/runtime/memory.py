@@ -10,9 +10,6 @@ import resource
 from pathlib import Path
 
 from ..common.parameters import Parameters
-from ..common.readings import Readings
-from ..maps.log_odds_map import arc_depth
-from ..sensor.cone_table import grid_of
 
 BYTES_A_READING = 400
 """What the search keeps for a reading without its pairs, twice over where arrays are sorted or grow."""
@@ -22,11 +19,9 @@ BYTES_A_CELL = 60
 CGROUP = Path('/sys/fs/cgroup')
 
 
-def least_memory(readings: Readings, parameters: Parameters) -> int:
-    """Return the bytes that EM of these readings takes at the least, without memory for pairs."""
-    p = parameters
-    cells = grid_of(readings, p.model, p.grid, beyond=arc_depth(p)).size if len(readings) else 0
-    return cells * BYTES_A_CELL + len(readings) * BYTES_A_READING
+def least_memory(cells: int, readings: int) -> int:
+    """Return the bytes that EM of so many readings on so many cells takes at the least, without memory for pairs."""
+    return cells * BYTES_A_CELL + readings * BYTES_A_READING
 
 
 def memory_for_pairs(parameters: Parameters) -> float:
@@ -46,13 +41,13 @@ def free_memory() -> int | None:
     return max(min(known), 0) if known else None
 
 
-def shortage(readings: Readings, parameters: Parameters) -> str:
-    """Return why EM of these readings cannot fit the memory; empty if it may."""
-    free, needed = free_memory(), least_memory(readings, parameters)
+def shortage(cells: int, readings: int) -> str:
+    """Return why EM of so many readings on so many cells cannot fit the memory; empty if it may."""
+    free, needed = free_memory(), least_memory(cells, readings)
     if free is None or needed <= free:
         return ''
     return (
-        f'EM of {len(readings)} readings takes {needed / 1e9:.1f} GB at the least, and {free / 1e9:.1f} GB are free; '
+        f'EM of {readings} readings takes {needed / 1e9:.1f} GB at the least, and {free / 1e9:.1f} GB are free; '
         f'lower max_readings, use a coarser resolution, or reset'
     )
 

@@ -102,7 +102,7 @@ def flip_in_order(s: State, prior: Prior, least: Least, cells: NDArray[np.int64]
 
 
 @kernel
-def free_needless(s: State, prior: Prior, least: Least, cells: NDArray[np.int64]) -> tuple[int, float]:
+def free_unneeded(s: State, prior: Prior, least: Least, cells: NDArray[np.int64]) -> tuple[int, float]:
     """Free those of `cells`, occupied ones, that cost nothing but rounding to free; return their number and gain."""
     flips, total = 0, 0.0
     for c in cells:

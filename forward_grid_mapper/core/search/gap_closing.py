@@ -19,14 +19,13 @@ from ..evidence.fixed_point import QUANTUM
 from ..evidence.state import State
 from ..evidence.updates import flip
 from ..runtime.jit import kernel
-from .flips import gain_of
-from .moves import Least
+from .flips import Least, gain_of
 from .prior import Prior
 
 MOST_AGAINST_CELL = 1.0
 """Nats."""
 
-MOST_AGAINST_BRIDGE = 4.0
+MOST_AGAINST_GAP = 4.0
 """Nats."""
 
 MOST_AGAINST_PASSAGE = 1.5
@@ -65,11 +64,11 @@ def _path(s: State, c: int, dx: int, dy: int, path: Any) -> bool:
         against -= data
         path[i - 1] = o
     passage = (n - 1) * s.lattice.resolution > PASSAGE
-    return against <= (MOST_AGAINST_PASSAGE if passage else MOST_AGAINST_BRIDGE)
+    return against <= (MOST_AGAINST_PASSAGE if passage else MOST_AGAINST_GAP)
 
 
 @kernel
-def _build(s: State, prior: Prior, least: Least, path: Any, n: int) -> float:
+def _close(s: State, prior: Prior, least: Least, path: Any, n: int) -> float:
     """Flip the first n cells of `path`; flip them back, and return 0, if that does not gain enough."""
     gain, needed = 0.0, 10.0 * least[0]
     for i in range(n):
@@ -84,7 +83,7 @@ def _build(s: State, prior: Prior, least: Least, path: Any, n: int) -> float:
 
 
 @kernel
-def build_bridges(s: State, prior: Prior, least: Least, cells: NDArray[np.int64], longest: int) -> tuple[int, float]:
+def close_gaps(s: State, prior: Prior, least: Least, cells: NDArray[np.int64], longest: int) -> tuple[int, float]:
     """Build the bridges that gain, the shortest first; return the number of flips and the total gain.
 
     `cells` are the occupied ones to start from.
@@ -112,7 +111,7 @@ def build_bridges(s: State, prior: Prior, least: Least, cells: NDArray[np.int64]
                     if not _leaves(pattern[c], dx, dy) or not _leaves(pattern[o], -dx, -dy):
                         continue
                     if _path(s, c, dx, dy, path):
-                        gain = _build(s, prior, least, path, n - 1)
+                        gain = _close(s, prior, least, path, n - 1)
                         if gain > 0.0:
                             flips += n - 1
                             total += gain

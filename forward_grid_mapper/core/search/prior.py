@@ -1,4 +1,4 @@
-"""The prior of a map: how likely cells are occupied, given what is driven over and given their neighbours.
+"""The prior of a map: how likely cells are occupied, given what is traversed over and given their neighbours.
 
     log p(m) = Σ over occupied cells c of [ local(c) + shape(the occupied ones of its eight neighbours) ]
 
@@ -56,10 +56,10 @@ def shapes(parameters: SearchParameters) -> Floats:
     return out
 
 
-def local_prior(parameters: SearchParameters, driven: NDArray[np.bool_]) -> Floats:
-    """Return the log prior odds of each cell by itself, given which are `driven` over; the same shape."""
+def local_prior(parameters: SearchParameters, traversed: NDArray[np.bool_]) -> Floats:
+    """Return the log prior odds of each cell by itself, given which are `traversed` over; the same shape."""
     odds = math.log(parameters.prior / (1 - parameters.prior))
-    out: Floats = np.where(driven, odds - parameters.driven_cost, odds)
+    out: Floats = np.where(traversed, odds - parameters.driven_cost, odds)
     return out
 
 

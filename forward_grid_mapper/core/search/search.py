@@ -27,19 +27,10 @@ from ..evidence.evidence import Evidence
 from ..evidence.state import State
 from ..runtime.cancelling import check
 from ..sensor.cone_table import Floats
-from .gap_closing import build_bridges
-from .moves import (
-    best_shifts,
-    flip_in_order,
-    free_needless,
-    highest,
-    promising,
-    see_any,
-    shift_in_order,
-    try_shifts,
-    unsettle,
-)
+from .flips import flip_in_order, free_unneeded, highest, promising
+from .gap_closing import close_gaps
 from .prior import Prior, local_prior, log_prior, shapes
+from .shifts import best_shifts, see_any, shift_in_order, try_shifts, unsettle
 
 LEAST_GAIN = 1e-4
 """Nats that a flip must gain."""
@@ -106,7 +97,7 @@ class Search:
         self,
         evidence: Evidence,
         parameters: SearchParameters,
-        driven: NDArray[np.bool_] | None = None,
+        traversed: NDArray[np.bool_] | None = None,
         window: Window | None = None,
     ) -> None:
         """Start from the map that `evidence` has.
@@ -115,7 +106,7 @@ class Search:
         ----------
         evidence : Evidence
         parameters : SearchParameters
-        driven : bool, shape (cells,), optional
+        traversed : bool, shape (cells,), optional
             Cells over which sensors were moved.
         window : optional
             First row, last one plus one, and columns likewise, of the cells that may change; by default all.
@@ -123,8 +114,8 @@ class Search:
         self.evidence, self._parameters = evidence, parameters
         height, width = evidence.grid.shape
         self._window = window or (0, height, 0, width)
-        driven = np.zeros(evidence.grid.size, np.bool_) if driven is None else driven
-        self._whole = Prior(local_prior(parameters, driven), shapes(parameters))
+        traversed = np.zeros(evidence.grid.size, np.bool_) if traversed is None else traversed
+        self._whole = Prior(local_prior(parameters, traversed), shapes(parameters))
         # as if cells were independent
         self._prior = self._whole._replace(shape=np.zeros(256))
         self._settled = np.zeros(evidence.grid.size, np.uint8)
@@ -177,7 +168,11 @@ class Search:
         """Flip, shift and bridge until nothing gains; return whether that was reached."""
         p = self._parameters
         while self._more():
-            if self._sweep(watch) or (p.shift_moves and self._shift(watch)) or (p.bridges > 1 and self._bridge(watch)):
+            if (
+                self._sweep(watch)
+                or (p.shift_moves and self._shift(watch))
+                or (p.bridges > 1 and self._close_gaps(watch))
+            ):
                 continue
             if not self._free(watch):
                 return True
@@ -257,13 +252,13 @@ class Search:
     def _free(self, watch: Watch) -> int:
         """Free cells that nothing needs, as rounds leave them where the prior does not speak against them."""
         cells = self._occupied()
-        flips, gain = free_needless(self.evidence.state, self._prior, LEAST, cells)
+        flips, gain = free_unneeded(self.evidence.state, self._prior, LEAST, cells)
         if flips:
             self._advance(flips, 0, max(gain, 0.0), watch)
         return flips
 
-    def _bridge(self, watch: Watch) -> int:
+    def _close_gaps(self, watch: Watch) -> int:
         s = self.evidence.state
-        flips, gain = build_bridges(s, self._prior, LEAST, self._occupied(), self._parameters.bridges)
+        flips, gain = close_gaps(s, self._prior, LEAST, self._occupied(), self._parameters.bridges)
         self._advance(flips, 0, gain, watch)
         return flips

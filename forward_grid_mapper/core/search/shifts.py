@@ -1,7 +1,7 @@
 """The search's moves: single flips, many flips together, and shifts of occupied cells to a neighbour.
 
 A shift frees cell c and occupies its neighbour o. What it gains follows from the single flips, since T is linear in
-each cell's share. For a reading that sees both, with likelihood ratios r_c and r_o of the single flips and
+each cell's reading_state. For a reading that sees both, with likelihood ratios r_c and r_o of the single flips and
 q = 1 − p_hit, both together have the ratio
 
     o behind c              r_c + (r_o − 1) / q
@@ -23,30 +23,30 @@ from ..evidence.fixed_point import QUANTUM
 from ..evidence.neighbourhood import note_flip
 from ..evidence.pairs import WORDS_PER_RUN, Pairs, make
 from ..evidence.state import State
-from ..evidence.updates import explain, find_seers, flip
+from ..evidence.updates import evaluate, find_observing, flip
 from ..runtime.jit import kernel
 from ..sensor.cone_table import Floats
 from .flips import Least, _least, gain_of
 from .prior import Prior
 
 LEAST_JOINT = 1e-9
-"""Ratios of shifts are differences, and rounding may leave nothing of the smallest."""
+"""RatioWorkspace of shifts are differences, and rounding may leave nothing of the smallest."""
 
 
 @kernel
 def unsettle(s: State, since: int, settled: Any) -> None:
     """Mark the cells of all readings that changed after the clock was `since` as not settled."""
-    bench = s.bench
-    for t in range(len(s.shares)):
-        share = s.shares[t]
-        if share.changed > since:
-            pairs, at = (s.pairs, share.at) if share.stored else (bench.pairs, 0)
-            if not share.stored:
-                make(s.cones, s.lattice, s.facing, t, bench.pairs, 0, bench)
-            begin = at + WORDS_PER_RUN * share.runs
+    workspace = s.workspace
+    for t in range(len(s.reading_states)):
+        reading_state = s.reading_states[t]
+        if reading_state.changed > since:
+            pairs, at = (s.pairs, reading_state.at) if reading_state.stored else (workspace.pairs, 0)
+            if not reading_state.stored:
+                make(s.cones, s.lattice, s.normals, t, workspace.pairs, 0, workspace)
+            begin = at + WORDS_PER_RUN * reading_state.runs
             for k in range(at, begin, WORDS_PER_RUN):
                 settled[pairs.cell[k] : pairs.cell[k + 1] + 1] = 0
-            for k in range(begin, begin + share.bands):
+            for k in range(begin, begin + reading_state.bands):
                 settled[pairs.cell[k]] = 0
 
 
@@ -54,8 +54,8 @@ def unsettle(s: State, since: int, settled: Any) -> None:
 def see_any(s: State, cells: NDArray[np.int64], sees: Any) -> None:
     """Mark in `sees` (uint8, shape (N,)) the readings that see any of `cells`."""
     for c in cells:
-        for i in range(find_seers(s, c)):
-            sees[s.seers[i, 0]] = 1
+        for i in range(find_observing(s, c)):
+            sees[s.observing[i, 0]] = 1
 
 
 @kernel
@@ -67,7 +67,9 @@ def _in_runs(pairs: Pairs, at: int, runs: int, c: int) -> bool:
 
 
 @kernel
-def _add_joint(s: State, share: Any, pairs: Pairs, at: int, cell: tuple[int, int], place: Any, joint: Any) -> None:
+def _add_joint(
+    s: State, reading_state: Any, pairs: Pairs, at: int, cell: tuple[int, int], place: Any, joint: Any
+) -> None:
     """Add to `joint` (9,) what a reading says of shifting a cell to each of its neighbours, beyond the two flips.
 
     Parameters
@@ -80,8 +82,8 @@ def _add_joint(s: State, share: Any, pairs: Pairs, at: int, cell: tuple[int, int
     c, here = cell
     height, width = s.lattice.height, s.lattice.width
     q = 1.0 - s.model.p_hit
-    logs = at + WORDS_PER_RUN * share.runs + 2 * share.bands
-    own = pairs.log[logs + here] if here >= 0 else share.release
+    logs = at + WORDS_PER_RUN * reading_state.runs + 2 * reading_state.bands
+    own = pairs.log[logs + here] if here >= 0 else reading_state.release
     ratio = math.exp(own * QUANTUM)
     row, column = c // width, c % width
     for dy in range(-1, 2):
@@ -96,13 +98,13 @@ def _add_joint(s: State, share: Any, pairs: Pairs, at: int, cell: tuple[int, int
                 log = pairs.log[logs + there]
                 other = math.exp(log * QUANTUM)
                 together = ratio + (other - 1.0) / q if there > here else other + q * (ratio - 1.0)
-            elif _in_runs(pairs, at, share.runs, o):
-                log = share.occupy
+            elif _in_runs(pairs, at, reading_state.runs, o):
+                log = reading_state.occupy
                 together = math.exp(log * QUANTUM) + q * (ratio - 1.0) if here >= 0 else 1.0
             else:
                 continue
             gain = math.log(max(together, LEAST_JOINT)) / QUANTUM - own - log
-            joint[3 * dy + dx + 4] += share.weight * int(math.floor(gain + 0.5))
+            joint[3 * dy + dx + 4] += reading_state.weight * int(math.floor(gain + 0.5))
 
 
 @kernel
@@ -120,38 +122,38 @@ def try_shifts(s: State, readings: Any, slot: Any, place: Any, joint: Any) -> No
     joint : int64, shape (rows, 9)
         By neighbour, row by row; added to. What it says of occupied neighbours means nothing.
     """
-    bench = s.bench
+    workspace = s.workspace
     for t in readings:
         if s.stop[0]:
             break
-        share = s.shares[t]
-        pairs, at = (s.pairs, share.at) if share.stored else (bench.pairs, 0)
-        if not share.stored:
-            make(s.cones, s.lattice, s.facing, t, bench.pairs, 0, bench)
-            explain(s.model, share, s.maps.occupied, bench.pairs, 0, s.ratios, bench.new)
-            log = WORDS_PER_RUN * share.runs + 2 * share.bands
-            for k in range(share.bands):
-                bench.pairs.log[log + k] = bench.new[k]
-        cells = at + WORDS_PER_RUN * share.runs
+        reading_state = s.reading_states[t]
+        pairs, at = (s.pairs, reading_state.at) if reading_state.stored else (workspace.pairs, 0)
+        if not reading_state.stored:
+            make(s.cones, s.lattice, s.normals, t, workspace.pairs, 0, workspace)
+            evaluate(s.model, reading_state, s.maps.occupied, workspace.pairs, 0, s.ratios, workspace.new)
+            log = WORDS_PER_RUN * reading_state.runs + 2 * reading_state.bands
+            for k in range(reading_state.bands):
+                workspace.pairs.log[log + k] = workspace.new[k]
+        cells = at + WORDS_PER_RUN * reading_state.runs
         n = 0
-        for k in range(share.bands):
+        for k in range(reading_state.bands):
             if slot[pairs.cell[cells + k]] >= 0:
-                bench.bucket[n] = k
+                workspace.bucket[n] = k
                 n += 1
-        if not n and not share.blocking:
+        if not n and not reading_state.blocking:
             continue
-        for k in range(share.bands):
+        for k in range(reading_state.bands):
             place[pairs.cell[cells + k]] = k
         for i in range(n):
-            k = bench.bucket[i]
+            k = workspace.bucket[i]
             c = int(pairs.cell[cells + k])
-            _add_joint(s, share, pairs, at, (c, k), place, joint[slot[c]])
-        if share.blocking:
+            _add_joint(s, reading_state, pairs, at, (c, k), place, joint[slot[c]])
+        if reading_state.blocking:
             for k in range(at, cells, WORDS_PER_RUN):
                 for c in range(pairs.cell[k], pairs.cell[k + 1] + 1):
                     if slot[c] >= 0:
-                        _add_joint(s, share, pairs, at, (c, -1), place, joint[slot[c]])
-        for k in range(share.bands):
+                        _add_joint(s, reading_state, pairs, at, (c, -1), place, joint[slot[c]])
+        for k in range(reading_state.bands):
             place[pairs.cell[cells + k]] = -1
 
 

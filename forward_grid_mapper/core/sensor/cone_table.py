@@ -2,7 +2,7 @@
 
 A reading of range z splits its cone. In the *free zone*, up to z − cut·σ, the noise density is nil: an occupied cell
 there acts only by standing in the way, so its distance does not matter. In the *band* around z lie the cells that can
-explain the reading. Cells beyond the band cannot matter, unless z is near z_max: then all cells up to z_max stand in
+evaluate the reading. Cells beyond the band cannot matter, unless z is near z_max: then all cells up to z_max stand in
 the way of the max-range cause.
 
 Distances are to the centres of cells, but it is a surface that echoes, and that lies before the centre: anywhere
@@ -135,7 +135,7 @@ def walk(table: Any, t: int, shape: Any, nearest: bool, cells: Any, distances: A
 
 
 @kernel
-def walk_with_room(
+def walk_resized(
     table: Any, t: int, shape: Any, nearest: bool, cells: Any, distances: Any
 ) -> tuple[int, NDArray[np.int32], Floats]:
     """Do as `walk` does; where the arrays are too short, go on with longer ones. Return them after the number."""

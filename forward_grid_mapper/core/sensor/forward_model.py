@@ -25,7 +25,7 @@ from ..common.grid import Grid
 from ..common.parameters import ModelParameters
 from ..common.readings import Readings
 from ..runtime.jit import kernel
-from .cone_table import Cones, Floats, cone_table, walk_with_room
+from .cone_table import Cones, Floats, cone_table, walk_resized
 
 
 class Causes(NamedTuple):
@@ -33,8 +33,8 @@ class Causes(NamedTuple):
 
     Attributes
     ----------
-    p_hit, share : float
-        Share is 1 − p_rand − p_lost.
+    p_hit, mixture_weight : float
+        The latter is 1 − p_rand − p_lost.
     random, lost : float64, shape (N,)
         The densities p_rand / z_max and, where there is no echo, p_lost · N(z; z_max, σ) in 1/m.
     no_echo : float64, shape (N,)
@@ -42,7 +42,7 @@ class Causes(NamedTuple):
     """
 
     p_hit: float
-    share: float
+    mixture_weight: float
     random: Floats
     lost: Floats
     no_echo: Floats
@@ -68,11 +68,11 @@ class Expectations:
 
 def causes_of(readings: Readings, sigma: Floats, model: ModelParameters) -> Causes:
     """Return the map-independent terms of each reading; `sigma` is that of `effective_sigma`."""
-    share = 1.0 - model.p_rand - model.p_lost
+    mixture_weight = 1.0 - model.p_rand - model.p_lost
     error = (readings.z_max - readings.z) / sigma
     density = np.where(error <= model.cut, np.exp(-0.5 * error**2) / (math.sqrt(2 * math.pi) * sigma), 0.0)
     lost = np.where(readings.echo, 0.0, model.p_lost * density)
-    return Causes(model.p_hit, share, model.p_rand / readings.z_max, lost, density)
+    return Causes(model.p_hit, mixture_weight, model.p_rand / readings.z_max, lost, density)
 
 
 @kernel
@@ -84,7 +84,7 @@ def _expect(
     flat = occupied.ravel()
     cells, distances = np.empty(1024, np.int32), np.empty(1024, np.float64)
     for t in range(len(table)):
-        n, cells, distances = walk_with_room(table, t, (height, width), nearest, cells, distances)
+        n, cells, distances = walk_resized(table, t, (height, width), nearest, cells, distances)
         m = 0
         for k in range(n):
             if flat[cells[k]] == 1:
@@ -92,7 +92,7 @@ def _expect(
                 m += 1
         hits = np.sort(distances[:m])
         sigma = table[t].sigma
-        weight = causes.share
+        weight = causes.mixture_weight
         hit, rank, squared = 0.0, 0.0, 0.0
         for k in range(m):
             error = (table[t].z - hits[k]) / sigma

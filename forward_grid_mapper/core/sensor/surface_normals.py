@@ -1,4 +1,4 @@
-"""Which way surfaces face, and which readings only graze them.
+"""Normals of surfaces, and which readings exceed the incidence angle at which a surface returns an echo.
 
 Sound that meets a smooth surface at a slant does not come back. So a reading that reaches past a surface contradicts it
 only if it met the surface nearly along its normal. Most of what speaks against walls that are there, in recordings
@@ -31,13 +31,13 @@ LEAST_AGREEMENT = 0.5
 """Length of the mean of the doubled bearings that it takes, 1 where all agree."""
 
 THROUGH = 2.0
-"""A reading that grazes a cell does not contradict it if its range is this many σ beyond."""
+"""A reading that exceeds_incidence_angle a cell does not contradict it if its range is this many σ beyond."""
 
 QUANTUM = 2.0**-20
 """Unit of the sums, which as whole numbers do not depend on their order."""
 
 
-class Facing(NamedTuple):
+class SurfaceNormals(NamedTuple):
     """The normals of surfaces.
 
     Attributes
@@ -47,21 +47,21 @@ class Facing(NamedTuple):
         Unit vector along the normal, either way.
     before : int32, shape (height, width + 1)
         Number of known cells in each row before a column.
-    slant : float
-        Squared cosine of the angle off the normal above which a reading grazes; 0 if none does.
+    cos2_limit : float
+        Squared cosine of the angle off the normal above which a reading exceeds_incidence_angle; 0 if none does.
     """
 
     known: NDArray[np.uint8]
     x: NDArray[np.float32]
     y: NDArray[np.float32]
     before: NDArray[np.int32]
-    slant: float
+    cos2_limit: float
 
 
-def no_facing() -> Facing:
-    """Return that no reading grazes."""
+def no_normals() -> SurfaceNormals:
+    """Return that no reading exceeds_incidence_angle."""
     none = np.zeros(0, np.float32)
-    return Facing(np.zeros(0, np.uint8), none, none, np.zeros((1, 1), np.int32), 0.0)
+    return SurfaceNormals(np.zeros(0, np.uint8), none, none, np.zeros((1, 1), np.int32), 0.0)
 
 
 @kernel
@@ -101,7 +101,7 @@ def _box(values: NDArray[np.int64]) -> NDArray[np.float64]:
     return out
 
 
-def facing_of(sums: NDArray[np.int64], shape: tuple[int, int], angle: float) -> Facing:
+def normals_of(sums: NDArray[np.int64], shape: tuple[int, int], angle: float) -> SurfaceNormals:
     """Return the normals that the sums of `gather` give; readings graze more than `angle` (radians) off them."""
     cosine, sine, mass = (_box(values.reshape(shape)) for values in sums)
     agreement = np.hypot(cosine, sine)
@@ -109,7 +109,7 @@ def facing_of(sums: NDArray[np.int64], shape: tuple[int, int], angle: float) -> 
     normal = np.arctan2(sine, cosine) / 2
     before = np.zeros((shape[0], shape[1] + 1), np.int32)
     np.cumsum(known, axis=1, out=before[:, 1:])
-    return Facing(
+    return SurfaceNormals(
         known.ravel().view(np.uint8),
         np.cos(normal).ravel().astype(np.float32),
         np.sin(normal).ravel().astype(np.float32),
@@ -119,13 +119,13 @@ def facing_of(sums: NDArray[np.int64], shape: tuple[int, int], angle: float) -> 
 
 
 @kernel
-def grazes(facing: Facing, reading: Any, c: int, u: float, v: float) -> bool:
-    """Tell whether a reading meets cell c, at (u, v) from its apex, at a slant, and goes on beyond it."""
-    if not facing.known[c]:
+def exceeds_incidence_angle(normals: SurfaceNormals, reading: Any, c: int, u: float, v: float) -> bool:
+    """Tell whether a reading meets cell c, at (u, v) from its apex, beyond the incidence angle, and goes on."""
+    if not normals.known[c]:
         return False
     square = u * u + v * v
     through = reading.z - THROUGH * reading.sigma
     if through <= 0.0 or square >= through * through:
         return False
-    along = u * facing.x[c] + v * facing.y[c]
-    return bool(along * along < facing.slant * square)
+    along = u * normals.x[c] + v * normals.y[c]
+    return bool(along * along < normals.cos2_limit * square)

@@ -16,9 +16,9 @@ from forward_grid_mapper.core.common.errors import Cancelled
 from forward_grid_mapper.core.common.grid import Grid
 from forward_grid_mapper.core.common.parameters import GridParameters, ModelParameters
 from forward_grid_mapper.core.common.readings import Readings
-from forward_grid_mapper.core.evidence.evidence import Evidence, share_table
+from forward_grid_mapper.core.evidence.evidence import Evidence, reading_state_table
 from forward_grid_mapper.core.evidence.fixed_point import QUANTUM
-from forward_grid_mapper.core.evidence.updates import _zone, find_seers, flip
+from forward_grid_mapper.core.evidence.updates import _zone, find_observing, flip
 from forward_grid_mapper.core.runtime import threads
 from forward_grid_mapper.core.search.flips import gain_of
 from forward_grid_mapper.core.search.prior import Prior
@@ -78,9 +78,9 @@ def snapshot(evidence: Evidence, logs: bool = True) -> list[object]:
     """All that is kept for readings and cells, but for when they changed and where they lie."""
     s, n = evidence.state, len(evidence)
     kept = ('floor', 'no_echo', 'through', 'runs', 'bands', 'blocking', 'weight', 'occupy', 'release', 'likelihood')
-    shares = [s.shares[name][:n].tolist() for name in kept]
-    stored = [naive.pairs_of(s, t) for t in range(n) if s.shares[t]['stored']] if logs else []
-    return [*(array.tolist() for array in s.maps), *shares, stored, evidence.log_likelihood]
+    reading_states = [s.reading_states[name][:n].tolist() for name in kept]
+    stored = [naive.pairs_of(s, t) for t in range(n) if s.reading_states[t]['stored']] if logs else []
+    return [*(array.tolist() for array in s.maps), *reading_states, stored, evidence.log_likelihood]
 
 
 def rebuilt(evidence: Evidence, readings: Readings, model: ModelParameters) -> Evidence:
@@ -102,17 +102,17 @@ def test_every_log_is_the_difference_of_two_evaluations_of_its_reading(seed: int
             return math.log(naive.likelihood(z, z_max, sigma, met, model))  # noqa: B023
 
         before = evaluate(occupied)
-        share = state.shares[t]
-        assert share['likelihood'] * QUANTUM == pytest.approx(before, abs=OFF)
+        reading_state = state.reading_states[t]
+        assert reading_state['likelihood'] * QUANTUM == pytest.approx(before, abs=OFF)
         free, band, _, logs = naive.pairs_of(state, t)
         told = dict(zip(band, logs, strict=True))
-        told |= {c: share['release' if occupied[c] else 'occupy'] for c in free}
+        told |= {c: reading_state['release' if occupied[c] else 'occupy'] for c in free}
         assert set(told) == set(away)
         for c, log in told.items():
             changed = occupied.copy()
             changed[c] ^= 1
             assert log * QUANTUM == pytest.approx(evaluate(changed) - before, abs=2e-7 + OFF)
-        assert share['blocking'] == occupied[free].sum()
+        assert reading_state['blocking'] == occupied[free].sum()
 
 
 @pytest.mark.parametrize('seed', range(24))
@@ -142,10 +142,10 @@ def test_the_evidence_of_every_cell_is_what_flipping_it_gains(seed: int) -> None
 def test_what_no_map_changes_is_that_of_the_forward_model(some: object) -> None:
     readings, model = some(np.random.default_rng(0), GRID, 100), MODEL
     sigma = np.array([naive.sigma_of(readings, t, GRID, model) for t in range(len(readings))])
-    shares, causes = share_table(readings, sigma, model), causes_of(readings, sigma, model)
-    assert shares['floor'] == pytest.approx(causes.random + causes.lost)
-    assert np.array_equal(shares['no_echo'], causes.no_echo)
-    assert (shares['weight'] == 1).all()
+    reading_states, causes = reading_state_table(readings, sigma, model), causes_of(readings, sigma, model)
+    assert reading_states['floor'] == pytest.approx(causes.random + causes.lost)
+    assert np.array_equal(reading_states['no_echo'], causes.no_echo)
+    assert (reading_states['weight'] == 1).all()
 
 
 @pytest.mark.parametrize('some', SOME)
@@ -163,11 +163,11 @@ def test_seers_of_a_cell_are_the_readings_that_have_it(some: object, nearest: bo
             for c in cells:
                 expected[c][t] = zone
     for c in range(grid.size):
-        n = find_seers(state, c)
+        n = find_observing(state, c)
         assert n == len(expected[c]) == state.maps.seen[c]
-        assert {int(t): int(zone) + 1 for t, zone in state.seers[:n]} == expected[c]
+        assert {int(t): int(zone) + 1 for t, zone in state.observing[:n]} == expected[c]
     zones = [[_zone(cone, state.lattice, *divmod(c, grid.width)) for c in range(grid.size)] for cone in state.cones]
-    assert zones == [[seers.get(t, 0) for seers in expected] for t in range(len(readings))]
+    assert zones == [[observing.get(t, 0) for observing in expected] for t in range(len(readings))]
 
 
 @settings(max_examples=60, deadline=None)
@@ -201,24 +201,24 @@ def test_a_flip_notes_which_readings_it_changed() -> None:
     readings = random_readings(np.random.default_rng(2), GRID, 50)
     evidence = evidence_of(readings, MODEL, np.zeros(GRID.size, np.uint8))
     for now, c in enumerate((50, 3, 50), 1):
-        before = evidence.state.shares['changed'].copy()
+        before = evidence.state.reading_states['changed'].copy()
         flip(evidence.state, c)
         sees = np.zeros(len(readings), bool)
-        sees[evidence.state.seers[: find_seers(evidence.state, c), 0]] = True
-        assert np.array_equal(evidence.state.shares['changed'], np.where(sees, now, before))
+        sees[evidence.state.observing[: find_observing(evidence.state, c), 0]] = True
+        assert np.array_equal(evidence.state.reading_states['changed'], np.where(sees, now, before))
 
 
 @pytest.mark.parametrize('seed', range(6))
 @pytest.mark.parametrize('share', [0.0, 0.3, 0.9])
-def test_readings_without_memory_come_to_the_same(seed: int, share: float) -> None:
+def test_readings_without_memory_come_to_the_same(seed: int, reading_state: float) -> None:
     readings, model, occupied = random_case(seed, 150)
     whole = evidence_of(readings, model, occupied)
     words = int(whole._totals[3])
-    less = evidence_of(readings, model, occupied, memory=share * 4 * words)
+    less = evidence_of(readings, model, occupied, memory=reading_state * 4 * words)
     assert whole.unstored == 0 < less.unstored
-    assert less.unstored < len(readings) or share == 0.0
-    assert sum(less.state.shares['stored']) == len(less) - less.unstored
-    assert less.state.pairs.cell.nbytes <= share * 4 * words
+    assert less.unstored < len(readings) or reading_state == 0.0
+    assert sum(less.state.reading_states['stored']) == len(less) - less.unstored
+    assert less.state.pairs.cell.nbytes <= reading_state * 4 * words
     assert less.nbytes < whole.nbytes
     for c in np.random.default_rng(seed).permutation(GRID.size)[:20]:
         flip(whole.state, c)
@@ -278,8 +278,8 @@ def test_a_reading_of_weight_three_is_three_readings(seed: int, memory: float) -
     readings, model, occupied = random_case(seed, 40)
     thrice = evidence_of(readings.select(np.repeat(np.arange(40), 3)), model, occupied)
     heavy = evidence_of(readings, model, occupied, memory=memory)
-    heavy.weigh(np.repeat(np.arange(40), 2))
-    assert (heavy.state.shares['weight'] == 3).all()
+    heavy.add_multiplicity(np.repeat(np.arange(40), 2))
+    assert (heavy.state.reading_states['weight'] == 3).all()
     for c in range(0, GRID.size, 5):
         assert np.array_equal(heavy.state.maps.evidence, thrice.state.maps.evidence)
         assert np.array_equal(heavy.state.maps.seen, thrice.state.maps.seen)
@@ -296,11 +296,11 @@ def test_readings_that_gain_weight_are_noted_as_changed() -> None:
     evidence = evidence_of(readings, model, occupied)
     flip(evidence.state, 0)
     flip(evidence.state, 0)
-    before = evidence.state.shares['changed'].copy()
-    evidence.weigh(np.array([3, 7, 3]))
-    assert evidence.state.shares['weight'].tolist() == [1, 1, 1, 3, 1, 1, 1, 2, 1, 1]
+    before = evidence.state.reading_states['changed'].copy()
+    evidence.add_multiplicity(np.array([3, 7, 3]))
+    assert evidence.state.reading_states['weight'].tolist() == [1, 1, 1, 3, 1, 1, 1, 2, 1, 1]
     before[[3, 7]] = 2
-    assert np.array_equal(evidence.state.shares['changed'], before)
+    assert np.array_equal(evidence.state.reading_states['changed'], before)
 
 
 @pytest.mark.parametrize('seed', [0, 1, 2, 3, 5, 7])
@@ -326,7 +326,7 @@ def test_a_grid_that_grew_is_as_if_it_had_been_larger_from_the_start(seed: int, 
         evidence.extend(late)
     assert snapshot(grown) == snapshot(whole)
     found = [
-        [evidence.state.seers[: find_seers(evidence.state, c)].tolist() for c in range(large.size)]
+        [evidence.state.observing[: find_observing(evidence.state, c)].tolist() for c in range(large.size)]
         for evidence in (grown, whole)
     ]
     assert found[0] == found[1]

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from forward_grid_mapper.core.evidence.fixed_point import QUANTUM, quantise_logs, ratios_for
+from forward_grid_mapper.core.evidence.fixed_point import QUANTUM, quantise_logs, ratio_workspace_for
 from forward_grid_mapper.core.evidence.updates import LEAST_RATIO
 from forward_grid_mapper.core.search.search import ROUNDING
 
@@ -18,7 +18,7 @@ POLYNOMIAL = 2e-9
 
 
 def logs_of(values: np.ndarray) -> np.ndarray:
-    ratios, out = ratios_for(len(values)), np.full(len(values) + 1, 7, np.int32)
+    ratios, out = ratio_workspace_for(len(values)), np.full(len(values) + 1, 7, np.int32)
     ratios.ratio[: len(values)] = values
     quantise_logs(ratios, len(values), out)
     assert out[-1] == 7, 'written beyond the end'

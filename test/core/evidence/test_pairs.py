@@ -13,7 +13,7 @@ import naive
 from conftest import plain_model, random_readings
 from forward_grid_mapper.core.common.grid import Grid
 from forward_grid_mapper.core.evidence.evidence import Evidence
-from forward_grid_mapper.core.evidence.pairs import _sort, bench_for, make
+from forward_grid_mapper.core.evidence.pairs import _sort, make, workspace_for
 from forward_grid_mapper.core.sensor.cone_table import walk
 
 GRID = Grid(0.1, -7, 12, 41, 33)
@@ -57,8 +57,8 @@ def test_each_run_lies_in_one_row() -> None:
     evidence = Evidence(GRID, plain_model(sigma=0.01))
     evidence.extend(random_readings(np.random.default_rng(5), GRID, 60))
     state = evidence.state
-    for share in state.shares[:60]:
-        runs = state.pairs.cell[share['at'] : share['at'] + 2 * share['runs']].reshape(-1, 2)
+    for reading_state in state.reading_states[:60]:
+        runs = state.pairs.cell[reading_state['at'] : reading_state['at'] + 2 * reading_state['runs']].reshape(-1, 2)
         assert (runs[:, 0] <= runs[:, 1]).all()
         assert (runs[:, 0] // GRID.width == runs[:, 1] // GRID.width).all()
 
@@ -80,11 +80,13 @@ def test_pairs_made_anew_are_those_that_are_stored() -> None:
     evidence = Evidence(GRID, model)
     evidence.extend(naive.awkward_readings(np.random.default_rng(7), GRID, 100))
     s = evidence.state
-    for t, share in enumerate(s.shares[:100]):
-        sizes = (int(share['runs']), int(share['bands']))
-        assert make(s.cones, s.lattice, s.facing, t, s.bench.pairs, 0, s.bench) == sizes
+    for t, reading_state in enumerate(s.reading_states[:100]):
+        sizes = (int(reading_state['runs']), int(reading_state['bands']))
+        assert make(s.cones, s.lattice, s.normals, t, s.workspace.pairs, 0, s.workspace) == sizes
         words = 2 * sizes[0] + 2 * sizes[1]
-        assert np.array_equal(s.bench.pairs.cell[:words], s.pairs.cell[share['at'] : share['at'] + words])
+        assert np.array_equal(
+            s.workspace.pairs.cell[:words], s.pairs.cell[reading_state['at'] : reading_state['at'] + words]
+        )
 
 
 @given(
@@ -94,14 +96,14 @@ def test_pairs_made_anew_are_those_that_are_stored() -> None:
     )
 )
 def test_the_sort_is_stable(keys: list[float]) -> None:
-    bench = bench_for(60)
+    workspace = workspace_for(60)
     m = len(keys)
-    bench.unsorted_key[:m] = keys
-    bench.unsorted[:m] = np.arange(m)
-    _sort(bench, m)
+    workspace.unsorted_key[:m] = keys
+    workspace.unsorted[:m] = np.arange(m)
+    _sort(workspace, m)
     order = sorted(range(m), key=lambda k: keys[k])
-    assert bench.cell[:m].tolist() == order
-    assert bench.key[:m].tolist() == [keys[k] for k in order]
+    assert workspace.cell[:m].tolist() == order
+    assert workspace.key[:m].tolist() == [keys[k] for k in order]
 
 
 def test_densities_integrate_to_one() -> None:

@@ -9,7 +9,7 @@ import naive
 from conftest import plain_model, random_readings
 from forward_grid_mapper.core.common.grid import Grid
 from forward_grid_mapper.core.evidence.evidence import Evidence
-from forward_grid_mapper.core.evidence.tile_index import CHUNK, SHIFT, enter, more_chunks, no_tiles
+from forward_grid_mapper.core.evidence.tile_index import CHUNK, SHIFT, insert, more_chunks, no_tiles
 
 
 @pytest.mark.parametrize('some', [naive.awkward_readings, random_readings])
@@ -57,7 +57,7 @@ def test_lists_keep_what_they_have_as_they_grow() -> None:
         row = int(rng.integers(40))
         first, last = sorted(rng.integers(0, 50, 2).tolist())
         for _ in range(2):
-            enter(tiles, row, first, last, t)
+            insert(tiles, row, first, last, t)
         for column in range(first >> SHIFT, (last >> SHIFT) + 1):
             kept[(row >> SHIFT) * tiles.across + column].append(t)
     assert [naive.readings_of_tile(tiles, k) for k in range(len(tiles.head))] == kept

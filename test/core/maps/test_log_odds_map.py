@@ -13,7 +13,7 @@ from forward_grid_mapper.core.common.errors import InputError
 from forward_grid_mapper.core.common.grid import Grid
 from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.common.readings import Readings
-from forward_grid_mapper.core.maps.log_odds_map import LiveMap
+from forward_grid_mapper.core.maps.log_odds_map import LogOddsMap
 
 AREA = Grid(0.1, -10, 5, 20, 16)
 
@@ -27,7 +27,7 @@ def logit(p: float) -> float:
 def test_log_odds_are_those_of_the_twin(cell_distance: str, depth: float) -> None:
     readings = random_readings(np.random.default_rng(0), AREA, 80)
     parameters = Parameters.from_flat({'live_depth': depth, 'cell_distance': cell_distance})
-    live = LiveMap(parameters)
+    live = LogOddsMap(parameters)
     live.add(readings)
     p = parameters.live
     logits = logit(p.live_p_occupied), logit(p.live_p_free), logit(p.live_p_free_no_echo)
@@ -36,7 +36,7 @@ def test_log_odds_are_those_of_the_twin(cell_distance: str, depth: float) -> Non
 
 
 def test_the_weight_falls_with_the_sine_of_the_angle_from_the_axis_to_the_edge() -> None:
-    live = LiveMap(Parameters.from_flat({'live_p_free': 0.2, 'cell_distance': 'center'}))
+    live = LogOddsMap(Parameters.from_flat({'live_p_free': 0.2, 'cell_distance': 'center'}))
     live.add(Readings.from_columns(x=0.0, y=0.0, yaw=0.0, z=[4.0], z_max=5.0, half_angle=0.6))
     rows, columns = live.grid.cells_of(np.full(5, 3.05), np.array([0.05, 0.55, 1.05, 1.55, 2.05]))
     sines = np.sin(np.arctan2([0.05, 0.55, 1.05, 1.55, 2.05], 3.05))
@@ -47,7 +47,7 @@ def test_the_weight_falls_with_the_sine_of_the_angle_from_the_axis_to_the_edge()
 
 @pytest.mark.parametrize('half_angle', [1e-6, 0.005, 0.02])
 def test_a_thin_cone_is_one_and_a_half_cells_wide(half_angle: float) -> None:
-    live = LiveMap(Parameters.from_flat({'live_p_free': 0.2, 'cell_distance': 'center'}))
+    live = LogOddsMap(Parameters.from_flat({'live_p_free': 0.2, 'cell_distance': 'center'}))
     # the axis leaves the centres of its cells by up to half a cell
     readings = Readings.from_columns(x=0.05, y=0.05, yaw=0.1, z=[3.0], z_max=5.0, half_angle=half_angle)
     live.add(readings)
@@ -64,9 +64,9 @@ def test_a_thin_cone_is_one_and_a_half_cells_wide(half_angle: float) -> None:
 def test_the_order_and_the_batches_of_readings_do_not_matter(some: object) -> None:
     rng = np.random.default_rng(1)
     readings = some(rng, AREA, 200)
-    whole = LiveMap(Parameters())
+    whole = LogOddsMap(Parameters())
     whole.add(readings)
-    parts = LiveMap(Parameters())
+    parts = LogOddsMap(Parameters())
     for part in np.array_split(rng.permutation(len(readings)), 23):
         parts.add(readings.select(part))
     assert parts.grid == whole.grid
@@ -75,7 +75,7 @@ def test_the_order_and_the_batches_of_readings_do_not_matter(some: object) -> No
 
 def test_probabilities_are_unknown_exactly_where_no_cone_reaches() -> None:
     readings = random_readings(np.random.default_rng(2), AREA, 1)
-    live = LiveMap(Parameters())
+    live = LogOddsMap(Parameters())
     live.add(readings)
     known = np.isfinite(live.probability()).ravel()
     depth = Parameters().live.live_depth
@@ -86,7 +86,7 @@ def test_probabilities_are_unknown_exactly_where_no_cone_reaches() -> None:
 
 def test_the_map_can_be_asked_for_on_a_larger_grid() -> None:
     readings = random_readings(np.random.default_rng(3), AREA, 30)
-    live = LiveMap(Parameters())
+    live = LogOddsMap(Parameters())
     live.add(readings)
     wide = Grid(0.1, -300, -300, 600, 600)
     assert np.array_equal(live.log_odds(wide)[wide.window(live.grid)], live.log_odds(), equal_nan=True)
@@ -94,7 +94,7 @@ def test_the_map_can_be_asked_for_on_a_larger_grid() -> None:
 
 
 def test_a_map_that_would_be_too_large_is_refused_and_nothing_changes() -> None:
-    live = LiveMap(Parameters.from_flat({'max_cells': 10_000}))
+    live = LogOddsMap(Parameters.from_flat({'max_cells': 10_000}))
     near = random_readings(np.random.default_rng(4), AREA, 5, z_max=1.0)
     live.add(near)
     before = live.log_odds()
@@ -106,7 +106,7 @@ def test_a_map_that_would_be_too_large_is_refused_and_nothing_changes() -> None:
 
 
 def test_evidence_that_cancels_leaves_a_known_cell() -> None:
-    live = LiveMap(Parameters.from_flat({'live_p_occupied': 0.8, 'live_p_free': 0.2}))
+    live = LogOddsMap(Parameters.from_flat({'live_p_occupied': 0.8, 'live_p_free': 0.2}))
     both = Readings.from_columns(x=0.05, y=0.05, yaw=0.0, z=[1.0, 2.0], z_max=4.0, half_angle=0.1)
     live.add(both)
     row, column = live.grid.cells_of(np.array(1.05), np.array(0.05))
@@ -114,7 +114,7 @@ def test_evidence_that_cancels_leaves_a_known_cell() -> None:
 
 
 def test_a_thin_beam_marks_the_cells_that_it_crosses() -> None:
-    live = LiveMap(Parameters())
+    live = LogOddsMap(Parameters())
     live.add(Readings.from_columns(x=0.05, y=0.02, yaw=0.0, z=[1.0] * 5, z_max=4.0, half_angle=0.005))
     row, column = live.grid.cells_of(np.array([0.55, 1.05]), np.array([0.05, 0.05]))
     free, occupied = live.probability()[row, column]
@@ -128,7 +128,7 @@ def test_a_deep_arc_does_not_depend_on_the_order() -> None:
     readings = random_readings(rng, AREA, 40)
     maps = []
     for order in (np.arange(40), np.arange(40)[::-1]):
-        live = LiveMap(parameters)
+        live = LogOddsMap(parameters)
         for k in order:
             live.add(readings.select(np.array([k])))
         maps.append(live.log_odds())
@@ -136,6 +136,6 @@ def test_a_deep_arc_does_not_depend_on_the_order() -> None:
 
 
 def test_empty_map() -> None:
-    live = LiveMap(Parameters())
+    live = LogOddsMap(Parameters())
     live.add(random_readings(np.random.default_rng(0), AREA, 0))
     assert live.probability().shape == (0, 0)

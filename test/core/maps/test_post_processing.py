@@ -15,8 +15,8 @@ from forward_grid_mapper.core.common.parameters import ModelParameters
 from forward_grid_mapper.core.common.readings import Readings
 from forward_grid_mapper.core.evidence.evidence import Evidence
 from forward_grid_mapper.core.evidence.fixed_point import QUANTUM
-from forward_grid_mapper.core.maps.free_space import passed_readings
-from forward_grid_mapper.core.maps.post_processing import finish
+from forward_grid_mapper.core.maps.free_space import expected_passes
+from forward_grid_mapper.core.maps.post_processing import post_process
 from forward_grid_mapper.core.maps.wall_extension import MOST_AGAINST, STRAIGHT_RUN, extend
 from forward_grid_mapper.core.runtime import threads
 
@@ -53,13 +53,13 @@ def test_readings_that_passed_are_those_of_the_twin(seed: int, filled: float) ->
     )
     occupied = (rng.random(GRID.size) < filled).astype(np.uint8)
     evidence = made(readings, model, occupied)
-    told = passed_readings(evidence, occupied)
+    told = expected_passes(evidence, occupied)
     expected = naive.passed(readings, GRID, occupied, model)
     assert np.abs(told - expected).max() < 2e-6 * len(readings)
     assert (told <= evidence.state.maps.seen + 1e-9).all()
     again = Evidence(GRID, model, memory=0.0, start=occupied.reshape(GRID.shape))
     again.extend(readings)
-    assert np.array_equal(passed_readings(again, occupied), told)
+    assert np.array_equal(expected_passes(again, occupied), told)
 
 
 def test_the_map_asked_about_may_be_another_and_weights_count() -> None:
@@ -67,8 +67,8 @@ def test_the_map_asked_about_may_be_another_and_weights_count() -> None:
     occupied = (np.random.default_rng(0).random(GRID.size) < 0.2).astype(np.uint8)
     evidence = made(readings, model, occupied)
     weight = 1 + np.arange(len(readings)) % 3
-    evidence.weigh(np.repeat(np.arange(len(readings)), weight - 1))
-    told = passed_readings(evidence, occupied)
+    evidence.add_multiplicity(np.repeat(np.arange(len(readings)), weight - 1))
+    told = expected_passes(evidence, occupied)
     expected = naive.passed(readings, GRID, occupied, model, weight)
     assert np.abs(told - expected).max() < 2e-6 * weight.sum()
 
@@ -77,12 +77,12 @@ def test_neither_threads_nor_what_is_grazed_change_who_passed(monkeypatch: pytes
     readings = random_readings(np.random.default_rng(5), GRID, 300)
     occupied = (np.random.default_rng(1).random(GRID.size) < 0.1).astype(np.uint8)
     whole, slanted = plain_model(), plain_model(grazing_angle=0.5)
-    one = passed_readings(made(readings, whole, occupied), occupied)
+    one = expected_passes(made(readings, whole, occupied), occupied)
     monkeypatch.setattr(threads, 'LEAST_PART', 20)
-    assert np.array_equal(passed_readings(made(readings, whole, occupied, threads=3), occupied), one)
+    assert np.array_equal(expected_passes(made(readings, whole, occupied, threads=3), occupied), one)
     two = made(readings, slanted, occupied)
-    assert two.state.facing.known.any()
-    assert np.array_equal(passed_readings(two, occupied), one)
+    assert two.state.normals.known.any()
+    assert np.array_equal(expected_passes(two, occupied), one)
 
 
 STEPS = [(1, 0), (1, 1), (0, 1), (-1, 1), (-1, 0), (-1, -1), (0, -1), (1, -1)]
@@ -146,31 +146,31 @@ def seen_by_all(occupied: np.ndarray) -> Evidence:
 
 def test_finish_draws_walls_out_by_so_many_cells_and_no_farther_than_something_speaks_against_it() -> None:
     evidence = seen_by_all(wall_at(5, 4, 8))
-    assert np.array_equal(finish(evidence, 0, 0.0, NOWHERE) == 1, wall_at(5, 4, 8) == 1)
-    assert np.array_equal(finish(evidence, 2, 0.0, NOWHERE) == 1, wall_at(5, 2, 10) == 1)
+    assert np.array_equal(post_process(evidence, 0, 0.0, NOWHERE) == 1, wall_at(5, 4, 8) == 1)
+    assert np.array_equal(post_process(evidence, 2, 0.0, NOWHERE) == 1, wall_at(5, 2, 10) == 1)
     evidence.state.maps.evidence.reshape(GRID.shape)[5, 10] = round(-1.1 * MOST_AGAINST / QUANTUM)
     evidence.state.maps.evidence.reshape(GRID.shape)[5, 2] = round(-0.9 * MOST_AGAINST / QUANTUM)
-    assert np.array_equal(finish(evidence, 3, 0.0, NOWHERE) == 1, wall_at(5, 1, 9) == 1)
+    assert np.array_equal(post_process(evidence, 3, 0.0, NOWHERE) == 1, wall_at(5, 1, 9) == 1)
     assert np.array_equal(evidence.observed() == 1, wall_at(5, 4, 8) == 1), 'the search goes on from its own map'
 
 
 def test_no_wall_is_drawn_out_over_where_the_robot_was_or_readings_passed() -> None:
-    driven = NOWHERE.copy()
-    driven[5, 10] = True
+    traversed = NOWHERE.copy()
+    traversed[5, 10] = True
     evidence = seen_by_all(wall_at(5, 4, 8))
-    assert np.array_equal(finish(evidence, 3, 0.0, driven) == 1, wall_at(5, 1, 9) == 1)
+    assert np.array_equal(post_process(evidence, 3, 0.0, traversed) == 1, wall_at(5, 1, 9) == 1)
     # ten readings that went through a gap
     readings = Readings.from_columns(x=1.15, y=0.05, yaw=math.pi / 2, z=np.full(10, 1.0), z_max=1.3, half_angle=0.02)
     evidence = made(readings, plain_model(sigma=0.05), wall_at(5, 4, 8))
     evidence.state.maps.seen[:], evidence.state.maps.evidence[:] = 1, 1
-    assert np.array_equal(finish(evidence, 6, 0.0, NOWHERE)[5] == 1, np.arange(14) <= 13)
-    told = finish(evidence, 6, 1.0, NOWHERE)
+    assert np.array_equal(post_process(evidence, 6, 0.0, NOWHERE)[5] == 1, np.arange(14) <= 13)
+    told = post_process(evidence, 6, 1.0, NOWHERE)
     assert told[5, 11] == 0
     assert (told[5, 9:11] == 1).all(), 'up to what is known'
 
 
 def test_three_cells_are_no_straight_wall() -> None:
-    assert np.array_equal(finish(seen_by_all(wall_at(5, 4, 6)), 3, 0.0, NOWHERE) == 1, wall_at(5, 4, 6) == 1)
+    assert np.array_equal(post_process(seen_by_all(wall_at(5, 4, 6)), 3, 0.0, NOWHERE) == 1, wall_at(5, 4, 6) == 1)
 
 
 @pytest.mark.parametrize('seed', range(6))
@@ -178,25 +178,25 @@ def test_cells_through_which_nobody_passed_are_unknown(seed: int) -> None:
     readings, model = random_readings(np.random.default_rng(seed), GRID, 12), plain_model(sigma=0.06)
     occupied = (np.random.default_rng(seed).random(GRID.size) < 0.05).astype(np.uint8)
     evidence = made(readings, model, occupied)
-    driven = np.random.default_rng(seed).random(GRID.shape) < 0.01
+    traversed = np.random.default_rng(seed).random(GRID.shape) < 0.01
     plain = evidence.observed()
-    plain[driven & (plain < 0)] = 0
-    passed = passed_readings(evidence, occupied).reshape(GRID.shape)
-    assert np.array_equal(finish(evidence, 0, 0.0, driven), plain)
+    plain[traversed & (plain < 0)] = 0
+    passed = expected_passes(evidence, occupied).reshape(GRID.shape)
+    assert np.array_equal(post_process(evidence, 0, 0.0, traversed), plain)
     for least in (0.5, 1.5):
-        told = finish(evidence, 0, least, driven)
-        known = ((passed >= least) | driven) & (plain == 0)
+        told = post_process(evidence, 0, least, traversed)
+        known = ((passed >= least) | traversed) & (plain == 0)
         beside = naive.box_sum(known.astype(int)) > 0
         expected = np.where((plain == 0) & ~beside, -1, plain)
         assert np.array_equal(told, expected)
-    assert (finish(evidence, 0, 100.0, NOWHERE) != 0).all()
+    assert (post_process(evidence, 0, 100.0, NOWHERE) != 0).all()
 
 
 def test_behind_a_wall_nothing_is_free() -> None:
     # fifty echoes of a wall 0.6 m ahead, and one that went through a gap
     readings = Readings.from_columns(x=0.05, y=0.55, yaw=0.0, z=np.full(50, 0.6), z_max=1.3, half_angle=0.02)
     evidence = made(readings, dataclasses.replace(plain_model(), sigma=0.05), wall_at(5, 6, 6))
-    told = finish(evidence, 0, 0.9, NOWHERE)
+    told = post_process(evidence, 0, 0.9, NOWHERE)
     assert told[5, :7].tolist() == [0] * 6 + [1]
     assert (told[5, 9:] == -1).all()
     assert math.isfinite(evidence.log_likelihood)

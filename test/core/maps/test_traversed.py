@@ -11,7 +11,13 @@ from hypothesis import strategies as st
 
 from forward_grid_mapper.core.common.grid import Grid
 from forward_grid_mapper.core.common.readings import Readings
-from forward_grid_mapper.core.maps.traversed import LONGEST_PAUSE, LONGEST_STEP, STRIDES, driven_cells, mark_driven
+from forward_grid_mapper.core.maps.traversed import (
+    LONGEST_PAUSE,
+    LONGEST_STEP,
+    STRIDES,
+    mark_traversed,
+    traversed_cells,
+)
 
 GRID = Grid(0.1, -10, 5, 40, 30)
 MS = 1_000_000
@@ -27,7 +33,7 @@ def cells(*places: tuple[float, float]) -> set[tuple[int, int]]:
 
 
 def told(*arguments: list[float]) -> set[tuple[int, int]]:
-    return {(int(r), int(c)) for r, c in np.argwhere(driven_cells(readings_at(*arguments), GRID))}
+    return {(int(r), int(c)) for r, c in np.argwhere(traversed_cells(readings_at(*arguments), GRID))}
 
 
 @settings(max_examples=60, deadline=None)
@@ -61,7 +67,7 @@ def test_the_middle_of_a_ring_of_sonars_is_driven_over_before_it_moves(count: in
     x, y = 0.52 + 0.25 * np.cos(yaw), 1.97 + 0.25 * np.sin(yaw)
     found = told(x, y, np.arange(2 * count) * 10 * MS)
     inside = cells(*((0.52 + u, 1.97 + v) for u in (-0.1, 0.0, 0.1) for v in (-0.1, 0.0, 0.1)))
-    # what is free reaches a cell beyond what was driven over
+    # what is free reaches a cell beyond what was traversed over
     beside = {(row + v, column + u) for row, column in found for u in (-1, 0, 1) for v in (-1, 0, 1)}
     assert inside <= beside
 
@@ -82,8 +88,8 @@ def test_readings_are_taken_in_the_order_of_their_stamps() -> None:
 
 def test_what_is_off_the_grid_is_left_out_and_what_was_set_stays() -> None:
     assert told([-1e6, 1e6, 0.05], [0.0, 0.0, 1.05], [0, 1, 2]) == cells((0.05, 1.05))
-    driven = np.zeros(GRID.shape, bool)
-    driven[3, 4] = True
-    mark_driven(np.zeros(0), np.zeros(0), np.zeros(0, np.int64), GRID, driven)
-    mark_driven(np.array([0.05]), np.array([1.05]), np.array([7]), GRID, driven)
-    assert {(int(r), int(c)) for r, c in np.argwhere(driven)} == {(3, 4)} | cells((0.05, 1.05))
+    traversed = np.zeros(GRID.shape, bool)
+    traversed[3, 4] = True
+    mark_traversed(np.zeros(0), np.zeros(0), np.zeros(0, np.int64), GRID, traversed)
+    mark_traversed(np.array([0.05]), np.array([1.05]), np.array([7]), GRID, traversed)
+    assert {(int(r), int(c)) for r, c in np.argwhere(traversed)} == {(3, 4)} | cells((0.05, 1.05))

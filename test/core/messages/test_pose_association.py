@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.messages.message_types import NANOSECONDS, OdometryMessage, Pose2, RangeMessage
-from forward_grid_mapper.core.messages.pose_association import HISTORY, LATER, MOST_FRAMES, MOST_POINTS, Placer
+from forward_grid_mapper.core.messages.pose_association import HISTORY, LATER, MOST_FRAMES, MOST_POINTS, PoseAssociator
 from forward_grid_mapper.core.messages.rep117 import REASONS, measure
 
 INF, NAN = math.inf, math.nan
@@ -37,8 +37,8 @@ class Clock:
         return self.now
 
 
-def placer(patient: bool = False, clock: Clock | None = None, **values: object) -> Placer:
-    return Placer(
+def associator(patient: bool = False, clock: Clock | None = None, **values: object) -> PoseAssociator:
+    return PoseAssociator(
         lambda base, frame, stamp: MOUNT if frame.startswith('sonar') else None,
         Parameters.from_flat(values),
         patient,
@@ -46,7 +46,7 @@ def placer(patient: bool = False, clock: Clock | None = None, **values: object) 
     )
 
 
-def accounted(p: Placer) -> bool:
+def accounted(p: PoseAssociator) -> bool:
     return p.received == len(p.buffer) + p.waiting + sum(p.rejected.values())
 
 
@@ -75,8 +75,8 @@ def accounted(p: Placer) -> bool:
     ],
 )
 def test_rejections_of_rep_117(changes: dict[str, object], reason: str) -> None:
-    assert measure(sonar(**changes), Parameters().placing) == reason
-    p = placer()
+    assert measure(sonar(**changes), Parameters().association) == reason
+    p = associator()
     p.add_range(sonar(**changes))
     assert p.rejected == {reason: 1}
     assert accounted(p)
@@ -84,17 +84,17 @@ def test_rejections_of_rep_117(changes: dict[str, object], reason: str) -> None:
 
 @pytest.mark.parametrize('value', [4.0, 4.5, INF])
 def test_out_of_range_is_no_echo_or_discarded(value: float) -> None:
-    measured = measure(sonar(range=value), Parameters().placing)
+    measured = measure(sonar(range=value), Parameters().association)
     assert not isinstance(measured, str)
     assert measured.z == measured.z_max == 4.0
-    discard = Parameters.from_flat({'over_range': 'discard'}).placing
+    discard = Parameters.from_flat({'over_range': 'discard'}).association
     assert measure(sonar(range=value), discard) == 'over_range'
 
 
 def test_fixed_distance_rangers() -> None:
     fixed = sonar(min_range=0.8, max_range=0.8)
-    clear = measure(fixed._replace(range=INF), Parameters().placing)
-    detected = measure(fixed._replace(range=-INF), Parameters().placing)
+    clear = measure(fixed._replace(range=INF), Parameters().association)
+    detected = measure(fixed._replace(range=-INF), Parameters().association)
     assert not isinstance(clear, str)
     assert not isinstance(detected, str)
     assert clear.z == clear.z_max == 0.8
@@ -102,14 +102,14 @@ def test_fixed_distance_rangers() -> None:
 
 
 def test_variance_and_overrides() -> None:
-    p = Parameters.from_flat({'field_of_view': 0.5, 'max_range': 2.0}).placing
+    p = Parameters.from_flat({'field_of_view': 0.5, 'max_range': 2.0}).association
     measured = measure(sonar(variance=0.04, field_of_view=0.0, range=3.0), p)
     assert not isinstance(measured, str)
     assert (measured.sigma, measured.half_angle, measured.z, measured.z_max) == (0.2, 0.25, 2.0, 2.0)
 
 
 def test_poses_are_interpolated_and_the_mount_is_added() -> None:
-    p = placer()
+    p = associator()
     p.add_odometry(odometry(10.0, 1.0, 2.0, 3.0))
     p.add_range(sonar(10.25))
     assert p.waiting == 1
@@ -125,7 +125,7 @@ def test_poses_are_interpolated_and_the_mount_is_added() -> None:
 
 def test_reasons_of_time() -> None:
     clock = Clock()
-    p = placer(clock=clock, max_pose_gap=0.5, pose_timeout=1.0)
+    p = associator(clock=clock, max_pose_gap=0.5, pose_timeout=1.0)
     p.add_range(sonar(0.5))
     p.add_odometry(odometry(1.0))
     assert p.rejected['before_odometry'] == 1
@@ -145,7 +145,7 @@ def test_reasons_of_time() -> None:
 
 def test_a_reading_times_out_by_stamps_and_by_the_clock() -> None:
     clock = Clock()
-    fast, still = placer(clock=clock), placer(clock=clock)
+    fast, still = associator(clock=clock), associator(clock=clock)
     for p in (fast, still):
         p.add_odometry(odometry(0.0))
         p.add_range(sonar(0.1))
@@ -164,7 +164,7 @@ def test_a_reading_times_out_by_stamps_and_by_the_clock() -> None:
 
 def test_a_pose_that_becomes_known_later_is_waited_for() -> None:
     clock, known = Clock(), {'sonar'}
-    p = Placer(lambda base, frame, stamp: MOUNT if frame in known else LATER, clock=clock)
+    p = PoseAssociator(lambda base, frame, stamp: MOUNT if frame in known else LATER, clock=clock)
     p.add_odometry(odometry(0.0))
     p.add_range(sonar(0.0, frame_id='late'))
     p.add_range(sonar(0.0, frame_id='never'))
@@ -174,29 +174,29 @@ def test_a_pose_that_becomes_known_later_is_waited_for() -> None:
     assert (p.waiting, len(p.buffer)) == (1, 1)
     clock.now = 10.0
     p.add_odometry(odometry(10.0))
-    assert p.rejected == {'unknown_mount': 1}
+    assert p.rejected == {'unknown_extrinsics': 1}
     assert p.unknown_frames == {'never'}
     assert accounted(p)
 
 
 def test_an_exact_stamp_needs_no_bracket() -> None:
-    p = placer()
+    p = associator()
     p.add_odometry(odometry(5.0, 1.0))
     p.add_range(sonar(5.0))
     assert len(p.buffer) == 1
 
 
 def test_unknown_mount_is_counted_and_named() -> None:
-    p = placer()
+    p = associator()
     p.add_odometry(odometry(0.0))
     p.add_range(sonar(0.0, frame_id='mystery'))
-    assert p.rejected == {'unknown_mount': 1}
+    assert p.rejected == {'unknown_extrinsics': 1}
     assert p.unknown_frames == {'mystery'}
-    assert p.rejected_by_frame['mystery']['unknown_mount'] == 1
+    assert p.rejected_by_frame['mystery']['unknown_extrinsics'] == 1
 
 
 def test_a_jump_back_drops_what_waits_and_keeps_the_readings() -> None:
-    p = placer()
+    p = associator()
     for second in (100.0, 100.5, 101.0):
         p.add_odometry(odometry(second))
         p.add_range(sonar(second + 0.2))
@@ -212,7 +212,7 @@ def test_a_jump_back_drops_what_waits_and_keeps_the_readings() -> None:
 
 
 def test_odometry_that_overtakes_is_sorted_in() -> None:
-    p = placer()
+    p = associator()
     for second, x in ((0.0, 0.0), (0.4, 4.0), (0.2, 1.0)):
         p.add_odometry(odometry(second, x))
     p.add_range(sonar(0.1))
@@ -220,7 +220,7 @@ def test_odometry_that_overtakes_is_sorted_in() -> None:
 
 
 def test_bad_odometry_is_counted() -> None:
-    p = placer()
+    p = associator()
     p.add_odometry(odometry(0.0)._replace(pose=None))
     p.add_odometry(odometry(0.0))
     p.add_odometry(odometry(0.1)._replace(frame_id='other'))
@@ -228,7 +228,7 @@ def test_bad_odometry_is_counted() -> None:
 
 
 def test_an_absurd_pose_is_refused() -> None:
-    p = placer()
+    p = associator()
     for second, x in ((0.0, 0.0), (0.1, 1e6), (0.2, 1e9), (0.3, 0.0)):
         p.add_odometry(odometry(second, x))
         p.add_range(sonar(second))
@@ -239,14 +239,14 @@ def test_an_absurd_pose_is_refused() -> None:
 
 
 def test_a_long_max_range_does_not_matter_where_echoes_are_near() -> None:
-    p = placer(max_cells=10_000)
+    p = associator(max_cells=10_000)
     p.add_odometry(odometry(0.0))
     p.add_range(sonar(0.0, max_range=3e38))
     assert len(p.buffer) == 1
 
 
 def test_odometry_kept_is_bounded_unless_patient() -> None:
-    p, q = placer(), placer(patient=True)
+    p, q = associator(), associator(patient=True)
     for k in range(50_000):
         p.add_odometry(odometry(0.05 * k))
         q.add_odometry(odometry(0.05 * k))
@@ -261,8 +261,8 @@ def test_a_patient_placer_does_not_care_about_interleaving(seed: int) -> None:
     poses = [odometry(0.1 * k + 0.01 * rng.random(), k, -k, 0.1 * k) for k in range(30) if rng.random() < 0.8]
     ranges = [sonar(3.2 * rng.random() - 0.1, range=rng.choice([1.0, 2.0, INF, NAN])) for _ in range(60)]
 
-    def run(messages: list[RangeMessage | OdometryMessage]) -> Placer:
-        p = placer(patient=True, max_pose_gap=0.25)
+    def run(messages: list[RangeMessage | OdometryMessage]) -> PoseAssociator:
+        p = associator(patient=True, max_pose_gap=0.25)
         for message in messages:
             (p.add_range if isinstance(message, RangeMessage) else p.add_odometry)(message)
             assert accounted(p)
@@ -310,7 +310,7 @@ def test_a_patient_placer_does_not_care_about_interleaving(seed: int) -> None:
     )
 )
 def test_any_messages_are_accounted_for(messages: list[RangeMessage | OdometryMessage]) -> None:
-    p = placer()
+    p = associator()
     for message in messages:
         (p.add_range if isinstance(message, RangeMessage) else p.add_odometry)(message)
         assert accounted(p)
@@ -322,7 +322,7 @@ def test_any_messages_are_accounted_for(messages: list[RangeMessage | OdometryMe
 
 
 def test_a_dead_sensor_does_not_wall_in_the_robot() -> None:
-    p = placer()
+    p = associator()
     for second in range(5):
         p.add_odometry(odometry(second))
         p.add_range(sonar(second, range=0.0, min_range=0.0))
@@ -330,7 +330,7 @@ def test_a_dead_sensor_does_not_wall_in_the_robot() -> None:
 
 
 def test_a_jump_of_ten_kilometres_costs_what_comes_after_it_and_no_memory() -> None:
-    p = placer()
+    p = associator()
     for second in range(20):
         p.add_odometry(odometry(second, 0.1 * second + (10_000.0 if second >= 10 else 0.0)))
         p.add_range(sonar(second + 0.5))
@@ -345,7 +345,7 @@ def test_a_jump_of_ten_kilometres_costs_what_comes_after_it_and_no_memory() -> N
 
 
 def test_a_cone_of_millions_of_cells_is_refused() -> None:
-    p = placer()
+    p = associator()
     p.add_odometry(odometry(0.0))
     p.add_range(sonar(0.0, range=300.0, max_range=1000.0, field_of_view=2.0))
     p.add_range(sonar(0.0, range=6.0, max_range=1000.0, field_of_view=2.0))
@@ -354,7 +354,7 @@ def test_a_cone_of_millions_of_cells_is_refused() -> None:
 
 def test_a_sensor_whose_clock_is_ahead_does_not_pile_up() -> None:
     clock = Clock()
-    p = placer(clock=clock)
+    p = associator(clock=clock)
     for tenth in range(200):
         clock.now = tenth / 10
         p.add_odometry(odometry(tenth / 10))
@@ -368,7 +368,7 @@ def test_a_sensor_whose_clock_is_ahead_does_not_pile_up() -> None:
 
 def test_odometry_that_stands_still_lets_readings_wait() -> None:
     clock = Clock()
-    p = placer(clock=clock)
+    p = associator(clock=clock)
     p.add_odometry(odometry(1.0))
     p.add_range(sonar(1.1))
     clock.now = 1000.0
@@ -380,7 +380,7 @@ def test_odometry_that_stands_still_lets_readings_wait() -> None:
 
 @pytest.mark.parametrize('rate', [1, 1000])
 def test_rates_of_odometry(rate: int) -> None:
-    p = placer()
+    p = associator()
     for k in range(5 * rate + 1):
         p.add_odometry(odometry(k / rate, k / rate))
         for tenth in range(10 // min(rate, 10)):
@@ -391,7 +391,7 @@ def test_rates_of_odometry(rate: int) -> None:
 
 
 def test_a_gap_of_an_hour_is_not_bridged() -> None:
-    p = placer()
+    p = associator()
     for second in (0.0, 0.5, 3600.0, 3600.5):
         p.add_odometry(odometry(second))
     for second in (0.25, 1.0, 1800.0, 3599.0, 3600.25):
@@ -402,7 +402,7 @@ def test_a_gap_of_an_hour_is_not_bridged() -> None:
 
 
 def test_one_stamp_from_the_future_costs_only_what_waits() -> None:
-    p = placer()
+    p = associator()
     for second in range(10):
         p.add_odometry(odometry(1e9 if second == 5 else second))
         p.add_range(sonar(second - 0.5))
@@ -412,7 +412,7 @@ def test_one_stamp_from_the_future_costs_only_what_waits() -> None:
 
 
 def test_what_strangers_can_make_grow_is_bounded() -> None:
-    p = placer()
+    p = associator()
     for k in range(2 * MOST_FRAMES):
         p.reject(sonar(0.0, frame_id=f'frame {k}'), 'paused')
         p.add_odometry(odometry(k))
@@ -423,7 +423,7 @@ def test_what_strangers_can_make_grow_is_bounded() -> None:
 
 
 def test_a_long_path_is_told_by_fewer_points() -> None:
-    p = placer()
+    p = associator()
     for k in range(3 * MOST_POINTS):
         p.extend_path((0.06 * k, 0.0))
     assert len(p.path) <= MOST_POINTS
@@ -433,7 +433,7 @@ def test_a_long_path_is_told_by_fewer_points() -> None:
 
 
 def test_a_reset_begins_with_the_odometry_that_comes() -> None:
-    p = placer()
+    p = associator()
     p.add_odometry(odometry(0.0)._replace(frame_id='garbage'))
     for second in (1.0, 1.5):
         p.add_odometry(odometry(second))

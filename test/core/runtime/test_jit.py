@@ -7,18 +7,21 @@ import shutil
 import subprocess
 import sys
 import tempfile
+import time
 from pathlib import Path
 
 import pytest
 
-PACKAGE = Path(__file__).resolve().parents[2] / 'forward_grid_mapper'
+PACKAGE = Path(__file__).resolve().parents[3] / 'forward_grid_mapper'
 PROGRAM = """
 import sys, time
-from forward_grid_mapper.core import jit, live_map, parameters, readings
+from forward_grid_mapper.core.common import parameters, readings
+from forward_grid_mapper.core.maps import log_odds_map
+from forward_grid_mapper.core.runtime import jit
 begin = time.perf_counter()
-live = live_map.LiveMap(parameters.Parameters())
+live = log_odds_map.LogOddsMap(parameters.Parameters())
 live.add(readings.Readings.from_columns(x=0.0, y=0.0, yaw=0.0, z=[1.0], z_max=2.0, half_angle=0.1))
-print(time.perf_counter() - begin, jit.CACHE, live_map.__file__)
+print(time.perf_counter() - begin, jit.CACHE, log_odds_map.__file__)
 """
 
 
@@ -56,7 +59,20 @@ def test_kernels_lie_beside_the_sources_and_are_renewed_with_any_of_them(install
     temporary = Path(tempfile.gettempdir())
     _, before = run(install, temporary)
     assert before.parent == install / PACKAGE.name / 'core' / '__pycache__'
-    with (install / PACKAGE.name / 'core' / 'cone.py').open('a') as file:
+    with (install / PACKAGE.name / 'core' / 'sensor' / 'cone.py').open('a') as file:
         file.write('\n# changed\n')
     _, after = run(install, temporary)
     assert after != before
+
+
+def test_kernels_of_other_sources_go_when_unused_for_a_day(install: Path) -> None:
+    beside = install / PACKAGE.name / 'core' / '__pycache__'
+    old, recent = beside / 'kernels_old', beside / 'kernels_recent'
+    for folder in (old, recent):
+        folder.mkdir(parents=True)
+    day_ago = time.time() - 25 * 3600
+    os.utime(old, (day_ago, day_ago))
+    _, cache = run(install, Path(tempfile.gettempdir()))
+    assert cache.parent == beside
+    assert not old.exists()
+    assert recent.exists()

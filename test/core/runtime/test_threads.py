@@ -69,7 +69,7 @@ def search(workers: int, memory: float, cell_distance: str, seed: int, plain: bo
     model = ModelParameters(p_hit=0.7, p_rand=0.1, sigma=0.06, cell_distance=cell_distance, **surfaces)
     evidence = Evidence(AREA, model, memory=memory, threads=workers)
     evidence.extend(readings)
-    assert evidence.state.facing.known.any() != plain
+    assert evidence.state.normals.known.any() != plain
     return Search(evidence, SearchParameters(**(PLAIN_SEARCH if plain else {}))).run(), evidence
 
 

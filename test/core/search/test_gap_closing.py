@@ -16,11 +16,11 @@ from forward_grid_mapper.core.evidence.evidence import Evidence
 from forward_grid_mapper.core.evidence.fixed_point import QUANTUM
 from forward_grid_mapper.core.evidence.neighbourhood import patterns
 from forward_grid_mapper.core.search.gap_closing import (
-    MOST_AGAINST_BRIDGE,
     MOST_AGAINST_CELL,
+    MOST_AGAINST_GAP,
     MOST_AGAINST_PASSAGE,
     PASSAGE,
-    build_bridges,
+    close_gaps,
 )
 from forward_grid_mapper.core.search.prior import Prior, local_prior, shapes
 from forward_grid_mapper.core.search.search import LEAST, Search
@@ -63,7 +63,7 @@ def prior_for(parameters: SearchParameters) -> Prior:
 
 def bridged(evidence: Evidence, prior: Prior, longest: int) -> tuple[int, float]:
     cells = np.flatnonzero(evidence.state.maps.occupied)
-    return build_bridges(evidence.state, prior, LEAST, cells, longest)
+    return close_gaps(evidence.state, prior, LEAST, cells, longest)
 
 
 def test_a_gap_that_few_looked_through_is_closed_and_only_by_a_bridge() -> None:
@@ -166,7 +166,7 @@ def test_what_bridges_gain_is_told_and_they_stand_where_they_may(seed: int) -> N
 def test_no_cell_may_have_much_against_it_nor_all_together(
     gap: int, against: float, resolution: float, stands: bool
 ) -> None:
-    assert (MOST_AGAINST_CELL, MOST_AGAINST_BRIDGE, MOST_AGAINST_PASSAGE, PASSAGE) == (1.0, 4.0, 1.5, 0.35)
+    assert (MOST_AGAINST_CELL, MOST_AGAINST_GAP, MOST_AGAINST_PASSAGE, PASSAGE) == (1.0, 4.0, 1.5, 0.35)
     evidence = Evidence(dataclasses.replace(GRID, resolution=resolution), MODEL)
     maps = evidence.state.maps
     occupied = np.zeros(GRID.shape, np.uint8)
@@ -183,4 +183,4 @@ def test_bridges_stop_when_told() -> None:
     evidence = Evidence(GRID, MODEL)
     evidence.extend(room(FREE))
     evidence.state.stop[0] = 1
-    assert build_bridges(evidence.state, prior_for(SearchParameters()), LEAST, np.arange(4), 9) == (0, 0.0)
+    assert close_gaps(evidence.state, prior_for(SearchParameters()), LEAST, np.arange(4), 9) == (0, 0.0)

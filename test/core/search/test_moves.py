@@ -18,20 +18,10 @@ from forward_grid_mapper.core.evidence.evidence import Evidence
 from forward_grid_mapper.core.evidence.fixed_point import QUANTUM
 from forward_grid_mapper.core.evidence.neighbourhood import patterns
 from forward_grid_mapper.core.evidence.updates import flip
-from forward_grid_mapper.core.search.moves import (
-    WORTH_WAITING,
-    best_shifts,
-    flip_in_order,
-    free_needless,
-    highest,
-    promising,
-    see_any,
-    shift_in_order,
-    try_shifts,
-    unsettle,
-)
+from forward_grid_mapper.core.search.flips import WORTH_WAITING, flip_in_order, free_unneeded, highest, promising
 from forward_grid_mapper.core.search.prior import Prior
 from forward_grid_mapper.core.search.search import LEAST
+from forward_grid_mapper.core.search.shifts import best_shifts, see_any, shift_in_order, try_shifts, unsettle
 from forward_grid_mapper.core.sensor.forward_model import expectations, log_likelihood
 
 GRID = Grid(0.1, 0, 0, 12, 9)
@@ -180,7 +170,7 @@ def test_occupied_cells_that_cost_nothing_to_free_are_freed_one_after_the_other(
         if twin.state.maps.seen[c] and now >= -tolerance * twin.state.maps.seen[c]:
             flip(twin.state, c)
             made, expected = made + 1, expected + now
-    assert free_needless(evidence.state, prior, (1.0, tolerance), occupied) == (made, expected)
+    assert free_unneeded(evidence.state, prior, (1.0, tolerance), occupied) == (made, expected)
     assert np.array_equal(evidence.state.maps.occupied, twin.state.maps.occupied)
 
 
@@ -213,9 +203,9 @@ def test_the_joint_gain_of_a_reading_is_the_difference_of_two_evaluations(filled
         for t in range(len(readings)):
             one = readings.select(slice(t, t + 1))
             free, band, _, logs = naive.pairs_of(evidence.state, t)
-            share = evidence.state.shares[t]
+            reading_state = evidence.state.reading_states[t]
             single = dict(zip(band, logs, strict=True))
-            single |= {c: share['release' if maps.occupied[c] else 'occupy'] for c in free}
+            single |= {c: reading_state['release' if maps.occupied[c] else 'occupy'] for c in free}
             joint = joints(evidence, cells, np.array([t]))
 
             def evaluate(*changes: int) -> float:
@@ -275,7 +265,7 @@ def test_the_best_shifts_are_those_that_brute_force_finds(seed: int, memory: flo
 @pytest.mark.parametrize('seed', range(4))
 def test_a_reading_of_weight_three_says_of_shifts_what_three_readings_say(seed: int) -> None:
     heavy, readings = random_case(seed)
-    heavy.weigh(np.repeat(np.arange(len(readings)), 2))
+    heavy.add_multiplicity(np.repeat(np.arange(len(readings)), 2))
     thrice = Evidence(GRID, model_of(heavy), start=heavy.state.maps.occupied.reshape(GRID.shape))
     thrice.extend(readings.select(np.repeat(np.arange(len(readings)), 3)))
     cells = np.flatnonzero(heavy.state.maps.occupied)

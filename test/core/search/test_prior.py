@@ -153,9 +153,9 @@ def test_plain_parameters_make_cells_independent() -> None:
 
 @pytest.mark.parametrize('cost', [0.0, 7.0])
 def test_cells_driven_over_cost_more(cost: float) -> None:
-    driven = np.array([[True, False, False], [False, False, True]])
-    told = local_prior(SearchParameters(prior=0.3, driven_cost=cost), driven)
+    traversed = np.array([[True, False, False], [False, False, True]])
+    told = local_prior(SearchParameters(prior=0.3, driven_cost=cost), traversed)
     odds = math.log(0.3 / 0.7)
-    assert told.shape == driven.shape
-    assert told[~driven] == pytest.approx(odds)
-    assert told[driven] == pytest.approx(odds - cost)
+    assert told.shape == traversed.shape
+    assert told[~traversed] == pytest.approx(odds)
+    assert told[traversed] == pytest.approx(odds - cost)

@@ -312,17 +312,17 @@ def test_max_sweeps_bounds_rounds_sweeps_and_shifts_together(most: int) -> None:
     assert not result.converged
 
 
-# With the prior of shapes, driven cells and bridges
+# With the prior of shapes, traversed cells and bridges
 
 SHAPED = SearchParameters(prior=0.4, driven_cost=3.0)
 ENDS = SearchParameters(prior=0.2, line_bonus=1.2, end_cost=2.5, isolated_cost=4.0, bridges=6)
 
 
-def shaped(readings: Readings, grid: Grid, parameters: SearchParameters, driven: np.ndarray) -> tuple[Search, Prior]:
+def shaped(readings: Readings, grid: Grid, parameters: SearchParameters, traversed: np.ndarray) -> tuple[Search, Prior]:
     evidence = Evidence(grid, MODEL)
     evidence.extend(readings)
-    whole = Prior(local_prior(parameters, driven).ravel(), shapes(parameters))
-    return Search(evidence, parameters, driven.ravel()), whole
+    whole = Prior(local_prior(parameters, traversed).ravel(), shapes(parameters))
+    return Search(evidence, parameters, traversed.ravel()), whole
 
 
 @settings(max_examples=25, deadline=None)
@@ -332,8 +332,8 @@ def test_with_shapes_the_objective_of_either_stage_never_falls_and_ends_at_an_op
 ) -> None:
     rng = np.random.default_rng(seed)
     readings = random_readings(rng, grid, int(rng.integers(1, 150)))
-    driven = rng.random(grid.shape) < 0.1
-    search, whole = shaped(readings, grid, parameters, driven)
+    traversed = rng.random(grid.shape) < 0.1
+    search, whole = shaped(readings, grid, parameters, traversed)
     plain = whole._replace(shape=np.zeros(256))
     maps = search.evidence.state.maps
     rounding = 3e-7 * len(readings)
@@ -398,11 +398,11 @@ def test_cells_driven_over_stay_free() -> None:
     readings = random_readings(np.random.default_rng(3), AREA, 400, z_max=2.0)
     free = np.zeros(AREA.shape, bool)
     before = shaped(readings, AREA, SHAPED, free)[0].run().occupied
-    driven = before.reshape(AREA.shape) == 1
-    search, _ = shaped(readings, AREA, dataclasses.replace(SHAPED, driven_cost=1000.0), driven)
+    traversed = before.reshape(AREA.shape) == 1
+    search, _ = shaped(readings, AREA, dataclasses.replace(SHAPED, driven_cost=1000.0), traversed)
     after = search.run().occupied
     assert before.any()
-    assert not (after[driven.ravel()]).any()
+    assert not (after[traversed.ravel()]).any()
 
 
 def test_a_search_changes_nothing_outside_of_its_window() -> None:

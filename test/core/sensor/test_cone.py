@@ -23,7 +23,7 @@ from forward_grid_mapper.core.sensor.cone_table import (
     grid_of,
     reach_of,
     walk,
-    walk_with_room,
+    walk_resized,
 )
 
 GRID = Grid(0.1, -7, 12, 41, 33)
@@ -140,7 +140,7 @@ def test_a_walk_says_how_many_cells_there_are_where_it_has_too_little_room() -> 
         cells, distances = np.full(4, -1, np.int32), np.full(4, -1.0)
         assert walk(table, t, GRID.shape, False, cells[:3], distances[:3]) == len(whole)
         assert cells[3] == -1, 'written beyond the end'
-        n, cells, distances = walk_with_room(table, t, GRID.shape, False, cells, distances)
+        n, cells, distances = walk_resized(table, t, GRID.shape, False, cells, distances)
         assert dict(zip(cells[:n].tolist(), distances[:n].tolist(), strict=True)) == whole
 
 

@@ -48,10 +48,10 @@ def test_expectations_are_the_share_of_each_cause(seed: int) -> None:
     for t in range(len(readings)):
         met = sorted(naive.obstacles(readings, t, GRID, occupied, model))
         terms = naive.causes(readings.z[t], readings.z_max[t], naive.sigma_of(readings, t, GRID, model), met, model)
-        share = np.array(terms) / sum(terms)
-        assert [e.random[t], e.lost[t], e.no_echo[t]] == pytest.approx(share[:3], abs=1e-10)
-        assert e.rank[t] == pytest.approx(sum((k + 1) * s for k, s in enumerate(share[3:])), abs=1e-9)
-        errors = sum(s * (readings.z[t] - d) ** 2 for s, d in zip(share[3:], met, strict=True))
+        reading_state = np.array(terms) / sum(terms)
+        assert [e.random[t], e.lost[t], e.no_echo[t]] == pytest.approx(reading_state[:3], abs=1e-10)
+        assert e.rank[t] == pytest.approx(sum((k + 1) * s for k, s in enumerate(reading_state[3:])), abs=1e-9)
+        errors = sum(s * (readings.z[t] - d) ** 2 for s, d in zip(reading_state[3:], met, strict=True))
         assert e.squared_error[t] == pytest.approx(errors, abs=1e-10)
         assert e.obstacles[t] == len(met)
 

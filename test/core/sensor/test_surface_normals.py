@@ -1,4 +1,4 @@
-"""Normals of surfaces, and the pairs that are left out where a reading grazes one."""
+"""Normals of surfaces, and the pairs that are left out where a reading exceeds_incidence_angle one."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from forward_grid_mapper.core.common.grid import Grid
 from forward_grid_mapper.core.common.parameters import ModelParameters
 from forward_grid_mapper.core.common.readings import Readings
 from forward_grid_mapper.core.evidence.evidence import Evidence
-from forward_grid_mapper.core.evidence.updates import find_seers, flip
+from forward_grid_mapper.core.evidence.updates import find_observing, flip
 from forward_grid_mapper.core.runtime import threads
 from forward_grid_mapper.core.sensor.surface_normals import (
     LEAST_AGREEMENT,
     LEAST_WEIGHT,
     QUANTUM,
     THROUGH,
-    facing_of,
+    exceeds_incidence_angle,
     gather,
-    grazes,
-    no_facing,
+    no_normals,
+    normals_of,
 )
 
 GRID = Grid(0.1, -7, 12, 25, 20)
@@ -70,58 +70,58 @@ def test_normals_are_those_of_the_twin(readings: Readings) -> None:
         assert np.abs(told.reshape(GRID.shape) * QUANTUM - exact).max() < 1e-3
     halves = sums_of(evidence, (0, 37)) + sums_of(evidence, (37, len(readings)))
     assert np.array_equal(halves, sums)
-    facing = evidence.state.facing
+    normals = evidence.state.normals
     cosine, sine, mass = (naive.box_sum(values) for values in expected)
     for row, column in np.ndindex(GRID.shape):
         c = row * GRID.width + column
         m, length = mass[row, column], math.hypot(cosine[row, column], sine[row, column])
         if abs(m - LEAST_WEIGHT) > 1e-2 and abs(length - LEAST_AGREEMENT * m) > 1e-2:
-            assert facing.known[c] == (m >= LEAST_WEIGHT and length >= LEAST_AGREEMENT * m)
-        if facing.known[c]:
+            assert normals.known[c] == (m >= LEAST_WEIGHT and length >= LEAST_AGREEMENT * m)
+        if normals.known[c]:
             normal = 0.5 * math.atan2(sine[row, column], cosine[row, column])
-            along = facing.x[c] * math.cos(normal) + facing.y[c] * math.sin(normal)
+            along = normals.x[c] * math.cos(normal) + normals.y[c] * math.sin(normal)
             assert abs(along) == pytest.approx(1.0, abs=1e-4)
-        assert facing.before[row, column] == facing.known.reshape(GRID.shape)[row, :column].sum()
-    assert facing.slant == pytest.approx(math.cos(0.7) ** 2)
-    assert 5 < facing.known.sum() < GRID.size
+        assert normals.before[row, column] == normals.known.reshape(GRID.shape)[row, :column].sum()
+    assert normals.cos2_limit == pytest.approx(math.cos(0.7) ** 2)
+    assert 5 < normals.known.sum() < GRID.size
 
 
 def test_the_normal_of_a_wall_is_across_it() -> None:
-    facing = made(along_wall()).state.facing
+    normals = made(along_wall()).state.normals
     row = round(3.0 / 0.1) - GRID.row
-    wall = facing.known.reshape(GRID.shape)[row, 5:20]
+    wall = normals.known.reshape(GRID.shape)[row, 5:20]
     assert wall.sum() > 10
-    assert np.abs(facing.y.reshape(GRID.shape)[row, 5:20][wall == 1]).min() > 0.9
+    assert np.abs(normals.y.reshape(GRID.shape)[row, 5:20][wall == 1]).min() > 0.9
 
 
 def test_readings_without_echo_tell_no_normal() -> None:
     readings = along_wall()
     readings.z[:] = readings.z_max
-    assert not made(readings).state.facing.known.any()
+    assert not made(readings).state.normals.known.any()
 
 
 def test_a_straight_angle_leaves_out_nothing() -> None:
     readings = along_wall()
     for angle in (math.pi / 2, 1.5708):
         evidence = made(readings, dataclasses.replace(MODEL, grazing_angle=angle))
-        assert evidence.state.facing.slant == no_facing().slant == 0.0
+        assert evidence.state.normals.cos2_limit == no_normals().cos2_limit == 0.0
     # all surfaces graze nobody where the angle has hardly any cosine
     sums = sums_of(evidence, (0, len(readings)))
-    assert facing_of(sums, GRID.shape, math.pi / 2).slant < 1e-12
+    assert normals_of(sums, GRID.shape, math.pi / 2).cos2_limit < 1e-12
 
 
 def left_out(evidence: Evidence, readings: Readings, t: int, model: ModelParameters) -> set[int]:
-    """The cells that reading t grazes, by the definition, given the normals."""
-    facing = evidence.state.facing
+    """The cells that reading t exceeds_incidence_angle, by the definition, given the normals."""
+    normals = evidence.state.normals
     xs, ys = GRID.centers()
     out = set()
     for c in naive.cells_of(readings, t, GRID, model):
         dx, dy = xs[c % GRID.width] - readings.x[t], ys[c // GRID.width] - readings.y[t]
         d = math.hypot(dx, dy)
         before = naive.surface(GRID, model)
-        if facing.known[c] and d - before < readings.z[t] - THROUGH * naive.sigma_of(readings, t, GRID, model):
-            slant = abs(facing.x[c] * dx + facing.y[c] * dy) / d
-            if slant < math.cos(model.grazing_angle):
+        if normals.known[c] and d - before < readings.z[t] - THROUGH * naive.sigma_of(readings, t, GRID, model):
+            cos2_limit = abs(normals.x[c] * dx + normals.y[c] * dy) / d
+            if cos2_limit < math.cos(model.grazing_angle):
                 out.add(c)
     return out
 
@@ -143,16 +143,16 @@ def test_pairs_are_those_of_the_cone_without_what_is_grazed(cell_distance: str, 
         kept = [(c, g) for c, g in zip(whole_band, whole_density, strict=True) if c not in grazed]
         assert list(zip(band, density, strict=True)) == kept
         total += len(grazed)
-        cut += s.shares[t]['runs'] > plain.state.shares[t]['runs']
+        cut += s.reading_states[t]['runs'] > plain.state.reading_states[t]['runs']
         for zone, cells in ((0, band), (1, free)):
             for c in cells:
                 found[c][t] = zone
     assert total > 50
     assert cut > 3, 'no run was cut in two'
     for c in range(GRID.size):
-        n = find_seers(s, c)
+        n = find_observing(s, c)
         assert n == len(found[c])
-        assert {int(t): int(zone) for t, zone in s.seers[:n]} == found[c]
+        assert {int(t): int(zone) for t, zone in s.observing[:n]} == found[c]
     # a cell that is only grazed is seen all the same
     assert np.array_equal(s.maps.seen, plain.state.maps.seen)
 
@@ -162,8 +162,8 @@ def snapshot(evidence: Evidence) -> list[object]:
     kept = ('through', 'runs', 'bands', 'blocking', 'weight', 'occupy', 'release', 'likelihood')
     return [
         *(array.tolist() for array in s.maps),
-        *(s.shares[name].tolist() for name in kept),
-        *map(list, s.facing[:3]),
+        *(s.reading_states[name].tolist() for name in kept),
+        *map(list, s.normals[:3]),
     ]
 
 
@@ -222,8 +222,8 @@ def test_what_is_grazed_is_not_contradicted() -> None:
 
 
 def test_only_what_a_reading_goes_through_can_be_grazed() -> None:
-    facing = no_facing()._replace(
-        known=np.ones(1, np.uint8), x=np.ones(1, np.float32), y=np.zeros(1, np.float32), slant=math.cos(0.7) ** 2
+    normals = no_normals()._replace(
+        known=np.ones(1, np.uint8), x=np.ones(1, np.float32), y=np.zeros(1, np.float32), cos2_limit=math.cos(0.7) ** 2
     )
     cones = made(along_wall(1)).state.cones.copy()
     reading = cones[0]
@@ -231,10 +231,12 @@ def test_only_what_a_reading_goes_through_can_be_grazed() -> None:
     for angle in np.linspace(-4, 4, 41):
         slanted = abs(math.cos(angle)) < math.cos(0.7)
         for d, through in ((7.9, True), (8.1, False), (0.5, True), (12.0, False)):
-            assert grazes(facing, reading, 0, d * math.cos(angle), d * math.sin(angle)) == (slanted and through)
-    facing.known[:] = 0
-    assert not grazes(facing, reading, 0, 0.0, 5.0)
-    facing.known[:] = 1
-    assert grazes(facing, reading, 0, 0.0, 5.0)
+            assert exceeds_incidence_angle(normals, reading, 0, d * math.cos(angle), d * math.sin(angle)) == (
+                slanted and through
+            )
+    normals.known[:] = 0
+    assert not exceeds_incidence_angle(normals, reading, 0, 0.0, 5.0)
+    normals.known[:] = 1
+    assert exceeds_incidence_angle(normals, reading, 0, 0.0, 5.0)
     reading['z'] = 1.9
-    assert not grazes(facing, reading, 0, 0.0, 0.1), 'within 2 sigma of the range everything is'
+    assert not exceeds_incidence_angle(normals, reading, 0, 0.0, 0.1), 'within 2 sigma of the range everything is'

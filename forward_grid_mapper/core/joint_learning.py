@@ -1,4 +1,4 @@
-"""Learning of the model together with the map: rounds of map search and updates, and doubts about what came out.
+"""Learning of the model together with the map: rounds of map search and updates, and warnings_ about what came out.
 
 Each round makes the map of the values so far and updates them, on that map, until they stay. The next round's map tells
 whether the new values are any good: where it has lost walls that the first map showed, they are refused, and learning
@@ -16,16 +16,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..common.grid import Grid
-from ..common.parameters import ModelParameters, Parameters
-from ..common.readings import Readings
-from ..mapping import Mapper
-from ..maps.map_set import MapSet
-from ..search.search import Progress
-from ..sensor.forward_model import expectations, log_likelihood
-from .lost_walls import Stretch, lost_walls
-from .model_update import learn
-from .standard_errors import LEARNED, Estimate, estimates
+from .common.grid import Grid
+from .common.parameters import ModelParameters, Parameters
+from .common.readings import Readings
+from .learning.lost_walls import Stretch, lost_walls
+from .learning.model_update import learn
+from .learning.standard_errors import LEARNED, Estimate, estimates
+from .mapping import Mapper
+from .maps.map_set import MapSet
+from .search.search import Progress
+from .sensor.forward_model import expectations, log_likelihood
 
 Watch = Callable[[str, Progress | None], None]
 
@@ -164,8 +164,8 @@ def learn_jointly(
     if len(accepted) > 1:
         found = estimates(learned_from.readings, learned_from.grid, learned_from.ml, last.parameters.model)
     number = len(accepted) - 1
-    doubts = (*_doubts(told, number, converged), *_weak(found, last.parameters.model))
-    return Learned(last.parameters, found, tuple(told), number, converged, last, doubts)
+    warnings_ = (*_quality_warnings(told, number, converged), *_weak(found, last.parameters.model))
+    return Learned(last.parameters, found, tuple(told), number, converged, last, warnings_)
 
 
 def _change(before: ModelParameters, after: ModelParameters) -> float:
@@ -188,7 +188,7 @@ def _round(first: MapSet, maps: MapSet, before: float) -> Round:
     )
 
 
-def _doubts(rounds: list[Round], accepted: int, converged: bool) -> list[str]:
+def _quality_warnings(rounds: list[Round], accepted: int, converged: bool) -> list[str]:
     """Say what speaks against the way that learning took."""
     told = []
     start, last = rounds[0], rounds[-1]

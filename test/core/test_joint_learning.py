@@ -13,7 +13,7 @@ from forward_grid_mapper.core.common.errors import InputError
 from forward_grid_mapper.core.common.grid import Grid
 from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.common.readings import Readings
-from forward_grid_mapper.core.learning.joint_learning import Learned, learn_jointly, settle
+from forward_grid_mapper.core.joint_learning import Learned, learn_jointly, settle
 from forward_grid_mapper.core.learning.lost_walls import lost_walls
 from forward_grid_mapper.core.learning.standard_errors import estimates
 from forward_grid_mapper.core.mapping import Mapper
@@ -150,5 +150,5 @@ def test_what_was_driven_over_is_no_wall() -> None:
             for name in ('x', 'y', 'yaw', 'z', 'z_max', 'half_angle', 'sigma', 'stamp', 'sensor')
         },
     )
-    driven = dataclasses.replace(before, readings=both, unexplained=np.zeros(len(both), bool))
-    assert lost_walls(driven, dataclasses.replace(driven, ml=np.zeros_like(before.ml))) == []
+    traversed = dataclasses.replace(before, readings=both, unexplained=np.zeros(len(both), bool))
+    assert lost_walls(traversed, dataclasses.replace(traversed, ml=np.zeros_like(before.ml))) == []

@@ -1,0 +1,41 @@
+"""What is drawn: panels of a picture, and tiles of a figure."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core.common.grid import Grid
+
+Box = tuple[float, float, float, float]
+"""Left, right, bottom, top in metres."""
+
+
+class Tile(NamedTuple):
+    """One map of the table: `values` are probabilities, or cells 0 and 1, with NaN or -1 where unknown."""
+
+    title: str
+    grid: Grid
+    values: NDArray[Any]
+
+
+class Panel(NamedTuple):
+    """One map of the picture: `values` are probabilities with NaN where unknown, `extent` its box in metres."""
+
+    title: str
+    values: NDArray[np.float32]
+    extent: Box
+
+
+class Picture(NamedTuple):
+    """What is drawn. `view` is the box shown; points are in metres; `overlay` is the panel that bears them."""
+
+    title: str
+    figures: str
+    panels: list[Panel]
+    view: Box
+    overlay: int
+    path_xy: NDArray[np.float64]
+    unexplained_xy: NDArray[np.float64]
