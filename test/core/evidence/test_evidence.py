@@ -209,16 +209,16 @@ def test_a_flip_notes_which_readings_it_changed() -> None:
 
 
 @pytest.mark.parametrize('seed', range(6))
-@pytest.mark.parametrize('share', [0.0, 0.3, 0.9])
-def test_readings_without_memory_come_to_the_same(seed: int, reading_state: float) -> None:
+@pytest.mark.parametrize('part', [0.0, 0.3, 0.9])
+def test_readings_without_memory_come_to_the_same(seed: int, part: float) -> None:
     readings, model, occupied = random_case(seed, 150)
     whole = evidence_of(readings, model, occupied)
     words = int(whole._totals[3])
-    less = evidence_of(readings, model, occupied, memory=reading_state * 4 * words)
+    less = evidence_of(readings, model, occupied, memory=part * 4 * words)
     assert whole.unstored == 0 < less.unstored
-    assert less.unstored < len(readings) or reading_state == 0.0
-    assert sum(less.state.reading_states['stored']) == len(less) - less.unstored
-    assert less.state.pairs.cell.nbytes <= reading_state * 4 * words
+    assert less.unstored < len(readings) or part == 0.0
+    assert sum(less.state.parts['stored']) == len(less) - less.unstored
+    assert less.state.pairs.cell.nbytes <= part * 4 * words
     assert less.nbytes < whole.nbytes
     for c in np.random.default_rng(seed).permutation(GRID.size)[:20]:
         flip(whole.state, c)
