@@ -6,7 +6,7 @@ from typing import Any
 
 from ..evidence.state import State
 from ..runtime.jit import kernel
-from .log_odds_map import QUANTUM
+from ..evidence.fixed_point import QUANTUM
 
 STRAIGHT_RUN = 4
 """Cells in a row that make a straight wall."""

@@ -217,7 +217,7 @@ def test_readings_without_memory_come_to_the_same(seed: int, part: float) -> Non
     less = evidence_of(readings, model, occupied, memory=part * 4 * words)
     assert whole.unstored == 0 < less.unstored
     assert less.unstored < len(readings) or part == 0.0
-    assert sum(less.state.parts['stored']) == len(less) - less.unstored
+    assert sum(less.state.reading_states['stored']) == len(less) - less.unstored
     assert less.state.pairs.cell.nbytes <= part * 4 * words
     assert less.nbytes < whole.nbytes
     for c in np.random.default_rng(seed).permutation(GRID.size)[:20]:
