@@ -24,7 +24,7 @@ from forward_grid_mapper.core.evidence.evidence import Evidence
 from forward_grid_mapper.core.evidence.pairs import WORDS_PER_RUN, make
 from forward_grid_mapper.core.evidence.state import State
 from forward_grid_mapper.core.evidence.tile_index import CHUNK, SHIFT
-from forward_grid_mapper.core.evidence.updates import _push_free, evaluate, find_observing, flip
+from forward_grid_mapper.core.evidence.updates import _add_to_free_zone, evaluate, find_observing, flip
 from forward_grid_mapper.core.maps.log_odds_map import arc_depth
 from forward_grid_mapper.core.maps.traversed import traversed_cells
 from forward_grid_mapper.core.search.flips import promising
@@ -49,9 +49,7 @@ def _make_all(s: State) -> None:
 @loop
 def _explain_all(s: State) -> None:
     for t in range(len(s.reading_states)):
-        evaluate(
-            s.model, s.reading_states[t], s.maps.occupied, s.pairs, s.reading_states[t].at, s.ratios, s.workspace.new
-        )
+        evaluate(s.model, s.reading_states[t], s.maps.occupied, s.pairs, s.reading_states[t].at, s.workspace)
 
 
 @loop
@@ -67,7 +65,7 @@ def _push_bands(s: State, by: int) -> None:
 @loop
 def _push_free_zones(s: State, by: int) -> None:
     for t in range(len(s.reading_states)):
-        _push_free(s.reading_states[t], s.pairs, s.reading_states[t].at, s.maps, (by, by))
+        _add_to_free_zone(s.reading_states[t], s.pairs, s.reading_states[t].at, s.maps, (by, by))
 
 
 @loop

@@ -37,8 +37,8 @@ from forward_grid_mapper.core.warm_up import warm_up
 ROOT = Path(__file__).resolve().parents[1]
 COLUMNS = ('x', 'y', 'yaw', 'z', 'z_max', 'half_angle', 'sigma', 'stamp', 'sensor')
 SETTINGS: dict[str, dict[str, float]] = {
-    'with a prior': {'p_hit': 0.6, 'p_rand': 0.4, 'p_lost': 0.25, 'sigma': 0.1, 'cut': 5.0, 'prior': 0.4},
-    'as in the paper': {'p_hit': 0.9, 'p_rand': 0.05, 'p_lost': 0.0, 'sigma': 0.05, 'cut': 5.0, 'prior': 0.5},
+    'with a prior': {'p_hit': 0.6, 'p_rand': 0.4, 'p_lost': 0.25, 'sigma': 0.1, 'prior': 0.4},
+    'as in the paper': {'p_hit': 0.9, 'p_rand': 0.05, 'p_lost': 0.0, 'sigma': 0.05, 'prior': 0.5},
 }
 RUNS = 3
 

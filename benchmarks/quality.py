@@ -75,7 +75,6 @@ ABLATIONS: dict[str, dict[str, Any]] = {
     'bridges': {'bridges': 0},
     'extension': {'extend': 0},
     'unknown': {'least_passed': 0.0},
-    'shifts': {'shift_moves': False},
     'lost echoes': {'p_lost': 0.0},
     'neighbours (uncertainty)': {'neighbour_weight': 0.0, 'alpha': 0.8, 'uncertainty_prior': 0.3},
     'all of these but lost echoes': {**PLAIN, 'neighbour_weight': 0.0, 'alpha': 0.8, 'uncertainty_prior': 0.3},

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from forward_grid_mapper.core.common.grid import Grid
 from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.common.readings import Readings
-from forward_grid_mapper.core.sensor.cone_table import cone_table, grid_of, offset_of, walk_resized
+from forward_grid_mapper.core.sensor.cone_table import cone_table, grid_of, walk_resized
 from forward_grid_mapper.recordings.read_drive import read_drive
 from forward_grid_mapper.simulation.drive import Recording, corridor_drive, door_drive, drive
 from forward_grid_mapper.simulation.rays import NOTHING, cast
@@ -211,8 +211,8 @@ def drawn(group: str, recording: Recording, model: dict[str, float], seed: int =
     z = np.empty(len(old))
     cells, distances = np.empty(4096, np.int32), np.empty(4096)
     for t in range(len(old)):
-        n, cells, distances = walk_resized(table, t, grid.shape, False, cells, distances)
-        hits = (np.sort(distances[:n][occupied[cells[:n]]]) - offset_of(p.model)) * grid.resolution
+        n, cells, distances = walk_resized(table, t, grid.shape, cells, distances)
+        hits = (np.sort(distances[:n][occupied[cells[:n]]]) - p.model.surface_offset) * grid.resolution
         cause, z_max = rng.random(), old.z_max[t]
         if cause < p.model.p_rand:
             z[t] = rng.random() * z_max

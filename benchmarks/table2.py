@@ -23,7 +23,7 @@ from forward_grid_mapper.core.common.readings import Readings
 from forward_grid_mapper.core.maps.log_odds_map import arc_depth
 from forward_grid_mapper.core.search.search import LEAST_GAIN
 from forward_grid_mapper.core.sensor.cone_table import cone_table, grid_of, walk
-from forward_grid_mapper.core.sensor.forward_model import causes_of
+from forward_grid_mapper.core.sensor.density import causes_of, density
 
 LARGEST = 100_000
 """Cells of the largest cone."""
@@ -41,46 +41,36 @@ class Table2(NamedTuple):
 
 
 @numba.njit(error_model='numpy')
-def _lists(table: Any, shape: tuple[int, int], nearest: bool) -> Any:
+def _lists(table: Any, shape: tuple[int, int]) -> Any:
     cells, distances = np.empty(LARGEST, np.int32), np.empty(LARGEST)
     begin = np.zeros(shape[0] * shape[1] + 1, np.int64)
     for t in range(len(table)):
-        for k in range(walk(table, t, shape, nearest, cells, distances)):
+        for k in range(walk(table, t, shape, cells, distances)):
             begin[cells[k] + 1] += 1
     begin = np.cumsum(begin)
     readings, at = np.empty(begin[-1], np.int32), begin.copy()
     for t in range(len(table)):
-        for k in range(walk(table, t, shape, nearest, cells, distances)):
+        for k in range(walk(table, t, shape, cells, distances)):
             readings[at[cells[k]]] = t
             at[cells[k]] += 1
     return begin, readings
 
 
 @numba.njit(error_model='numpy')
-def _density(z: float, mean: float, sigma: float, cut: float) -> float:
-    error = (z - mean) / sigma
-    return math.exp(-0.5 * error * error) / (math.sqrt(2.0 * math.pi) * sigma) if abs(error) <= cut else 0.0
-
-
-@numba.njit(error_model='numpy')
-def _likelihood(reading: Any, hits: Any, causes: Any, t: int, scale: tuple[float, float]) -> float:
+def _likelihood(reading: Any, hits: Any, causes: Any, t: int, resolution: float) -> float:
     """Return p(z | obstacles at the distances `hits`, ascending); `scale` is cut and resolution."""
-    cut, resolution = scale
-    total, weight = causes.random[t] + causes.lost[t], causes.share
+    total, weight = causes.random[t] + causes.lost[t], causes.mixture_weight
     for distance in hits:
-        total += weight * causes.p_hit * _density(reading.z, distance, reading.sigma, cut) / resolution
+        total += weight * causes.p_hit * density((reading.z - distance) / reading.sigma, reading.sigma * resolution)
         weight *= 1.0 - causes.p_hit
-    return float(total + weight * causes.no_echo[t])
+    return float(total + weight * causes.max_range[t])
 
 
 @numba.njit(error_model='numpy')
-def _sweep(
-    table: Any, lists: Any, causes: Any, occupied: Any, how: tuple[tuple[int, int], bool], numbers: Any
-) -> tuple[int, int]:
+def _sweep(table: Any, lists: Any, causes: Any, occupied: Any, shape: tuple[int, int], numbers: Any) -> tuple[int, int]:
     """Visit all cells once; return how many flipped, and how often a reading was cast."""
-    shape, nearest = how
     begin, readings = lists
-    prior, least, scale = numbers
+    prior, least, resolution = numbers
     cells, distances = np.empty(LARGEST, np.int32), np.empty(LARGEST)
     hits, others = np.empty(LARGEST), np.empty(LARGEST)
     flips, casts = 0, 0
@@ -91,7 +81,7 @@ def _sweep(
             casts += 1
             # with the cell occupied, and without it
             m, n = 0, 0
-            for k in range(walk(table, t, shape, nearest, cells, distances)):
+            for k in range(walk(table, t, shape, cells, distances)):
                 if cells[k] == c or occupied[cells[k]]:
                     hits[m] = distances[k]
                     m += 1
@@ -101,7 +91,8 @@ def _sweep(
             hits[:m].sort()
             others[:n].sort()
             gain += math.log(
-                _likelihood(table[t], hits[:m], causes, t, scale) / _likelihood(table[t], others[:n], causes, t, scale)
+                _likelihood(table[t], hits[:m], causes, t, resolution)
+                / _likelihood(table[t], others[:n], causes, t, resolution)
             )
         if begin[c] < begin[c + 1] and (gain > least if not occupied[c] else gain < -least):
             occupied[c] ^= 1
@@ -115,17 +106,16 @@ def search(readings: Readings, parameters: Parameters, most_sweeps: int = 200) -
     grid = grid_of(readings, p.model, p.grid, beyond=arc_depth(p))
     table = cone_table(readings, grid, p.model)
     causes = causes_of(readings, table['sigma'] * grid.resolution, p.model)
-    how = (grid.shape, p.model.cell_distance == 'nearest')
-    lists = _lists(table, *how)
+    lists = _lists(table, grid.shape)
     prior = math.log(p.search.prior / (1 - p.search.prior))
-    numbers = (prior, LEAST_GAIN, (p.model.cut, grid.resolution))
+    numbers = (prior, LEAST_GAIN, grid.resolution)
     occupied = np.zeros(grid.size, np.uint8)
     # compiles, and visits no cell
-    _sweep(table, lists, causes, occupied[:0], how, numbers)
+    _sweep(table, lists, causes, occupied[:0], grid.shape, numbers)
     sweeps, flips, casts = 0, 0, 0
     start = time.perf_counter()
     while sweeps < most_sweeps:
-        flipped, cast = _sweep(table, lists, causes, occupied, how, numbers)
+        flipped, cast = _sweep(table, lists, causes, occupied, grid.shape, numbers)
         sweeps, flips, casts = sweeps + 1, flips + flipped, casts + cast
         if not flipped:
             break

@@ -13,6 +13,7 @@ from forward_grid_mapper.core.common.readings import Readings
 from forward_grid_mapper.core.evidence.state import State
 from forward_grid_mapper.core.evidence.tile_index import Tiles
 from forward_grid_mapper.core.search.prior import Prior
+from forward_grid_mapper.core.sensor.density import CUT
 
 
 def axis_crosses(x: float, y: float, yaw: float, length: float, left: float, bottom: float, size: float) -> bool:
@@ -28,48 +29,38 @@ def axis_crosses(x: float, y: float, yaw: float, length: float, left: float, bot
     return low <= high
 
 
-def cell_distance(x: float, y: float, cx: float, cy: float, size: float, nearest: bool) -> float:
-    dx, dy = cx - x, cy - y
-    if nearest:
-        dx, dy = max(abs(dx) - size / 2, 0.0), max(abs(dy) - size / 2, 0.0)
-    return math.hypot(dx, dy)
-
-
 def cone_cells(
     pose: tuple[float, float, float],
     half_angle: float,
     reach: float,
     grid: Grid,
-    nearest: bool = False,
     slack: float = 0.0,
 ) -> dict[int, float]:
     """Cells of a cone and their distances in metres; `slack` widens it, to tell rounding from error."""
     x, y, yaw = pose
-    # cells may be within reach whose nearest point is not where the axis crosses them
-    axis = reach + (0.7072 * grid.resolution if nearest else 0.0)
     cells = {}
     xs, ys = grid.centers()
     for row, cy in enumerate(ys):
         for column, cx in enumerate(xs):
-            d = cell_distance(x, y, cx, cy, grid.resolution, nearest)
+            d = math.hypot(cx - x, cy - y)
             if d > reach + slack:
                 continue
             off_axis = abs(math.remainder(math.atan2(cy - y, cx - x) - yaw, 2 * math.pi))
             size = grid.resolution
-            crossed = axis_crosses(x, y, yaw, axis, cx - size / 2 - slack, cy - size / 2 - slack, size + 2 * slack)
+            crossed = axis_crosses(x, y, yaw, reach, cx - size / 2 - slack, cy - size / 2 - slack, size + 2 * slack)
             if off_axis <= half_angle + slack or crossed:
                 cells[row * grid.width + column] = d
     return cells
 
 
-def normal(z: float, mean: float, sigma: float, cut: float) -> float:
+def normal(z: float, mean: float, sigma: float) -> float:
     error = (z - mean) / sigma
-    return math.exp(-0.5 * error * error) / (math.sqrt(2 * math.pi) * sigma) if abs(error) <= cut else 0.0
+    return math.exp(-0.5 * error * error) / (math.sqrt(2 * math.pi) * sigma) if abs(error) <= CUT else 0.0
 
 
 def lost(z: float, z_max: float, sigma: float, model: ModelParameters) -> float:
     """Density of a lost echo, which is no echo and so of the largest range."""
-    return model.p_lost * normal(z, z_max, sigma, model.cut) if z >= z_max else 0.0
+    return model.p_lost * normal(z, z_max, sigma) if z >= z_max else 0.0
 
 
 def causes(z: float, z_max: float, sigma: float, distances: list[float], model: ModelParameters) -> list[float]:
@@ -85,9 +76,9 @@ def causes(z: float, z_max: float, sigma: float, distances: list[float], model: 
         p = mixture_weight * math.prod(model.p_hit if answers else 1 - model.p_hit for answers in pattern)
         if any(pattern):
             k = pattern.index(True)
-            out[3 + k] += p * normal(z, distances[k], sigma, model.cut)
+            out[3 + k] += p * normal(z, distances[k], sigma)
         else:
-            out[2] += p * normal(z, z_max, sigma, model.cut)
+            out[2] += p * normal(z, z_max, sigma)
     return out
 
 
@@ -105,9 +96,9 @@ def likelihood(z: float, z_max: float, sigma: float, distances: list[float], mod
     mixture_weight = 1 - model.p_rand - model.p_lost
     total = model.p_rand / z_max + lost(z, z_max, sigma, model)
     for d in sorted(distances):
-        total += mixture_weight * model.p_hit * normal(z, d, sigma, model.cut)
+        total += mixture_weight * model.p_hit * normal(z, d, sigma)
         mixture_weight *= 1 - model.p_hit
-    return total + mixture_weight * normal(z, z_max, sigma, model.cut)
+    return total + mixture_weight * normal(z, z_max, sigma)
 
 
 def log_likelihood(readings: Readings, grid: Grid, occupied: np.ndarray, model: ModelParameters) -> float:
@@ -120,26 +111,26 @@ def log_likelihood(readings: Readings, grid: Grid, occupied: np.ndarray, model: 
 
 def free_end(readings: Readings, t: int, grid: Grid, model: ModelParameters) -> float:
     """Where the free zone of reading t ends and its band begins, in metres."""
-    return readings.z[t] - model.cut * sigma_of(readings, t, grid, model)
+    return readings.z[t] - CUT * sigma_of(readings, t, grid, model)
 
 
 def reach(readings: Readings, t: int, grid: Grid, model: ModelParameters) -> float:
     """The distance in metres beyond which no cell matters to reading t."""
-    end = readings.z[t] + model.cut * sigma_of(readings, t, grid, model)
+    end = readings.z[t] + CUT * sigma_of(readings, t, grid, model)
     return end if end < readings.z_max[t] else readings.z_max[t]
 
 
 def surface(grid: Grid, model: ModelParameters) -> float:
     """How far the surface of an obstacle lies before what the distance to its cell is measured to, in metres."""
-    return 0.0 if model.cell_distance == 'nearest' else model.surface_offset * grid.resolution
+    return model.surface_offset * grid.resolution
 
 
 def cells_of(readings: Readings, t: int, grid: Grid, model: ModelParameters, slack: float = 0.0) -> dict[int, float]:
     """The cells that reading t sees, and the distances of their surfaces in metres."""
     pose = (readings.x[t], readings.y[t], readings.yaw[t])
-    before, nearest = surface(grid, model), model.cell_distance == 'nearest'
+    before = surface(grid, model)
     end = reach(readings, t, grid, model) + before
-    cells = cone_cells(pose, readings.half_angle[t], end, grid, nearest, slack)
+    cells = cone_cells(pose, readings.half_angle[t], end, grid, slack)
     return {c: d - before for c, d in cells.items()}
 
 
@@ -153,15 +144,13 @@ def strength(readings: Readings, t: int, grid: Grid, c: int) -> float:
     return max(0.0, 1 - (off_axis / edge) ** 2)
 
 
-def live_log_odds(
-    readings: Readings, grid: Grid, depth: float, logits: tuple[float, float, float], nearest: bool = False
-) -> np.ndarray:
+def live_log_odds(readings: Readings, grid: Grid, depth: float, logits: tuple[float, float, float]) -> np.ndarray:
     """The standard map; `logits` of occupied, free, and free without echo."""
     out = np.full(grid.size, np.nan)
     for t in range(len(readings)):
         x, y, yaw, z = readings.x[t], readings.y[t], readings.yaw[t], readings.z[t]
         echo = z < readings.z_max[t]
-        for c, d in cone_cells((x, y, yaw), readings.half_angle[t], z + depth, grid, nearest).items():
+        for c, d in cone_cells((x, y, yaw), readings.half_angle[t], z + depth, grid).items():
             weight = strength(readings, t, grid, c)
             if d < (z - depth if echo else z):
                 out[c] = np.nansum([out[c], weight * logits[1 if echo else 2]])
@@ -256,12 +245,12 @@ def log_likelihoods(readings: Readings, grid: Grid, maps: np.ndarray, model: Mod
     total = np.zeros(len(maps))
     for t in range(len(readings)):
         z, z_max, sigma = readings.z[t], readings.z_max[t], sigma_of(readings, t, grid, model)
-        no_echo = normal(z, z_max, sigma, model.cut)
+        no_echo = normal(z, z_max, sigma)
         unmapped = model.p_rand / z_max + lost(z, z_max, sigma, model)
         likelihood, left = np.full(len(maps), unmapped), np.full(len(maps), mixture_weight)
         for c, d in sorted(cells_of(readings, t, grid, model).items(), key=lambda pair: pair[1]):
             answers = model.p_hit * maps[:, c]
-            likelihood += left * answers * normal(z, d, sigma, model.cut)
+            likelihood += left * answers * normal(z, d, sigma)
             left *= 1 - answers
         total += np.log(likelihood + left * no_echo)
     return total
@@ -302,12 +291,12 @@ def passed(
     for t in range(len(readings)):
         z, z_max, sigma = readings.z[t], readings.z_max[t], sigma_of(readings, t, grid, model)
         away = cells_of(readings, t, grid, model)
-        chance, no_echo = model.p_rand / z_max, normal(z, z_max, sigma, model.cut)
+        chance, no_echo = model.p_rand / z_max, normal(z, z_max, sigma)
         met = sorted((d, c) for c, d in away.items() if occupied.ravel()[c])
-        free_end = z - model.cut * sigma
+        free_end = z - CUT * sigma
         terms, left = [], mixture_weight
         for d, _ in met:
-            terms.append((d, left * model.p_hit * normal(z, d, sigma, model.cut)))
+            terms.append((d, left * model.p_hit * normal(z, d, sigma)))
             left *= 1 - model.p_hit
         whole = sum(term for _, term in terms) + left * no_echo
         total = chance + model.p_lost * no_echo + whole

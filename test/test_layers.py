@@ -22,7 +22,7 @@ BELOW = {
 }
 """The packages that each package may import from, beside itself."""
 
-CORE = ('common', 'runtime', 'messages', 'sensor', 'evidence', 'search', 'maps', 'learning')
+CORE = ('common', 'runtime', 'sensor', 'messages', 'evidence', 'search', 'maps', 'learning')
 """The layers of the core, from the bottom up; the modules beside them are above all."""
 
 OUTSIDE = {

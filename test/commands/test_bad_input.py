@@ -357,7 +357,7 @@ def test_a_pose_from_another_planet(tmp_path: Path) -> None:
         (['--set', 'phit=0.5'], ["'phit'", 'did you mean p_hit']),
         (['--set', 'p_hit=high'], ['p_hit', "'high' is not a number"]),
         (['--set', 'max_sweeps=2.5'], ['max_sweeps', 'whole number']),
-        (['--set', 'shift_moves=maybe'], ['shift_moves', 'true or false']),
+        (['--set', 'online=maybe'], ['online', 'true or false']),
         (['--set', 'over_range=ignore'], ['over_range', 'no_echo, discard']),
         (['--set', 'p_hit'], ["'p_hit'", 'name=value']),
         (['--sensor', 'sonar_00=1,2'], ["'sonar_00=1,2'", 'frame=x,y,yaw']),
@@ -396,7 +396,7 @@ def test_no_bag_given(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Non
     [
         ('p_hit: 2', ['p_hit', 'out of range']),
         ('p_hit: high', ['p_hit', "'high' is not a number"]),
-        ('shift_moves: 1', ['shift_moves', 'true or false']),
+        ('online: 1', ['online', 'true or false']),
         ('phit: 0.5', ['phit', 'did you mean p_hit']),
         ('p_hit: 0.5\np_hit: 0.6', ['p_hit', 'twice']),
         ('sensors: {front: {pose: [1, 2]}}', ['sensors.front.pose', '[x, y, yaw]']),

@@ -107,7 +107,7 @@ def test_readings_that_say_the_same_add_weight_and_nothing_else(values: dict[str
     assert len(online) == count
     assert online._evidence.nbytes == taken
     evidence = online._evidence
-    weight = evidence.state.reading_states['weight'][:count]
+    weight = evidence.state.reading_states['multiplicity'][:count]
     assert weight.sum() == 4 * len(readings)
     # as if each kept reading had come so many times
     often = Evidence(evidence.grid, evidence.model, start=evidence.state.maps.occupied.reshape(evidence.grid.shape))
@@ -271,6 +271,6 @@ def test_readings_that_say_the_same_may_come_in_one_call() -> None:
     apart.add(readings)
     assert len(together) == len(apart) == kept
     states = [online._evidence.state for online in (together, apart) if online._evidence is not None]
-    weights = [state.reading_states['weight'][:kept].tolist() for state in states]
+    weights = [state.reading_states['multiplicity'][:kept].tolist() for state in states]
     assert weights[0] == weights[1]
     assert sum(weights[0]) == len(twice)

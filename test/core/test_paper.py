@@ -36,7 +36,7 @@ LINE = Grid(0.1, 0, 0, 12, 1)
 
 AREA = Grid(0.1, 0, 0, 12, 9)
 
-PAPER = plain_model(p_hit=0.6, p_rand=0.1, p_lost=0.0, sigma=0.05, cut=5.0, cell_distance='center')
+PAPER = plain_model(p_hit=0.6, p_rand=0.1, p_lost=0.0, sigma=0.05)
 
 WHOLE = replace(PAPER, cut=40.0)
 """The same with the tails of the noise."""
@@ -108,7 +108,7 @@ def terms(readings: Readings, t: int, grid: Grid, occupied: np.ndarray, model: M
 
 def test_one_reading_gives_back_its_inverse_model_and_not_eq_4_as_printed() -> None:
     values = {'resolution': 0.1, 'live_p_occupied': 0.8, 'live_p_free': 0.25, 'live_depth': 0.05}
-    live = LogOddsMap(Parameters.from_flat({**values, 'cell_distance': 'center'}))
+    live = LogOddsMap(Parameters.from_flat({**values}))
     live.add(along(0.55))
     p, log_odds = live.probability(LINE)[0], live.log_odds(LINE)[0]
     assert p[2] == pytest.approx(0.25, abs=1e-5)

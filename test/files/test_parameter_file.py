@@ -115,7 +115,7 @@ def test_parameters_of_ros_itself_pass(tmp_path: Path) -> None:
         ('p_hit: 1.5', 'p_hit: 1.5 is out of range'),
         ('p_hit:', 'p_hit: None is not a number'),
         ('max_sweeps: 1.5', 'max_sweeps: 1.5 is not a whole number'),
-        ('shift_moves: 1', 'shift_moves: 1 is not true or false'),
+        ('online: 1', 'online: 1 is not true or false'),
         ('over_range: keep', 'not one of no_echo, discard'),
         ('p_hit: 0.3\np_hit: 0.4', 'p_hit is given twice'),
         ('sensors.a.pose: [0, 0, 0]\nsensors: {a: {pose: [0, 0, 1]}}', 'sensors.a.pose is given twice'),
@@ -165,7 +165,7 @@ def test_settings_round_trip(values: dict[str, Any]) -> None:
         ('p_hit=', "'' is not a number"),
         ('p_hit=nan', 'out of range'),
         ('max_sweeps=1.5', "'1.5' is not a whole number"),
-        ('shift_moves=maybe', 'not true or false'),
+        ('online=maybe', 'not true or false'),
     ],
 )
 def test_bad_settings(text: str, message: str) -> None:

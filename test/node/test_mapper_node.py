@@ -224,7 +224,7 @@ def test_parameters_are_checked(start: Any, robot: Robot, door: Recording) -> No
         result = robot.set_parameter(name, value)
         assert not result.successful, name
         assert re.search(why, result.reason), result.reason
-    for name, value in (('p_hit', 0.9), ('shift_moves', False), ('sigma', 1), ('publish_rate', 10.0)):
+    for name, value in (('p_hit', 0.9), ('online', True), ('sigma', 1), ('publish_rate', 10.0)):
         result = robot.set_parameter(name, value)
         assert result.successful, result.reason
     robot.play(merged(door))

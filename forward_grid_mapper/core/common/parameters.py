@@ -124,7 +124,6 @@ class ModelParameters:
         0.001,
         5.0,
     )
-    cut: float = _param(4.0, 'The noise density is cut off at this many sigma.', 'sigma', 3.0, 40.0)
     grazing_angle: float = _param(
         0.7,
         'A reading that meets a surface this far off its normal does not contradict it; pi/2 has none of that.',
@@ -132,16 +131,9 @@ class ModelParameters:
         0.1,
         1.5708,
     )
-    cell_distance: str = _param(
-        'center',
-        'Distance from the sensor to a cell: to its center or to its nearest point.',
-        choices=('center', 'nearest'),
-        read_only=True,
-    )
     surface_offset: float = _param(
         0.3,
-        'How far before the center of its cell the surface of an obstacle lies, unless cell_distance is nearest; 0 is '
-        'the paper.',
+        'How far before the center of its cell the surface of an obstacle lies; 0 is the paper.',
         'cells',
         0.0,
         0.5,
@@ -197,7 +189,6 @@ class SearchParameters:
         0.0,
         100.0,
     )
-    shift_moves: bool = _param(True, 'Also try to move an occupied cell to a neighbouring one in a single step.')
     max_sweeps: int = _param(
         200, 'Bound on the sweeps over the map; the report says when it was reached.', 'sweeps', 1, 100_000
     )

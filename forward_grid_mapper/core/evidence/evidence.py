@@ -16,10 +16,11 @@ from ..common.readings import Readings
 from ..runtime.cancelling import check
 from ..runtime.jit import kernel
 from ..runtime.threads import parts, run_each
-from ..sensor.cone import row_runs, within
-from ..sensor.cone_table import CONE, Floats, cone_of, cone_table, offset_of
+from ..sensor.cone import rows_of, runs_of
+from ..sensor.cone_table import CONE, Floats, cone_of, cone_table
+from ..sensor.density import causes_of
 from ..sensor.surface_normals import gather, no_normals, normals_of
-from .fixed_point import QUANTUM, ratio_workspace_for
+from .fixed_point import QUANTUM
 from .neighbourhood import patterns
 from .pairs import WORD, WORDS_PER_BAND_PAIR, WORDS_PER_RUN, Lattice, empty_pairs, workspace_for
 from .state import READING_STATE, Maps, Model, State
@@ -48,31 +49,31 @@ def _index(s: State, limits: tuple[int, int, int], totals: Any) -> int:
     cones, lattice, tiles, seen, before = s.cones, s.lattice, s.tiles, s.maps.seen, s.normals.before
     for t in range(begin, end):
         reading = cones[t]
-        cone = cone_of(reading, lattice.nearest)
-        bottom, top = max(cone.bottom, 0), min(cone.top, lattice.height - 1)
+        cone = cone_of(reading)
+        bottom, end_row = rows_of(cone, lattice.height)
         across = min(2 * int(cone.reach) + 3, lattice.width)
-        most = (((top - bottom) >> SHIFT) + 2) * ((across >> SHIFT) + 2)
+        most = (((end_row - bottom) >> SHIFT) + 2) * ((across >> SHIFT) + 2)
         if s.stop[0] or tiles.used[0] + most > len(tiles.chunks):
             return t
-        runs, free, band = 0, 0, 0
-        for row in range(bottom, top + 1):
-            a, b, c, d = row_runs(cone, row, reading.reach, lattice.width, lattice.nearest)
-            first, last = within(cone.x, row + 0.5 - cone.y, reading.free, lattice.nearest)
-            for left, right in ((a, b), (c, d)):
+        count, free, band = 0, 0, 0
+        for row in range(bottom, end_row):
+            runs = runs_of(cone, row, lattice.width)
+            for left, right in ((runs.first, runs.last), (runs.first2, runs.last2)):
                 if left > right:
                     continue
                 insert(tiles, row, left, right, t)
-                inside = max(min(right, last) - max(left, first) + 1, 0)
-                runs += inside > 0
+                inner, outer = max(left, runs.inner), min(right, runs.outer)
+                inside = max(outer - inner + 1, 0)
+                count += inside > 0
                 if s.normals.cos2_limit > 0.0 and inside > 0:
-                    # a surface that is grazed may cut a run in two
-                    runs += before[row, min(right, last) + 1] - before[row, max(left, first)]
+                    # a cell that is left out may cut a run in two
+                    count += before[row, outer + 1] - before[row, inner]
                 for c in range(np.uint64(row * lattice.width + left), np.uint64(row * lattice.width + right + 1)):
                     seen[c] += 1
                 free += inside
                 band += right - left + 1 - inside
         reading_state = s.reading_states[t]
-        size = WORDS_PER_RUN * runs + WORDS_PER_BAND_PAIR * band
+        size = WORDS_PER_RUN * count + WORDS_PER_BAND_PAIR * band
         reading_state.at = totals[WORDS]
         reading_state.stored = totals[WORDS] + size <= words
         if reading_state.stored:
@@ -88,11 +89,10 @@ def _index(s: State, limits: tuple[int, int, int], totals: Any) -> int:
 def reading_state_table(readings: Readings, sigma: Floats, model: ModelParameters) -> NDArray[np.void]:
     """Return records of `READING_STATE`, shape (N,), with what no map changes; `sigma` is that of `effective_sigma`."""
     reading_states = np.zeros(len(readings), READING_STATE)
-    error = (readings.z_max - readings.z) / sigma
-    density = np.where(error <= model.cut, np.exp(-0.5 * error**2) / (math.sqrt(2 * math.pi) * sigma), 0.0)
-    reading_states['floor'] = model.p_rand / readings.z_max + np.where(readings.echo, 0.0, model.p_lost * density)
-    reading_states['no_echo'] = density
-    reading_states['weight'] = 1
+    causes = causes_of(readings, sigma, model)
+    reading_states['floor'] = causes.random + causes.lost
+    reading_states['max_range'] = causes.max_range
+    reading_states['multiplicity'] = 1
     return reading_states
 
 
@@ -143,7 +143,7 @@ class Evidence:
         self._size = 0
         self.state = State(
             normals=no_normals(),
-            lattice=Lattice(grid.height, grid.width, model.cell_distance == 'nearest', model.cut, grid.resolution),
+            lattice=Lattice(grid.height, grid.width, grid.resolution),
             model=Model(model.p_hit, 1.0 - model.p_rand - model.p_lost),
             cones=np.empty(0, CONE),
             reading_states=np.empty(0, READING_STATE),
@@ -151,7 +151,6 @@ class Evidence:
             tiles=no_tiles(grid.height, grid.width),
             maps=_maps(grid, np.zeros(grid.shape, np.uint8) if start is None else np.array(start, np.uint8)),
             workspace=workspace_for(0),
-            ratios=ratio_workspace_for(0),
             observing=np.empty((0, 2), np.int32),
             clock=np.zeros(1, np.int64),
             stop=np.zeros(1, np.uint8) if stop is None else stop,
@@ -181,7 +180,7 @@ class Evidence:
     def log_likelihood(self) -> float:
         """Log p(Z | m) in nats."""
         reading_states = self.state.reading_states[: self._size]
-        return float((reading_states['likelihood'].astype(np.int64) * reading_states['weight']).sum() * QUANTUM)
+        return float((reading_states['likelihood'].astype(np.int64) * reading_states['multiplicity']).sum() * QUANTUM)
 
     def of_occupancy(self) -> Floats:
         """Return log p(Z | cell occupied, rest of the map) − log p(Z | cell free, rest of the map) in nats.
@@ -195,7 +194,7 @@ class Evidence:
     @property
     def z_max(self) -> Floats:
         """The largest range of every reading in metres, shape (N,)."""
-        far = self.state.cones['z_max'][: self._size] - offset_of(self.model)
+        far = self.state.cones['z_max'][: self._size] - self.model.surface_offset
         out: Floats = far * self.grid.resolution
         return out
 
@@ -267,7 +266,7 @@ class Evidence:
         for k, (first, last) in enumerate(parts(begin, end, self._threads)):
             s = self.state
             if k:
-                s = s._replace(workspace=workspace_for(largest), ratios=ratio_workspace_for(largest))
+                s = s._replace(workspace=workspace_for(largest))
             jobs.append(partial(work, s, first, last))
         run_each(jobs)
         check(self.state.stop)
@@ -307,7 +306,7 @@ class Evidence:
 
         def work(s: State, first: int, last: int) -> None:
             sums.append(np.zeros((3, self.grid.size), np.int64))
-            gather(s.cones, self.grid.shape, s.lattice.nearest, (first, last), sums[-1], s.stop)
+            gather(s.cones, self.grid.shape, (first, last), sums[-1], s.stop)
 
         self.each(0, end, work)
         normals = normals_of(np.sum(sums, axis=0), self.grid.shape, self.model.grazing_angle)
@@ -333,5 +332,5 @@ class Evidence:
             pairs.cell[:kept] = s.pairs.cell
             s = s._replace(pairs=pairs)
         if largest + 3 > len(s.workspace.new):
-            s = s._replace(workspace=workspace_for(largest), ratios=ratio_workspace_for(largest))
+            s = s._replace(workspace=workspace_for(largest))
         self.state = s

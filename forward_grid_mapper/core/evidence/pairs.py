@@ -17,9 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..runtime.jit import kernel
-from ..sensor.cone import distance, row_runs, within
+from ..sensor.cone import rows_of, runs_of
 from ..sensor.cone_table import Cones, cone_of
+from ..sensor.density import density
 from ..sensor.surface_normals import SurfaceNormals, exceeds_incidence_angle
+from .fixed_point import RatioWorkspace, ratio_workspace_for
 
 WORD = 4
 """Bytes in a word of a block."""
@@ -29,12 +31,10 @@ WORDS_PER_BAND_PAIR = 3
 
 
 class Lattice(NamedTuple):
-    """What cones are walked with: cells up and across, the distance's kind, σ at which to cut, metres a cell."""
+    """The grid as kernels see it: cells up and across, metres a cell."""
 
     height: int
     width: int
-    nearest: bool
-    cut: float
     resolution: float
 
 
@@ -52,25 +52,28 @@ class Pairs(NamedTuple):
 
 
 def empty_pairs(words: int) -> Pairs:
-    """Return room for so many words."""
+    """Return pairs of so many words, not yet written."""
     block = np.empty(words, np.uint32)
     return Pairs(block, block.view(np.float32), block.view(np.int32))
 
 
 class Workspace(NamedTuple):
-    """Room to work on one reading at a time.
+    """Arrays to work on one reading at a time; every thread has its own.
 
     Attributes
     ----------
     pairs : Pairs
-        Room for its pairs, where they are not stored.
+        For its pairs, where they are not stored.
+    ratios : RatioWorkspace
+        For the likelihood ratios of its cells.
     new : int32
-        Room for its logs.
+        For the logs of these, and of three more ratios (`updates.evaluate`).
     cell, key, unsorted, unsorted_key, tally, bucket
-        Room to sort its band in.
+        For sorting its band.
     """
 
     pairs: Pairs
+    ratios: RatioWorkspace
     new: NDArray[np.int32]
     cell: NDArray[np.uint32]
     key: NDArray[np.float64]
@@ -81,11 +84,12 @@ class Workspace(NamedTuple):
 
 
 def workspace_for(largest: int) -> Workspace:
-    """Return room for cones of up to `largest` cells."""
+    """Return a workspace for cones of up to `largest` cells."""
     n = largest + 3
     ints = [np.empty(n, np.int32) for _ in range(3)]
     return Workspace(
         pairs=empty_pairs((WORDS_PER_RUN + WORDS_PER_BAND_PAIR) * n),
+        ratios=ratio_workspace_for(largest),
         new=ints[0],
         cell=np.empty(n, np.uint32),
         key=np.empty(n),
@@ -102,51 +106,45 @@ def make(
 ) -> tuple[int, int]:
     """Write the runs, cells and densities of reading t into `pairs` from `at`; return its runs and band pairs.
 
-    Surfaces that the reading exceeds_incidence_angle are left out, which may cut a run in two.
+    Cells at which the reading exceeds the incidence angle are left out, which may cut a run in two.
     """
     reading = cones[t]
-    cone = cone_of(reading, lattice.nearest)
+    cone = cone_of(reading)
     n, m = at, 0
-    for row in range(max(cone.bottom, 0), min(cone.top, lattice.height - 1) + 1):
-        a, b, c, d = row_runs(cone, row, reading.reach, lattice.width, lattice.nearest)
+    for row in range(*rows_of(cone, lattice.height)):
+        runs = runs_of(cone, row, lattice.width)
         v = row + 0.5 - cone.y
-        first, last = within(cone.x, v, reading.free, lattice.nearest)
         start = row * lattice.width
-        for begin, end in ((a, b), (c, d)):
+        for begin, end in ((runs.first, runs.last), (runs.first2, runs.last2)):
             if begin > end:
                 continue
             slanted = normals.cos2_limit > 0.0 and normals.before[row, end + 1] > normals.before[row, begin]
-            inner, outer = max(begin, first), min(end, last)
+            inner, outer = max(begin, runs.inner), min(end, runs.outer)
             if inner > outer:
                 inner, outer = end + 1, end
-            elif not slanted:
-                pairs.cell[n] = start + inner
-                pairs.cell[n + 1] = start + outer
-                n += 2
-            else:
-                left = inner
-                for column in range(inner, outer + 2):
-                    if column > outer or exceeds_incidence_angle(
-                        normals, reading, start + column, column + 0.5 - cone.x, v
-                    ):
-                        if left < column:
-                            pairs.cell[n] = start + left
-                            pairs.cell[n + 1] = start + column - 1
-                            n += 2
-                        left = column + 1
+            left = inner
+            for column in range(inner if slanted else outer + 1, outer + 2):
+                # a run ends at its last column, and before a cell that is left out
+                if column > outer or exceeds_incidence_angle(
+                    normals, reading, start + column, column + 0.5 - cone.x, v
+                ):
+                    if left < column:
+                        pairs.cell[n] = start + left
+                        pairs.cell[n + 1] = start + column - 1
+                        n += WORDS_PER_RUN
+                    left = column + 1
             for side_first, side_last in ((begin, inner - 1), (outer + 1, end)):
                 for column in range(side_first, side_last + 1):
                     u = column + 0.5 - cone.x
                     if not slanted or not exceeds_incidence_angle(normals, reading, start + column, u, v):
                         workspace.unsorted[m] = start + column
-                        workspace.unsorted_key[m] = distance(u, v, lattice.nearest)
+                        workspace.unsorted_key[m] = math.sqrt(u * u + v * v)
                         m += 1
     _sort(workspace, m)
-    peak = 1.0 / (math.sqrt(2.0 * math.pi) * reading.sigma * lattice.resolution)
     for k in range(m):
-        error = (reading.z - workspace.key[k]) / reading.sigma
         pairs.cell[n + k] = workspace.cell[k]
-        pairs.density[n + m + k] = peak * math.exp(-0.5 * error * error) if abs(error) <= lattice.cut else 0.0
+        error = (reading.z - workspace.key[k]) / reading.sigma
+        pairs.density[n + m + k] = density(error, reading.sigma * lattice.resolution)
     return (n - at) // WORDS_PER_RUN, m
 
 

@@ -9,14 +9,13 @@ from numpy.typing import NDArray
 
 from ..sensor.cone_table import Cones
 from ..sensor.surface_normals import SurfaceNormals
-from .fixed_point import RatioWorkspace
 from .pairs import Lattice, Pairs, Workspace
 from .tile_index import Tiles
 
 READING_STATE = np.dtype(
     [
         ('floor', np.float64),
-        ('no_echo', np.float64),
+        ('max_range', np.float64),
         ('through', np.float64),
         ('at', np.int64),
         ('changed', np.int64),
@@ -24,7 +23,7 @@ READING_STATE = np.dtype(
         ('runs', np.int32),
         ('bands', np.int32),
         ('blocking', np.int32),
-        ('weight', np.int32),
+        ('multiplicity', np.int32),
         ('occupy', np.int32),
         ('release', np.int32),
         ('likelihood', np.int32),
@@ -33,7 +32,7 @@ READING_STATE = np.dtype(
 )
 """What is kept for a reading beside its cone.
 
-floor, no_echo
+floor, max_range
     The densities p_rand / z_max, with p_lost · N(z; z_max, σ) where there is no echo, and N(z; z_max, σ) in 1/m, which
     no map changes.
 blocking, through
@@ -41,10 +40,10 @@ blocking, through
     (1 − p_rand − p_lost) (1 − p_hit)^blocking.
 stored, at, runs, bands
     Whether its pairs are stored, where in `Pairs`, and how many runs and band pairs there are.
-weight
+multiplicity
     How many equal readings this one stands for.
 occupy, release
-    Log of the likelihood ratio of occupying, or freeing, a cell of the free zone, in units of `logs.QUANTUM`.
+    Log of the likelihood ratio of occupying, or freeing, a cell of the free zone, in units of `fixed_point.QUANTUM`.
 likelihood
     log p(z | m), in the same units.
 changed
@@ -67,11 +66,11 @@ class Maps(NamedTuple):
     occupied : uint8
         The map.
     evidence : int64
-        Log-likelihood gain of flipping the cell, in units of `logs.QUANTUM`.
+        Log-likelihood gain of flipping the cell, in units of `fixed_point.QUANTUM`.
     seen : int32
         Number of readings in whose cone the cell is.
     pattern : uint8
-        Which of its neighbours are occupied (`prior`).
+        Which of its neighbours are occupied (`neighbourhood`).
     """
 
     occupied: NDArray[np.uint8]
@@ -103,7 +102,6 @@ class State(NamedTuple):
     tiles: Tiles
     maps: Maps
     workspace: Workspace
-    ratios: RatioWorkspace
     observing: NDArray[np.int32]
     clock: NDArray[np.int64]
     stop: NDArray[np.uint8]

@@ -1,4 +1,4 @@
-"""Flips of single cells: the M-step with an exact mini E-step in both directions, and what every cell would gain by it.
+"""Flips of single cells: the M-step with an exact E-step in both directions, and what every cell would gain by it.
 
 Write p(z_t | m) = c + T, where c gathers the causes that no map changes and T the obstacles and max range. For a cell
 at distance d, let A be the part of T from occupied cells before it, n the number of these,
@@ -7,13 +7,13 @@ W = (1 − p_rand − p_lost) (1 − p_hit)ⁿ and g = N(z; d, σ). Then flippin
     occupy   T' = A + W p_hit g + (T − A) (1 − p_hit)
     free     T' = A + (T − A − W p_hit g) / (1 − p_hit)
 
-and multiplies p(z_t | m) by (c + T') / (c + T) (ALGORITHM §5; eq 37-40 of the paper with its constants mended). The log
-of this ratio is the same for all free cells of the free zone (A = 0, g = 0), and for the free cells between two
-occupied ones of the band it is that of a straight line in g.
+and multiplies p(z_t | m) by (c + T') / (c + T) (ALGORITHM §5; it takes the place of eq 39 and 40 of the paper). The log
+of this ratio is the same for all free cells of the free zone (A = 0, g = 0). For the free cells between two occupied
+ones of the band it is that of a straight line in g.
 
-The sum of these logs over the readings of a cell is its evidence: what flipping it gains. It is kept for every cell at
-once. A flip recomputes the readings that see the cell and pushes the differences to their cells, so that to know what
-any other flip gains takes nothing but a look.
+The sum of these logs over the readings of a cell is its evidence: what flipping it gains. The evidence of all cells is
+kept up to date. A flip evaluates the readings that see the cell anew, and adds the differences to the evidence of their
+cells. So the gain of any flip is a table lookup.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from typing import Any
 import numpy as np
 
 from ..runtime.jit import kernel
-from ..sensor.cone import row_runs, within
+from ..sensor.cone import rows_of, runs_of
 from ..sensor.cone_table import cone_of
 from ..sensor.surface_normals import exceeds_incidence_angle
-from .fixed_point import RatioWorkspace, quantise_logs
+from .fixed_point import quantise_logs
 from .neighbourhood import note_flip
-from .pairs import WORDS_PER_RUN, Lattice, Pairs, make
+from .pairs import WORDS_PER_RUN, Lattice, Pairs, Workspace, make
 from .state import Maps, Model, State
 from .tile_index import CHUNK, SHIFT
 
@@ -40,12 +40,10 @@ LEAST_RATIO = 1e-30
 
 
 @kernel
-def evaluate(
-    model: Model, reading_state: Any, occupied: Any, pairs: Pairs, at: int, ratios: RatioWorkspace, out: Any
-) -> None:
-    """Compute the log ratios of a reading from the map into `out`, in the order of its band.
+def evaluate(model: Model, reading_state: Any, occupied: Any, pairs: Pairs, at: int, workspace: Workspace) -> None:
+    """Compute the log ratios of a reading from the map (E-step) into `workspace.new`, in the order of its band.
 
-    Those of occupying and freeing a cell of the free zone, and the log-likelihood of the reading, come after them.
+    After them come those of occupying and of freeing a cell of the free zone, and the log-likelihood of the reading.
 
     Parameters
     ----------
@@ -59,7 +57,7 @@ def evaluate(
     cell = np.uint64(at + WORDS_PER_RUN * reading_state.runs)
     density = cell + m
     p, q = model.p_hit, 1.0 - model.p_hit
-    floor, ratio = reading_state.floor, ratios.ratio
+    floor, ratio, out = reading_state.floor, workspace.ratios.ratio, workspace.new
     weight, total = reading_state.through, 0.0
     obstacles = np.uint64(0)
     for k in range(m):
@@ -69,7 +67,7 @@ def evaluate(
             obstacles += one
             total += weight * p * pairs.density[density + k]
             weight *= q
-    total += weight * reading_state.no_echo
+    total += weight * reading_state.max_range
     scale = 1.0 / (floor + total)
     before, weight = 0.0, reading_state.through
     begin = np.uint64(0)
@@ -88,11 +86,37 @@ def evaluate(
     ratio[m] = (floor + total * q) * scale
     ratio[m + one] = (floor + total / q) * scale
     ratio[m + one + one] = floor + total
-    quantise_logs(ratios, reading_state.bands + 3, out)
+    quantise_logs(workspace.ratios, reading_state.bands + 3, out)
 
 
 @kernel
-def _push_free(reading_state: Any, pairs: Pairs, at: int, maps: Maps, steps: tuple[int, int]) -> None:
+def pairs_of(s: State, t: int, new: bool) -> tuple[Pairs, int]:
+    """Return the pairs of reading t and where they begin; they are made in the workspace where they are not stored.
+
+    Those of a `new` reading are made where they will be stored. Logs are not written.
+    """
+    reading_state = s.reading_states[t]
+    pairs, at = (s.pairs, reading_state.at) if reading_state.stored else (s.workspace.pairs, 0)
+    if new or not reading_state.stored:
+        reading_state.runs, reading_state.bands = make(s.cones, s.lattice, s.normals, t, pairs, at, s.workspace)
+    return pairs, at
+
+
+@kernel
+def pairs_with_logs(s: State, t: int) -> tuple[Pairs, int]:
+    """Do as `pairs_of` does, with the logs of the map as it is."""
+    pairs, at = pairs_of(s, t, False)
+    reading_state = s.reading_states[t]
+    if not reading_state.stored:
+        evaluate(s.model, reading_state, s.maps.occupied, pairs, at, s.workspace)
+        log = at + WORDS_PER_RUN * reading_state.runs + 2 * reading_state.bands
+        for k in range(reading_state.bands):
+            pairs.log[log + k] = s.workspace.new[k]
+    return pairs, at
+
+
+@kernel
+def _add_to_free_zone(reading_state: Any, pairs: Pairs, at: int, maps: Maps, steps: tuple[int, int]) -> None:
     """Add steps[0] to the evidence of the free cells of the free zone, steps[1] to that of the occupied."""
     for k in range(np.uint64(at), np.uint64(at + WORDS_PER_RUN * reading_state.runs), np.uint64(WORDS_PER_RUN)):
         for c in range(np.uint64(pairs.cell[k]), np.uint64(pairs.cell[k + np.uint64(1)]) + np.uint64(1)):
@@ -100,71 +124,61 @@ def _push_free(reading_state: Any, pairs: Pairs, at: int, maps: Maps, steps: tup
 
 
 @kernel
-def _note(reading_state: Any, new: Any) -> None:
-    """Keep what `evaluate` left after the band."""
-    m = reading_state.bands
+def _add_difference(reading_state: Any, pairs: Pairs, at: int, maps: Maps, new: Any) -> None:
+    """Bring the evidence from the logs that were kept of a reading to those that `evaluate` left, and keep these."""
+    m, multiplicity = reading_state.bands, reading_state.multiplicity
+    cell = np.uint64(at + WORDS_PER_RUN * reading_state.runs)
+    log = cell + np.uint64(2 * m)
+    for k in range(np.uint64(m)):
+        maps.evidence[pairs.cell[cell + k]] += multiplicity * (new[k] - pairs.log[log + k])
+        pairs.log[log + k] = new[k]
+    steps = new[m] - reading_state.occupy, new[m + 1] - reading_state.release
+    _add_to_free_zone(reading_state, pairs, at, maps, (multiplicity * steps[0], multiplicity * steps[1]))
     reading_state.occupy, reading_state.release, reading_state.likelihood = new[m], new[m + 1], new[m + 2]
 
 
 @kernel
-def _evaluate_and_add(
-    model: Model, reading_state: Any, maps: Maps, pairs: Pairs, at: int, room: tuple[RatioWorkspace, Any]
-) -> None:
-    """Explain a reading, and add all that it says to the evidence."""
-    ratios, new = room
-    blocking = 0
-    for k in range(np.uint64(at), np.uint64(at + WORDS_PER_RUN * reading_state.runs), np.uint64(WORDS_PER_RUN)):
-        for c in range(np.uint64(pairs.cell[k]), np.uint64(pairs.cell[k + np.uint64(1)]) + np.uint64(1)):
-            blocking += maps.occupied[c]
-    reading_state.blocking = blocking
-    reading_state.through = model.mixture_weight * (1.0 - model.p_hit) ** blocking
-    evaluate(model, reading_state, maps.occupied, pairs, at, ratios, new)
-    _note(reading_state, new)
-    weight = reading_state.weight
-    _push_free(reading_state, pairs, at, maps, (weight * reading_state.occupy, weight * reading_state.release))
-    cell = np.uint64(at + WORDS_PER_RUN * reading_state.runs)
-    log = cell + np.uint64(2 * reading_state.bands)
-    for k in range(np.uint64(reading_state.bands)):
-        maps.evidence[pairs.cell[cell + k]] += weight * new[k]
-        pairs.log[log + k] = new[k]
-
-
-@kernel
 def evaluate_all(s: State, begin: int, end: int, new: bool) -> None:
-    """Explain the readings `begin` to `end` by the map, and add all that they say to the evidence.
+    """Evaluate the readings `begin` to `end` on the map, and add all that they say to the evidence.
 
-    The pairs of new ones are made first.
+    The pairs of `new` ones are made first.
     """
-    room = (s.ratios, s.workspace.new)
+    maps = s.maps
     for t in range(begin, end):
         if s.stop[0]:
             break
+        pairs, at = pairs_of(s, t, new)
         reading_state = s.reading_states[t]
-        pairs, at = (s.pairs, reading_state.at) if reading_state.stored else (s.workspace.pairs, 0)
-        if new or not reading_state.stored:
-            reading_state.runs, reading_state.bands = make(s.cones, s.lattice, s.normals, t, pairs, at, s.workspace)
-        _evaluate_and_add(s.model, reading_state, s.maps, pairs, at, room)
+        log = at + WORDS_PER_RUN * reading_state.runs + 2 * reading_state.bands
+        pairs.log[log : log + reading_state.bands] = 0
+        reading_state.occupy, reading_state.release = 0, 0
+        blocking = 0
+        for k in range(np.uint64(at), np.uint64(at + WORDS_PER_RUN * reading_state.runs), np.uint64(WORDS_PER_RUN)):
+            for c in range(np.uint64(pairs.cell[k]), np.uint64(pairs.cell[k + np.uint64(1)]) + np.uint64(1)):
+                blocking += maps.occupied[c]
+        reading_state.blocking = blocking
+        reading_state.through = s.model.mixture_weight * (1.0 - s.model.p_hit) ** blocking
+        evaluate(s.model, reading_state, maps.occupied, pairs, at, s.workspace)
+        _add_difference(reading_state, pairs, at, maps, s.workspace.new)
         reading_state.changed = s.clock[0]
 
 
 @kernel
 def add_multiplicity(s: State, readings: Any) -> None:
     """Let each of `readings` stand for one more that says the same."""
-    maps, workspace = s.maps, s.workspace
+    maps = s.maps
     for t in readings:
+        pairs, at = pairs_with_logs(s, t)
         reading_state = s.reading_states[t]
-        reading_state.weight += 1
+        reading_state.multiplicity += 1
         reading_state.changed = s.clock[0]
-        pairs, at = (s.pairs, reading_state.at) if reading_state.stored else (workspace.pairs, 0)
-        if not reading_state.stored:
-            make(s.cones, s.lattice, s.normals, t, workspace.pairs, 0, workspace)
-        evaluate(s.model, reading_state, maps.occupied, pairs, at, s.ratios, workspace.new)
-        _push_free(reading_state, pairs, at, maps, (reading_state.occupy, reading_state.release))
-        cell = np.uint64(at + WORDS_PER_RUN * reading_state.runs)
-        for k in range(np.uint64(reading_state.bands)):
-            maps.evidence[pairs.cell[cell + k]] += workspace.new[k]
-            maps.seen[pairs.cell[cell + k]] += 1
-        for k in range(at, at + WORDS_PER_RUN * reading_state.runs, WORDS_PER_RUN):
+        _add_to_free_zone(reading_state, pairs, at, maps, (reading_state.occupy, reading_state.release))
+        begin = at + WORDS_PER_RUN * reading_state.runs
+        log = begin + 2 * reading_state.bands
+        for k in range(reading_state.bands):
+            maps.evidence[pairs.cell[begin + k]] += pairs.log[log + k]
+            maps.seen[pairs.cell[begin + k]] += 1
+        for k in range(at, begin, WORDS_PER_RUN):
             for c in range(np.uint64(pairs.cell[k]), np.uint64(pairs.cell[k + 1]) + np.uint64(1)):
                 maps.seen[c] += 1
 
@@ -179,7 +193,7 @@ def _zone(reading: Any, lattice: Lattice, row: int, column: int) -> int:
     if (outside > EDGE and across > 0.7072) or along > reading.reach + 1.5:
         return 0
     away = du * du + dv * dv
-    if not lattice.nearest and outside < -EDGE:
+    if outside < -EDGE:
         if away > (reading.reach + EDGE) ** 2:
             return 0
         if reading.free > EDGE and away < (reading.free - EDGE) ** 2:
@@ -187,12 +201,12 @@ def _zone(reading: Any, lattice: Lattice, row: int, column: int) -> int:
         if away < (reading.reach - EDGE) ** 2 and (reading.free < 0.0 or away > (reading.free + EDGE) ** 2):
             return 1
     # a cell at an edge, or one that only the axis crosses
-    cone = cone_of(reading, lattice.nearest)
-    a, b, c, d = row_runs(cone, row, reading.reach, lattice.width, lattice.nearest)
-    if not cone.bottom <= row <= cone.top or not (a <= column <= b or c <= column <= d):
+    cone = cone_of(reading)
+    runs = runs_of(cone, row, lattice.width)
+    bottom, top = rows_of(cone, lattice.height)
+    if not bottom <= row < top or not (runs.first <= column <= runs.last or runs.first2 <= column <= runs.last2):
         return 0
-    first, last = within(cone.x, dv, reading.free, lattice.nearest)
-    return 2 if first <= column <= last else 1
+    return 2 if runs.inner <= column <= runs.outer else 1
 
 
 @kernel
@@ -221,61 +235,31 @@ def find_observing(s: State, c: int) -> int:
 
 
 @kernel
-def _reevaluate(
-    model: Model, reading_state: Any, maps: Maps, pairs: Pairs, at: int, room: tuple[RatioWorkspace, Any]
-) -> None:
-    """Explain a reading anew, and push what changed to the evidence."""
-    ratios, new = room
-    evaluate(model, reading_state, maps.occupied, pairs, at, ratios, new)
-    m, weight = reading_state.bands, reading_state.weight
-    cell = np.uint64(at + WORDS_PER_RUN * reading_state.runs)
-    log = cell + np.uint64(2 * m)
-    for k in range(np.uint64(m)):
-        maps.evidence[pairs.cell[cell + k]] += weight * (new[k] - pairs.log[log + k])
-        pairs.log[log + k] = new[k]
-    _push_free(
-        reading_state,
-        pairs,
-        at,
-        maps,
-        (weight * (new[m] - reading_state.occupy), weight * (new[m + 1] - reading_state.release)),
-    )
-    _note(reading_state, new)
-
-
-@kernel
 def flip(s: State, c: int) -> None:
     """Flip cell c and bring the evidence of all cells up to date."""
     n = find_observing(s, c)
-    maps, workspace = s.maps, s.workspace
+    maps = s.maps
     own = 0
     for i in range(n):
         if s.observing[i, 1]:
             reading_state = s.reading_states[s.observing[i, 0]]
-            own += reading_state.weight * (reading_state.release - reading_state.occupy)
+            own += reading_state.multiplicity * (reading_state.release - reading_state.occupy)
     # where the cell is in the free zone, its own ratio is that of an occupied cell from now on, or of a free one
     maps.evidence[c] += -own if maps.occupied[c] else own
     maps.occupied[c] ^= 1
     note_flip(maps.pattern, c, s.lattice.height, s.lattice.width)
     step = 1 if maps.occupied[c] else -1
     s.clock[0] += 1
-    room = (s.ratios, workspace.new)
     for i in range(n):
         t = s.observing[i, 0]
+        # logs that are not stored are those of the map before the flip
+        maps.occupied[c] ^= 1
+        pairs, at = pairs_with_logs(s, t)
+        maps.occupied[c] ^= 1
         reading_state = s.reading_states[t]
-        if not reading_state.stored:
-            make(s.cones, s.lattice, s.normals, t, workspace.pairs, 0, workspace)
-            maps.occupied[c] ^= 1
-            evaluate(s.model, reading_state, maps.occupied, workspace.pairs, 0, s.ratios, workspace.new)
-            maps.occupied[c] ^= 1
-            log = WORDS_PER_RUN * reading_state.runs + 2 * reading_state.bands
-            for k in range(reading_state.bands):
-                workspace.pairs.log[log + k] = workspace.new[k]
         if s.observing[i, 1]:
             reading_state.blocking += step
             reading_state.through = s.model.mixture_weight * (1.0 - s.model.p_hit) ** reading_state.blocking
-        if reading_state.stored:
-            _reevaluate(s.model, reading_state, maps, s.pairs, reading_state.at, room)
-        else:
-            _reevaluate(s.model, reading_state, maps, workspace.pairs, 0, room)
+        evaluate(s.model, reading_state, maps.occupied, pairs, at, s.workspace)
+        _add_difference(reading_state, pairs, at, maps, s.workspace.new)
         reading_state.changed = s.clock[0]

@@ -6,7 +6,6 @@ counted cell by cell: a person who stood about shows as a patch of counts, a str
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import numpy as np
@@ -16,26 +15,22 @@ from ..common.grid import Grid
 from ..common.parameters import ModelParameters
 from ..common.readings import Readings
 from ..runtime.jit import kernel
-from ..sensor.cone import row_runs
-from ..sensor.cone_table import Cones, cone_of, cone_table
+from ..sensor.cone_table import Cones, cone_table, walk_resized
 
 
 @kernel
-def _count(cones: Cones, unexplained: Any, nearest: bool, out: Any) -> None:
+def _count(cones: Cones, unexplained: Any, out: Any) -> None:
     """Add 1 to the cells that are at most σ from the range of each unexplained echo."""
-    height, width = out.shape
+    flat = out.ravel()
+    cells, distances = np.empty(1024, np.int32), np.empty(1024, np.float64)
     for t in range(len(cones)):
         reading = cones[t]
         if not unexplained[t] or reading.z >= reading.z_max:
             continue
-        cone = cone_of(reading, nearest)
-        for row in range(max(cone.bottom, 0), min(cone.top, height - 1) + 1):
-            v = row + 0.5 - cone.y
-            a, b, c, d = row_runs(cone, row, reading.reach, width, nearest)
-            for first, last in ((a, b), (c, d)):
-                for column in range(first, last + 1):
-                    if abs(math.hypot(column + 0.5 - cone.x, v) - reading.z) <= reading.sigma:
-                        out[row, column] += 1.0
+        n, cells, distances = walk_resized(cones, t, out.shape, cells, distances)
+        for k in range(n):
+            if abs(distances[k] - reading.z) <= reading.sigma:
+                flat[cells[k]] += 1.0
 
 
 def dynamic_echoes(
@@ -54,6 +49,6 @@ def dynamic_echoes(
     model : ModelParameters
     """
     out = np.zeros(grid.shape, np.float32)
-    _count(cone_table(readings, grid, model), unexplained, model.cell_distance == 'nearest', out)
+    _count(cone_table(readings, grid, model), unexplained, out)
     out[ml != 0] = 0.0
     return out

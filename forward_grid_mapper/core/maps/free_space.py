@@ -12,53 +12,50 @@ from ..common.readings import Floats
 from ..evidence.evidence import Evidence
 from ..evidence.state import State
 from ..runtime.jit import kernel
-from ..sensor.cone import row_runs, strength, within
+from ..sensor.cone import rows_of, runs_of, strength
 from ..sensor.cone_table import cone_of
-
-MOST_OBSTACLES = 4096
-"""Occupied cells in one band that are told apart."""
-
+from ..sensor.density import density
 
 UNIT = 2.0**-20
-"""Unit of the sums of passed readings, which as whole numbers do not depend on their order."""
+"""Readings in a unit of the sums of passed readings; sums of whole numbers do not depend on their order."""
 
 
 @kernel
 def _obstacles(s: State, t: int, occupied: Any, squares: Any, left: Any) -> tuple[int, int, float]:
-    """List the occupied cells in the band of a cone, all of it, near to far.
+    """List the occupied cells in the band of a cone, also those at which the reading exceeds the incidence angle.
 
-    Writes the squares of their distances, and into `left` (longer by one) what of T is left in front of each and
-    behind the last. Returns how many there are, how many are in the free zone, and the least square of these.
+    Writes the squares of their distances, near to far, and into `left` (longer by one) what of T is left in front of
+    each and behind the last. Returns how many there are, how many are in the free zone, and the least square of these.
     """
     reading, reading_state = s.cones[t], s.reading_states[t]
-    cone = cone_of(reading, s.lattice.nearest)
+    cone = cone_of(reading)
     n, blocking, near = 0, 0, np.inf
-    for row in range(max(cone.bottom, 0), min(cone.top, s.lattice.height - 1) + 1):
-        a, b, c, d = row_runs(cone, row, reading.reach, s.lattice.width, s.lattice.nearest)
+    for row in range(*rows_of(cone, s.lattice.height)):
+        runs = runs_of(cone, row, s.lattice.width)
         v = row + 0.5 - cone.y
-        first, last = within(cone.x, v, reading.free, s.lattice.nearest)
-        for begin, end in ((a, b), (c, d)):
-            for column in range(begin, end + 1):
-                if occupied[row * s.lattice.width + column]:
-                    u = column + 0.5 - cone.x
-                    if first <= column <= last:
-                        blocking += 1
-                        near = min(near, u * u + v * v)
-                    elif n < len(squares):
-                        k = n
-                        while k > 0 and squares[k - 1] > u * u + v * v:
-                            squares[k] = squares[k - 1]
-                            k -= 1
-                        squares[k] = u * u + v * v
-                        n += 1
+        for first, last in ((runs.first, runs.last), (runs.first2, runs.last2)):
+            for column in range(first, last + 1):
+                if not occupied[row * s.lattice.width + column]:
+                    continue
+                u = column + 0.5 - cone.x
+                square = u * u + v * v
+                if runs.inner <= column <= runs.outer:
+                    blocking += 1
+                    near = min(near, square)
+                    continue
+                k = n
+                while k > 0 and squares[k - 1] > square:
+                    squares[k] = squares[k - 1]
+                    k -= 1
+                squares[k] = square
+                n += 1
     p = s.model.p_hit
     weight = s.model.mixture_weight * (1.0 - p) ** blocking
-    peak = 1.0 / (math.sqrt(2.0 * math.pi) * reading.sigma * s.lattice.resolution)
     for k in range(n):
         error = (reading.z - math.sqrt(squares[k])) / reading.sigma
-        left[k] = weight * p * peak * math.exp(-0.5 * error * error) if abs(error) <= s.lattice.cut else 0.0
+        left[k] = weight * p * density(error, reading.sigma * s.lattice.resolution)
         weight *= 1.0 - p
-    left[n] = weight * reading_state.no_echo
+    left[n] = weight * reading_state.max_range
     for k in range(n - 1, -1, -1):
         left[k] += left[k + 1]
     return n, blocking, near
@@ -68,32 +65,32 @@ def _obstacles(s: State, t: int, occupied: Any, squares: Any, left: Any) -> tupl
 def add_passes(s: State, begin: int, end: int, random: Floats, lost: Floats, occupied: Any, passed: Any) -> None:
     """Add to `passed` (int64, in units of UNIT) how likely the readings `begin` to `end` passed each of their cells.
 
-    This looks at whole cones, what they graze included. `random` and `lost` are the densities p_rand / z_max and
-    p_lost · N(z; z_max, σ) of all readings in 1/m.
+    All cells of a cone count, also those at which the reading exceeds the incidence angle. `random` and `lost` are the
+    densities p_rand / z_max and p_lost · N(z; z_max, σ) of all readings in 1/m.
     """
-    squares, left = np.empty(MOST_OBSTACLES), np.empty(MOST_OBSTACLES + 1)
+    # no band has more cells than the largest cone
+    squares, left = s.workspace.key, np.empty(len(s.workspace.key) + 1)
     for t in range(begin, end):
         if s.stop[0]:
             break
         reading, reading_state = s.cones[t], s.reading_states[t]
         n, blocking, near = _obstacles(s, t, occupied, squares, left)
-        scale = reading_state.weight / ((random[t] + lost[t] + left[0]) * UNIT)
-        chance = random[t] * scale if reading.z < reading.z_max else 0.0
-        in_front = left[0] * scale + chance
-        hidden = left[0] * scale + chance * (1.0 - s.model.p_hit) ** blocking
-        cone = cone_of(reading, s.lattice.nearest)
+        scale = reading_state.multiplicity / ((random[t] + lost[t] + left[0]) * UNIT)
+        stray = random[t] * scale if reading.z < reading.z_max else 0.0
+        in_front = left[0] * scale + stray
+        hidden = left[0] * scale + stray * (1.0 - s.model.p_hit) ** blocking
+        cone = cone_of(reading)
         axis_x, axis_y, sine2 = reading.axis_x, reading.axis_y, reading.sine**2
-        for row in range(max(cone.bottom, 0), min(cone.top, s.lattice.height - 1) + 1):
-            a, b, c, d = row_runs(cone, row, reading.reach, s.lattice.width, s.lattice.nearest)
+        for row in range(*rows_of(cone, s.lattice.height)):
+            runs = runs_of(cone, row, s.lattice.width)
             v = row + 0.5 - cone.y
-            first, last = within(cone.x, v, reading.free, s.lattice.nearest)
             line = passed[row * s.lattice.width : (row + 1) * s.lattice.width]
-            for start, stop in ((a, b), (c, d)):
-                for column in range(start, stop + 1):
+            for first, last in ((runs.first, runs.last), (runs.first2, runs.last2)):
+                for column in range(first, last + 1):
                     u = column + 0.5 - cone.x
                     square = u * u + v * v
                     weight = strength(axis_x, axis_y, sine2, u, v)
-                    if first <= column <= last:
+                    if runs.inner <= column <= runs.outer:
                         line[column] += int(weight * (hidden if blocking and square > near else in_front))
                     else:
                         k = 0
@@ -107,7 +104,7 @@ def expected_passes(evidence: Evidence, occupied: NDArray[np.uint8]) -> Floats:
     model = evidence.model
     random = model.p_rand / evidence.z_max
     # of an echo from almost as far as z_max too, so that it frees little more than a reading without any
-    lost = model.p_lost * evidence.state.reading_states['no_echo'][: len(evidence)]
+    lost = model.p_lost * evidence.state.reading_states['max_range'][: len(evidence)]
     sums: list[NDArray[np.int64]] = []
 
     def work(s: State, begin: int, end: int) -> None:

@@ -23,7 +23,7 @@ from ..common.grid import Grid
 from ..common.parameters import Parameters
 from ..common.readings import Readings
 from ..runtime.jit import kernel
-from ..sensor.cone import row_runs, strength, within
+from ..sensor.cone import rows_of, runs_of, strength
 from ..sensor.cone_table import Cones, Floats, cone_of, cone_table, grid_of
 
 QUANTUM = 2.0**-20
@@ -59,25 +59,24 @@ def _add_run(
 
 
 @kernel
-def _add(cones: Cones, gains: Any, log_odds: Any, nearest: bool) -> None:
-    """Add every reading's increments; `gains` are those of occupied, free, and free without echo."""
+def _add(cones: Cones, gains: Any, log_odds: Any) -> None:
+    """Add every reading's increments; `gains` are those of occupied, free, and free for a max-range reading."""
     height, width = log_odds.shape
     for t in range(len(cones)):
         reading = cones[t]
-        cone = cone_of(reading, nearest)
+        cone = cone_of(reading)
         echo = reading.z < reading.z_max
         free = gains[1] if echo else gains[2]
         beam = (reading.axis_x, reading.axis_y, reading.sine**2)
-        for y in range(max(cone.bottom, 0), min(cone.top, height - 1) + 1):
-            v = y + 0.5 - reading.y
-            a, b, c, d = row_runs(cone, y, reading.reach, width, nearest)
-            inner, outer = within(reading.x, v, reading.free, nearest)
+        for y in range(*rows_of(cone, height)):
+            runs = runs_of(cone, y, width)
+            row, offset = log_odds[y], (0.5 - reading.x, y + 0.5 - reading.y)
+            inner, outer = runs.inner, runs.outer
             if outer < inner:
                 inner, outer = width, width - 1
-            for first, last in ((a, b), (c, d)):
+            for first, last in ((runs.first, runs.last), (runs.first2, runs.last2)):
                 if first > last:
                     continue
-                row, offset = log_odds[y], (0.5 - reading.x, v)
                 _add_run(row, max(first, inner), min(last, outer), offset, beam, free)
                 if echo:
                     _add_run(row, first, min(last, inner - 1), offset, beam, gains[0])
@@ -136,7 +135,7 @@ class LogOddsMap:
         gains = tuple(
             math.log(q / (1 - q)) for q in (p.live.live_p_occupied, p.live.live_p_free, p.live.live_p_free_no_echo)
         )
-        _add(table, gains, self._log_odds, p.model.cell_distance == 'nearest')
+        _add(table, gains, self._log_odds)
 
     def log_odds(self, grid: Grid | None = None) -> Floats:
         """Return a copy of the log-odds on `grid` (by default the map's own); NaN is not observed.

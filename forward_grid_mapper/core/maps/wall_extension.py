@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
+from ..evidence.fixed_point import QUANTUM
+from ..evidence.neighbourhood import NEIGHBOURS, neighbour, opposite
 from ..evidence.state import State
 from ..runtime.jit import kernel
-from ..evidence.fixed_point import QUANTUM
 
 STRAIGHT_RUN = 4
 """Cells in a row that make a straight wall."""
@@ -18,16 +19,10 @@ MOST_AGAINST = 0.05
 
 @kernel
 def _ahead(c: int, k: int, height: int, width: int, n: int) -> int:
-    """Return the cell that is n steps from c in direction k (in eighths of a turn), or -1 off the grid."""
-    o = c
+    """Return the cell that is n steps from c in the direction of neighbour k; -1 if it is off the grid."""
     for _ in range(n):
-        x, y = o % width, o // width
-        dx = 1 if k in (0, 1, 7) else (-1 if k in (3, 4, 5) else 0)
-        dy = 1 if k in (1, 2, 3) else (-1 if k in (5, 6, 7) else 0)
-        if not (0 <= x + dx < width and 0 <= y + dy < height):
-            return -1
-        o = (y + dy) * width + x + dx
-    return o
+        c = neighbour(c, k, height, width) if c >= 0 else -1
+    return c
 
 
 @kernel
@@ -38,10 +33,10 @@ def extend(s: State, steps: int, barred: Any, out: Any) -> None:
     for c in range(len(occupied)):
         if not occupied[c]:
             continue
-        for k in range(8):
+        for k in range(NEIGHBOURS):
             straight = True
             for n in range(1, STRAIGHT_RUN):
-                o = _ahead(c, (k + 4) & 7, height, width, n)
+                o = _ahead(c, opposite(k), height, width, n)
                 straight = straight and o >= 0 and occupied[o] == 1
             # a true end has no neighbour ahead, nor abreast of what is ahead
             for turn in (k, (k + 1) & 7, (k + 7) & 7):

@@ -15,6 +15,7 @@ from collections.abc import Callable
 
 from ..common.parameters import Parameters
 from ..common.readings import Readings
+from ..sensor.density import CUT
 from .message_types import NANOSECONDS, OdometryMessage, Pose2, RangeMessage
 from .reading_buffer import ReadingBuffer
 from .rep117 import LONGEST_NAME, _Measurement, measure
@@ -402,7 +403,7 @@ class PoseAssociator:
         """Return how far from the sensor the maps take note of a reading, and two cells more, in metres."""
         p = self._all
         cell = p.grid.resolution
-        explained = measured.z + p.model.cut * max(measured.sigma or p.model.sigma, cell / 2)
+        explained = measured.z + CUT * max(measured.sigma or p.model.sigma, cell / 2)
         return max(min(explained, measured.z_max), measured.z + max(p.live.live_depth, cell / 2)) + 2 * cell
 
     def _misfit(self, sensor: Pose2, measured: _Measurement) -> str:

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from ..common.readings import Floats
 from ..evidence.fixed_point import QUANTUM
+from ..evidence.neighbourhood import NEIGHBOURS, neighbour
 from ..evidence.state import State
 from ..evidence.updates import flip
 from ..runtime.jit import kernel
@@ -31,7 +32,8 @@ Least = tuple[float, float]
 
 
 @kernel
-def _least(s: State, least: Least, c: int) -> float:
+def least_gain(s: State, least: Least, c: int) -> float:
+    """Return what flipping cell c must gain, nats."""
     return float(least[0] + least[1] * s.maps.seen[c])
 
 
@@ -61,24 +63,22 @@ def promising(s: State, prior: Prior, least: Least, window: tuple[int, int, int,
 
 
 @kernel
-def highest(s: State, cells: NDArray[np.int64], gains: Floats, room: Floats) -> NDArray[np.bool_]:
+def highest(s: State, cells: NDArray[np.int64], gains: Floats, workspace: Floats) -> NDArray[np.bool_]:
     """Tell which of `cells` gain more than those of their eight neighbours that gain as well; of equals, the first.
 
-    `room` (float64, shape (cells of the map,)) must be 0, and is left so.
+    `workspace` (float64, shape (cells of the map,)) must be 0, and is left so.
     """
     height, width = s.lattice.height, s.lattice.width
     for i in range(len(cells)):
-        room[cells[i]] = gains[i]
+        workspace[cells[i]] = gains[i]
     chosen = np.ones(len(cells), np.bool_)
     for i in range(len(cells)):
-        row, column = cells[i] // width, cells[i] % width
-        for y in range(max(row - 1, 0), min(row + 2, height)):
-            for x in range(max(column - 1, 0), min(column + 2, width)):
-                o = y * width + x
-                if room[o] > gains[i] or (room[o] == gains[i] and o < cells[i]):
-                    chosen[i] = False
+        for k in range(NEIGHBOURS):
+            o = neighbour(cells[i], k, height, width)
+            if o >= 0 and (workspace[o] > gains[i] or (workspace[o] == gains[i] and o < cells[i])):
+                chosen[i] = False
     for i in range(len(cells)):
-        room[cells[i]] = 0.0
+        workspace[cells[i]] = 0.0
     return chosen
 
 
@@ -94,7 +94,7 @@ def flip_in_order(s: State, prior: Prior, least: Least, cells: NDArray[np.int64]
         if s.stop[0]:
             break
         gain = gain_of(s, prior, cells[i])
-        if gain > max(_least(s, least, cells[i]), WORTH_WAITING * gains[i]):
+        if gain > max(least_gain(s, least, cells[i]), WORTH_WAITING * gains[i]):
             flip(s, cells[i])
             flips += 1
             total += gain

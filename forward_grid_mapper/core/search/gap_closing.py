@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..evidence.fixed_point import QUANTUM
+from ..evidence.neighbourhood import DX, DY, NEIGHBOURS
 from ..evidence.state import State
 from ..evidence.updates import flip
 from ..runtime.jit import kernel
@@ -42,10 +43,11 @@ AWAY = -0.35
 def _leaves(pattern: int, dx: int, dy: int) -> bool:
     """Tell whether direction (dx, dy) leads away from the neighbours of a pattern."""
     x, y = 0.0, 0.0
-    for k in range(8):
+    for k in range(NEIGHBOURS):
         if pattern >> k & 1:
-            x += math.cos(k * math.pi / 4)
-            y += math.sin(k * math.pi / 4)
+            away = math.hypot(DX[k], DY[k])
+            x += DX[k] / away
+            y += DY[k] / away
     length = math.hypot(x, y)
     return bool(length < 0.1 or (x * dx + y * dy) <= AWAY * length * math.hypot(dx, dy))
 

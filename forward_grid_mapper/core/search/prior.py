@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..common.parameters import SearchParameters
-from ..evidence.neighbourhood import neighbour, patterns
+from ..evidence.neighbourhood import NEIGHBOURS, offset, opposite, patterns
 from ..runtime.jit import kernel
 from ..sensor.cone_table import Floats
 
@@ -69,10 +69,10 @@ def prior_gain(prior: Prior, occupied: NDArray[np.uint8], pattern: NDArray[np.ui
     own = pattern[c]
     gain = prior.local[c] + prior.shape[own]
     if own:
-        for k in range(8):
+        for k in range(NEIGHBOURS):
             if own >> k & 1:
-                o = neighbour(c, k, width)
-                bit = 1 << ((k + 4) & 7)
+                o = c + offset(k, width)
+                bit = 1 << opposite(k)
                 gain += prior.shape[pattern[o] | bit] - prior.shape[pattern[o] & ~bit & 255]
     return float(-gain if occupied[c] else gain)
 

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from ..common.parameters import SearchParameters
 from ..evidence.evidence import Evidence
+from ..evidence.neighbourhood import NEIGHBOURS
 from ..evidence.state import State
 from ..runtime.cancelling import check
 from ..sensor.cone_table import Floats
@@ -168,11 +169,7 @@ class Search:
         """Flip, shift and bridge until nothing gains; return whether that was reached."""
         p = self._parameters
         while self._more():
-            if (
-                self._sweep(watch)
-                or (p.shift_moves and self._shift(watch))
-                or (p.bridges > 1 and self._close_gaps(watch))
-            ):
+            if self._sweep(watch) or self._shift(watch) or (p.bridges > 1 and self._close_gaps(watch)):
                 continue
             if not self._free(watch):
                 return True
@@ -237,7 +234,7 @@ class Search:
         joints = []
 
         def work(s: State, begin: int, end: int) -> None:
-            place, joint = np.full(len(slot), -1, np.int32), np.zeros((len(cells), 9), np.int64)
+            place, joint = np.full(len(slot), -1, np.int32), np.zeros((len(cells), NEIGHBOURS), np.int64)
             joints.append(joint)
             try_shifts(s, readings[begin:end], slot, place, joint)
 

@@ -1,14 +1,14 @@
-"""The search's moves: single flips, many flips together, and shifts of occupied cells to a neighbour.
+"""Shifts: an occupied cell moves to a neighbour in one step, a block move of two cells.
 
 A shift frees cell c and occupies its neighbour o. What it gains follows from the single flips, since T is linear in
-each cell's reading_state. For a reading that sees both, with likelihood ratios r_c and r_o of the single flips and
+each cell's term. For a reading that sees both, with likelihood ratios r_c and r_o of the single flips and
 q = 1 − p_hit, both together have the ratio
 
     o behind c              r_c + (r_o − 1) / q
     o in front of c         r_o + q (r_c − 1)
     both in the free zone   1
 
-so that all shifts are tried in one pass over the readings, and none is made but those that gain.
+So one pass over the readings tries all shifts, and only those that gain are made.
 """
 
 from __future__ import annotations
@@ -20,29 +20,26 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..evidence.fixed_point import QUANTUM
-from ..evidence.neighbourhood import note_flip
-from ..evidence.pairs import WORDS_PER_RUN, Pairs, make
+from ..evidence.neighbourhood import NEIGHBOURS, neighbour, note_flip
+from ..evidence.pairs import WORDS_PER_RUN, Pairs
 from ..evidence.state import State
-from ..evidence.updates import evaluate, find_observing, flip
+from ..evidence.updates import find_observing, flip, pairs_of, pairs_with_logs
 from ..runtime.jit import kernel
 from ..sensor.cone_table import Floats
-from .flips import Least, _least, gain_of
+from .flips import Least, gain_of, least_gain
 from .prior import Prior
 
 LEAST_JOINT = 1e-9
-"""RatioWorkspace of shifts are differences, and rounding may leave nothing of the smallest."""
+"""Ratios of shifts are differences, and rounding may leave nothing of the smallest."""
 
 
 @kernel
 def unsettle(s: State, since: int, settled: Any) -> None:
     """Mark the cells of all readings that changed after the clock was `since` as not settled."""
-    workspace = s.workspace
     for t in range(len(s.reading_states)):
         reading_state = s.reading_states[t]
         if reading_state.changed > since:
-            pairs, at = (s.pairs, reading_state.at) if reading_state.stored else (workspace.pairs, 0)
-            if not reading_state.stored:
-                make(s.cones, s.lattice, s.normals, t, workspace.pairs, 0, workspace)
+            pairs, at = pairs_of(s, t, False)
             begin = at + WORDS_PER_RUN * reading_state.runs
             for k in range(at, begin, WORDS_PER_RUN):
                 settled[pairs.cell[k] : pairs.cell[k + 1] + 1] = 0
@@ -70,7 +67,7 @@ def _in_runs(pairs: Pairs, at: int, runs: int, c: int) -> bool:
 def _add_joint(
     s: State, reading_state: Any, pairs: Pairs, at: int, cell: tuple[int, int], place: Any, joint: Any
 ) -> None:
-    """Add to `joint` (9,) what a reading says of shifting a cell to each of its neighbours, beyond the two flips.
+    """Add to `joint` (8,) what a reading says of shifting a cell to each of its neighbours, beyond the two flips.
 
     Parameters
     ----------
@@ -85,31 +82,27 @@ def _add_joint(
     logs = at + WORDS_PER_RUN * reading_state.runs + 2 * reading_state.bands
     own = pairs.log[logs + here] if here >= 0 else reading_state.release
     ratio = math.exp(own * QUANTUM)
-    row, column = c // width, c % width
-    for dy in range(-1, 2):
-        for dx in range(-1, 2):
-            if not (0 <= row + dy < height and 0 <= column + dx < width) or (dx == 0 and dy == 0):
-                continue
-            o = c + dy * width + dx
-            if s.maps.occupied[o]:
-                continue
-            there = place[o]
-            if there >= 0:
-                log = pairs.log[logs + there]
-                other = math.exp(log * QUANTUM)
-                together = ratio + (other - 1.0) / q if there > here else other + q * (ratio - 1.0)
-            elif _in_runs(pairs, at, reading_state.runs, o):
-                log = reading_state.occupy
-                together = math.exp(log * QUANTUM) + q * (ratio - 1.0) if here >= 0 else 1.0
-            else:
-                continue
-            gain = math.log(max(together, LEAST_JOINT)) / QUANTUM - own - log
-            joint[3 * dy + dx + 4] += reading_state.weight * int(math.floor(gain + 0.5))
+    for k in range(NEIGHBOURS):
+        o = neighbour(c, k, height, width)
+        if o < 0 or s.maps.occupied[o]:
+            continue
+        there = place[o]
+        if there >= 0:
+            log = pairs.log[logs + there]
+            other = math.exp(log * QUANTUM)
+            together = ratio + (other - 1.0) / q if there > here else other + q * (ratio - 1.0)
+        elif _in_runs(pairs, at, reading_state.runs, o):
+            log = reading_state.occupy
+            together = math.exp(log * QUANTUM) + q * (ratio - 1.0) if here >= 0 else 1.0
+        else:
+            continue
+        gain = math.log(max(together, LEAST_JOINT)) / QUANTUM - own - log
+        joint[k] += reading_state.multiplicity * int(math.floor(gain + 0.5))
 
 
 @kernel
 def try_shifts(s: State, readings: Any, slot: Any, place: Any, joint: Any) -> None:
-    """Compute what some readings say of shifts, beyond the two flips, in units of `logs.QUANTUM`.
+    """Compute what some readings say of shifts, beyond the two flips, in units of `fixed_point.QUANTUM`.
 
     Parameters
     ----------
@@ -118,8 +111,8 @@ def try_shifts(s: State, readings: Any, slot: Any, place: Any, joint: Any) -> No
     slot : int32, shape (cells,)
         Row of `joint` of each cell that is to be tried, -1 elsewhere.
     place : int32, shape (cells,)
-        Room to work in; all -1, and left so.
-    joint : int64, shape (rows, 9)
+        To work in; all -1, and left so.
+    joint : int64, shape (rows, 8)
         By neighbour, row by row; added to. What it says of occupied neighbours means nothing.
     """
     workspace = s.workspace
@@ -127,13 +120,7 @@ def try_shifts(s: State, readings: Any, slot: Any, place: Any, joint: Any) -> No
         if s.stop[0]:
             break
         reading_state = s.reading_states[t]
-        pairs, at = (s.pairs, reading_state.at) if reading_state.stored else (workspace.pairs, 0)
-        if not reading_state.stored:
-            make(s.cones, s.lattice, s.normals, t, workspace.pairs, 0, workspace)
-            evaluate(s.model, reading_state, s.maps.occupied, workspace.pairs, 0, s.ratios, workspace.new)
-            log = WORDS_PER_RUN * reading_state.runs + 2 * reading_state.bands
-            for k in range(reading_state.bands):
-                workspace.pairs.log[log + k] = workspace.new[k]
+        pairs, at = pairs_with_logs(s, t)
         cells = at + WORDS_PER_RUN * reading_state.runs
         n = 0
         for k in range(reading_state.bands):
@@ -166,18 +153,16 @@ def best_shifts(
     targets, gains = np.full(len(cells), -1, np.int64), np.zeros(len(cells))
     for i in range(len(cells)):
         c = cells[i]
-        row, column = c // width, c % width
         loss = gain_of(s, prior, c)
         # the prior of the neighbours depends on this cell
         s.maps.occupied[c] ^= 1
         note_flip(s.maps.pattern, c, height, width)
-        for k in range(9):
-            y, x = row + k // 3 - 1, column + k % 3 - 1
-            o = y * width + x
-            if k == 4 or not (0 <= y < height and 0 <= x < width) or s.maps.occupied[o] or not s.maps.seen[o]:
+        for k in range(NEIGHBOURS):
+            o = neighbour(c, k, height, width)
+            if o < 0 or s.maps.occupied[o] or not s.maps.seen[o]:
                 continue
             gain = loss + gain_of(s, prior, o) + joint[i, k] * QUANTUM
-            if gain > max(gains[i], _least(s, least, c) + _least(s, least, o)):
+            if gain > max(gains[i], least_gain(s, least, c) + least_gain(s, least, o)):
                 targets[i], gains[i] = o, gain
         s.maps.occupied[c] ^= 1
         note_flip(s.maps.pattern, c, height, width)
@@ -199,7 +184,7 @@ def shift_in_order(
         loss = gain_of(s, prior, c)
         flip(s, c)
         gain = loss + gain_of(s, prior, o)
-        if gain > _least(s, least, c) + _least(s, least, o):
+        if gain > least_gain(s, least, c) + least_gain(s, least, o):
             flip(s, o)
             moves += 1
             total += gain

@@ -19,11 +19,24 @@ HALF_WIDTH = 0.75
 
 
 class Cone(NamedTuple):
-    """A circular sector: apex `x`, `y`, radius `reach`, unit vectors of its axis and its two edges, row limits."""
+    """A circular sector with the free zone at its apex.
+
+    Attributes
+    ----------
+    x, y : float
+        Apex.
+    reach, free : float
+        Radius of the sector, and of the free zone.
+    axis_x, axis_y, right_x, right_y, left_x, left_y : float
+        Unit vectors of the axis and of the two edges.
+    bottom, top : int
+        First and last row, on the grid or off it.
+    """
 
     x: float
     y: float
     reach: float
+    free: float
     axis_x: float
     axis_y: float
     right_x: float
@@ -34,9 +47,39 @@ class Cone(NamedTuple):
     top: int
 
 
+class Runs(NamedTuple):
+    """The cells of a cone in one row: columns `first` to `last`, and `first2` to `last2` right of them.
+
+    A run is empty where its last column is before its first; one run is the rule. `inner` to `outer` are the columns of
+    the row that are in the free zone, whether they are in the cone or not.
+    """
+
+    first: int
+    last: int
+    first2: int
+    last2: int
+    inner: int
+    outer: int
+
+
 @kernel
-def make_cone(x: float, y: float, axis: tuple[float, float], half: tuple[float, float], reach: float) -> Cone:
-    """Return the sector of a reading; `axis` is a unit vector, `half` sine and cosine of the half angle in (0, π/2)."""
+def make_cone(
+    x: float, y: float, axis: tuple[float, float], half: tuple[float, float], lengths: tuple[float, float]
+) -> Cone:
+    """Return the sector of a reading.
+
+    Parameters
+    ----------
+    x, y
+        Apex.
+    axis
+        Unit vector.
+    half
+        Sine and cosine of the half angle in (0, π/2).
+    lengths
+        Radius of the sector, and of the free zone, which is empty where negative.
+    """
+    reach, free = lengths
     axis_x, axis_y = axis
     sine, cosine = half
     right_x, right_y = axis_x * cosine + axis_y * sine, axis_y * cosine - axis_x * sine
@@ -47,6 +90,7 @@ def make_cone(x: float, y: float, axis: tuple[float, float], half: tuple[float, 
         x,
         y,
         reach,
+        free,
         axis_x,
         axis_y,
         right_x,
@@ -101,48 +145,43 @@ def axis_run(cone: Cone, row: int) -> tuple[int, int]:
 
 
 @kernel
-def within(x: float, v: float, radius: float, nearest: bool) -> tuple[int, int]:
-    """Return the first and last column of a row whose cells are at most `radius` away; last < first if none is.
+def within(x: float, v: float, radius: float) -> tuple[int, int]:
+    """Return the first and last column of a row whose centres are at most `radius` away; last < first if none is.
 
-    `x` is the apex, `v` the row's height above it; the distance is that of `distance`.
+    `x` is the apex, `v` the row's height above it.
     """
-    v = max(abs(v) - 0.5, 0.0) if nearest else v
     chord = radius * radius - v * v
     if radius < 0.0 or chord < 0.0:
         return 0, -1
-    half = math.sqrt(chord) + (0.5 if nearest else 0.0)
+    half = math.sqrt(chord)
     return int(math.ceil(x - half - 0.5)), int(math.floor(x + half - 0.5))
 
 
 @kernel
-def row_runs(cone: Cone, row: int, radius: float, width: int, nearest: bool) -> tuple[int, int, int, int]:
-    """Return the cells of the cone in a row, at most `radius` away and on the grid, as two runs: first, last, twice.
+def rows_of(cone: Cone, height: int) -> tuple[int, int]:
+    """Return the first row of the cone that is on the grid, and the last one plus one."""
+    return max(cone.bottom, 0), min(cone.top, height - 1) + 1
 
-    The first run is left of the second. A run is empty where its last column is before its first; one run is the rule.
-    """
-    first, last = within(cone.x, row + 0.5 - cone.y, radius, nearest)
+
+@kernel
+def runs_of(cone: Cone, row: int, width: int) -> Runs:
+    """Return the cells of the cone in a row of the grid. Every walk over a cone is one over `rows_of` and these."""
+    v = row + 0.5 - cone.y
+    inner, outer = within(cone.x, v, cone.free)
+    first, last = within(cone.x, v, cone.reach)
     first, last = max(first, 0), min(last, width - 1)
     a, b = wedge_run(cone, row)
     c, d = axis_run(cone, row)
     a, b, c, d = max(a, first), min(b, last), max(c, first), min(d, last)
     if b < a:
-        return c, d, 0, -1
+        return Runs(c, d, 0, -1, inner, outer)
     if d < c:
-        return a, b, 0, -1
+        return Runs(a, b, 0, -1, inner, outer)
     if c <= b + 1 and a <= d + 1:
-        return min(a, c), max(b, d), 0, -1
+        return Runs(min(a, c), max(b, d), 0, -1, inner, outer)
     if a < c:
-        return a, b, c, d
-    return c, d, a, b
-
-
-@kernel
-def distance(du: float, dv: float, nearest: bool) -> float:
-    """Return the distance to a cell whose centre is (du, dv) away: to its centre or to its nearest point."""
-    if nearest:
-        du = max(abs(du) - 0.5, 0.0)
-        dv = max(abs(dv) - 0.5, 0.0)
-    return math.sqrt(du * du + dv * dv)
+        return Runs(a, b, c, d, inner, outer)
+    return Runs(c, d, a, b, inner, outer)
 
 
 @kernel

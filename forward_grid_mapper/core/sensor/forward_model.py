@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,26 +26,7 @@ from ..common.parameters import ModelParameters
 from ..common.readings import Readings
 from ..runtime.jit import kernel
 from .cone_table import Cones, Floats, cone_table, walk_resized
-
-
-class Causes(NamedTuple):
-    """The model's terms that do not depend on the map.
-
-    Attributes
-    ----------
-    p_hit, mixture_weight : float
-        The latter is 1 − p_rand − p_lost.
-    random, lost : float64, shape (N,)
-        The densities p_rand / z_max and, where there is no echo, p_lost · N(z; z_max, σ) in 1/m.
-    no_echo : float64, shape (N,)
-        N(z; z_max, σ) in 1/m.
-    """
-
-    p_hit: float
-    mixture_weight: float
-    random: Floats
-    lost: Floats
-    no_echo: Floats
+from .density import Causes, causes_of, density
 
 
 @dataclass(frozen=True)
@@ -66,25 +47,14 @@ class Expectations:
     log_likelihood: Floats
 
 
-def causes_of(readings: Readings, sigma: Floats, model: ModelParameters) -> Causes:
-    """Return the map-independent terms of each reading; `sigma` is that of `effective_sigma`."""
-    mixture_weight = 1.0 - model.p_rand - model.p_lost
-    error = (readings.z_max - readings.z) / sigma
-    density = np.where(error <= model.cut, np.exp(-0.5 * error**2) / (math.sqrt(2 * math.pi) * sigma), 0.0)
-    lost = np.where(readings.echo, 0.0, model.p_lost * density)
-    return Causes(model.p_hit, mixture_weight, model.p_rand / readings.z_max, lost, density)
-
-
 @kernel
-def _expect(
-    table: Cones, causes: Causes, occupied: Any, nearest: bool, cut: float, resolution: float, out: Any
-) -> None:
+def _expect(table: Cones, causes: Causes, occupied: Any, resolution: float, out: Any) -> None:
     """Fill `out` (8, N) with the rows of `Expectations`, in its order."""
     height, width = occupied.shape
     flat = occupied.ravel()
     cells, distances = np.empty(1024, np.int32), np.empty(1024, np.float64)
     for t in range(len(table)):
-        n, cells, distances = walk_resized(table, t, (height, width), nearest, cells, distances)
+        n, cells, distances = walk_resized(table, t, (height, width), cells, distances)
         m = 0
         for k in range(n):
             if flat[cells[k]] == 1:
@@ -96,17 +66,15 @@ def _expect(
         hit, rank, squared = 0.0, 0.0, 0.0
         for k in range(m):
             error = (table[t].z - hits[k]) / sigma
-            if abs(error) <= cut:
-                term = weight * causes.p_hit * math.exp(-0.5 * error * error)
-                term /= math.sqrt(2.0 * math.pi) * sigma * resolution
-                hit += term
-                rank += (k + 1) * term
-                squared += term * (error * sigma * resolution) ** 2
+            term = weight * causes.p_hit * density(error, sigma * resolution)
+            hit += term
+            rank += (k + 1) * term
+            squared += term * (error * sigma * resolution) ** 2
             weight *= 1.0 - causes.p_hit
-        total = causes.random[t] + causes.lost[t] + hit + weight * causes.no_echo[t]
+        total = causes.random[t] + causes.lost[t] + hit + weight * causes.max_range[t]
         out[0, t] = causes.random[t] / total
         out[1, t] = causes.lost[t] / total
-        out[2, t] = weight * causes.no_echo[t] / total
+        out[2, t] = weight * causes.max_range[t] / total
         out[3, t] = hit / total
         out[4, t] = rank / total
         out[5, t] = squared / total
@@ -129,7 +97,7 @@ def expectations(readings: Readings, grid: Grid, occupied: NDArray[Any], model: 
     causes = causes_of(readings, table['sigma'] * grid.resolution, model)
     out = np.empty((8, len(readings)))
     filled = np.ascontiguousarray(np.asarray(occupied) == 1).view(np.uint8)
-    _expect(table, causes, filled, model.cell_distance == 'nearest', model.cut, grid.resolution, out)
+    _expect(table, causes, filled, grid.resolution, out)
     return Expectations(*out)
 
 

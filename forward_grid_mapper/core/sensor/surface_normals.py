@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..runtime.jit import kernel
-from .cone import row_runs
+from .cone import rows_of, runs_of
 from .cone_table import Cones, cone_of
 
 LEAST_WEIGHT = 3.0
@@ -65,7 +65,7 @@ def no_normals() -> SurfaceNormals:
 
 
 @kernel
-def gather(cones: Cones, shape: tuple[int, int], nearest: bool, part: tuple[int, int], sums: Any, stop: Any) -> None:
+def gather(cones: Cones, shape: tuple[int, int], part: tuple[int, int], sums: Any, stop: Any) -> None:
     """Add C, S and M of the readings `part[0]` to `part[1]` to `sums`, int64, shape (3, cells), in units of QUANTUM."""
     height, width = shape
     for t in range(part[0], part[1]):
@@ -74,13 +74,13 @@ def gather(cones: Cones, shape: tuple[int, int], nearest: bool, part: tuple[int,
         reading = cones[t]
         if reading.z >= reading.z_max:
             continue
-        cone = cone_of(reading, nearest)
+        cone = cone_of(reading)
         low = max(reading.z - 4.0 * reading.sigma, 0.0) ** 2
-        for row in range(max(cone.bottom, 0), min(cone.top, height - 1) + 1):
+        for row in range(*rows_of(cone, height)):
             v = row + 0.5 - cone.y
-            a, b, c, d = row_runs(cone, row, reading.reach, width, nearest)
-            for begin, end in ((a, b), (c, d)):
-                for column in range(begin, end + 1):
+            runs = runs_of(cone, row, width)
+            for first, last in ((runs.first, runs.last), (runs.first2, runs.last2)):
+                for column in range(first, last + 1):
                     u = column + 0.5 - cone.x
                     square = u * u + v * v
                     if square <= low:

@@ -26,7 +26,7 @@ def test_rows_are_complete_and_defaults_admitted(row) -> None:
 
 
 def test_flat_values_go_there_and_back() -> None:
-    changed = Parameters.from_flat({'p_hit': 0.5, 'resolution': 1, 'shift_moves': False})
+    changed = Parameters.from_flat({'p_hit': 0.5, 'resolution': 1, 'online': False})
     assert changed.model.p_hit == 0.5
     assert changed.grid.resolution == 1.0
     assert Parameters.from_flat(changed.flat()) == changed

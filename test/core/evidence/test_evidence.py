@@ -24,7 +24,8 @@ from forward_grid_mapper.core.search.flips import gain_of
 from forward_grid_mapper.core.search.prior import Prior
 from forward_grid_mapper.core.search.search import ROUNDING
 from forward_grid_mapper.core.sensor.cone_table import grid_of
-from forward_grid_mapper.core.sensor.forward_model import causes_of, expectations
+from forward_grid_mapper.core.sensor.density import CUT, causes_of
+from forward_grid_mapper.core.sensor.forward_model import expectations
 
 GRID = Grid(0.1, -4, 7, 12, 9)
 WIDE = Grid(0.1, -7, 12, 41, 33)
@@ -42,8 +43,6 @@ def random_model(rng: np.random.Generator) -> ModelParameters:
         p_rand=rng.choice([1e-4, 0.1, 0.4]),
         p_lost=rng.choice([0.0, 0.25]),
         sigma=rng.uniform(0.01, 0.3),
-        cut=rng.choice([4.0, 5.0, 30.0]),
-        cell_distance=str(rng.choice(['center', 'nearest'])),
     )
 
 
@@ -59,7 +58,7 @@ def without_ties(readings: Readings, model: ModelParameters) -> Readings:
     kept = []
     for t in range(len(readings)):
         away = naive.cells_of(readings, t, GRID, model, 1e-9)
-        width = model.cut * naive.sigma_of(readings, t, GRID, model)
+        width = CUT * naive.sigma_of(readings, t, GRID, model)
         cut = any(abs(abs(readings.z[t] - d) - width) < 1e-9 for d in [*away.values(), readings.z_max[t]])
         if not cut and set(away) == set(naive.cells_of(readings, t, GRID, model, -1e-9)):
             kept.append(t)
@@ -77,7 +76,18 @@ def evidence_of(readings: Readings, model: ModelParameters, occupied: np.ndarray
 def snapshot(evidence: Evidence, logs: bool = True) -> list[object]:
     """All that is kept for readings and cells, but for when they changed and where they lie."""
     s, n = evidence.state, len(evidence)
-    kept = ('floor', 'no_echo', 'through', 'runs', 'bands', 'blocking', 'weight', 'occupy', 'release', 'likelihood')
+    kept = (
+        'floor',
+        'max_range',
+        'through',
+        'runs',
+        'bands',
+        'blocking',
+        'multiplicity',
+        'occupy',
+        'release',
+        'likelihood',
+    )
     reading_states = [s.reading_states[name][:n].tolist() for name in kept]
     stored = [naive.pairs_of(s, t) for t in range(n) if s.reading_states[t]['stored']] if logs else []
     return [*(array.tolist() for array in s.maps), *reading_states, stored, evidence.log_likelihood]
@@ -144,16 +154,15 @@ def test_what_no_map_changes_is_that_of_the_forward_model(some: object) -> None:
     sigma = np.array([naive.sigma_of(readings, t, GRID, model) for t in range(len(readings))])
     reading_states, causes = reading_state_table(readings, sigma, model), causes_of(readings, sigma, model)
     assert reading_states['floor'] == pytest.approx(causes.random + causes.lost)
-    assert np.array_equal(reading_states['no_echo'], causes.no_echo)
-    assert (reading_states['weight'] == 1).all()
+    assert np.array_equal(reading_states['max_range'], causes.max_range)
+    assert (reading_states['multiplicity'] == 1).all()
 
 
 @pytest.mark.parametrize('some', SOME)
-@pytest.mark.parametrize('nearest', [False, True])
 @pytest.mark.parametrize('grid', [WIDE, Grid(0.25, 0, 0, 9, 20)], ids=['fine', 'coarse'])
-def test_seers_of_a_cell_are_the_readings_that_have_it(some: object, nearest: bool, grid: Grid) -> None:
+def test_seers_of_a_cell_are_the_readings_that_have_it(some: object, grid: Grid) -> None:
     readings = some(np.random.default_rng(1), grid, 250)
-    model = plain_model(sigma=0.03, cell_distance='nearest' if nearest else 'center')
+    model = plain_model(sigma=0.03)
     evidence = evidence_of(readings, model, np.zeros(grid.size, np.uint8), grid=grid)
     state = evidence.state
     expected: list[dict[int, int]] = [{} for _ in range(grid.size)]
@@ -279,7 +288,7 @@ def test_a_reading_of_weight_three_is_three_readings(seed: int, memory: float) -
     thrice = evidence_of(readings.select(np.repeat(np.arange(40), 3)), model, occupied)
     heavy = evidence_of(readings, model, occupied, memory=memory)
     heavy.add_multiplicity(np.repeat(np.arange(40), 2))
-    assert (heavy.state.reading_states['weight'] == 3).all()
+    assert (heavy.state.reading_states['multiplicity'] == 3).all()
     for c in range(0, GRID.size, 5):
         assert np.array_equal(heavy.state.maps.evidence, thrice.state.maps.evidence)
         assert np.array_equal(heavy.state.maps.seen, thrice.state.maps.seen)
@@ -298,7 +307,7 @@ def test_readings_that_gain_weight_are_noted_as_changed() -> None:
     flip(evidence.state, 0)
     before = evidence.state.reading_states['changed'].copy()
     evidence.add_multiplicity(np.array([3, 7, 3]))
-    assert evidence.state.reading_states['weight'].tolist() == [1, 1, 1, 3, 1, 1, 1, 2, 1, 1]
+    assert evidence.state.reading_states['multiplicity'].tolist() == [1, 1, 1, 3, 1, 1, 1, 2, 1, 1]
     before[[3, 7]] = 2
     assert np.array_equal(evidence.state.reading_states['changed'], before)
 

@@ -15,23 +15,22 @@ from forward_grid_mapper.core.common.grid import Grid
 from forward_grid_mapper.core.evidence.evidence import Evidence
 from forward_grid_mapper.core.evidence.pairs import _sort, make, workspace_for
 from forward_grid_mapper.core.sensor.cone_table import walk
+from forward_grid_mapper.core.sensor.density import CUT
 
 GRID = Grid(0.1, -7, 12, 41, 33)
 
 
 @pytest.mark.parametrize('some', [naive.awkward_readings, random_readings])
-@pytest.mark.parametrize('nearest', [False, True])
-@pytest.mark.parametrize('cut', [4.0, 5.0, 40.0])
-def test_runs_and_band_are_the_free_zone_and_the_rest_of_the_cone(some: object, nearest: bool, cut: float) -> None:
+def test_runs_and_band_are_the_free_zone_and_the_rest_of_the_cone(some: object) -> None:
     readings = some(np.random.default_rng(4), GRID, 80)
-    model = plain_model(cut=cut, sigma=0.06, cell_distance='nearest' if nearest else 'center')
+    model = plain_model(sigma=0.06)
     evidence = Evidence(GRID, model)
     evidence.extend(readings)
     state = evidence.state
     cells, distances = np.empty(GRID.size, np.int32), np.empty(GRID.size)
     seen, pairs = np.zeros(GRID.size, int), 0
     for t in range(len(readings)):
-        n = walk(state.cones, t, GRID.shape, nearest, cells, distances)
+        n = walk(state.cones, t, GRID.shape, cells, distances)
         away = dict(zip(cells[:n].tolist(), (distances[:n] * GRID.resolution).tolist(), strict=True))
         free, band, density, _ = naive.pairs_of(state, t)
         assert free == sorted(set(free)), 'in ascending order, each once'
@@ -45,8 +44,8 @@ def test_runs_and_band_are_the_free_zone_and_the_rest_of_the_cone(some: object, 
         sigma = naive.sigma_of(readings, t, GRID, model)
         for c, told in zip(band, density, strict=True):
             # where the noise is cut off, rounding may decide
-            if abs(abs(readings.z[t] - away[c]) - cut * sigma) > 1e-9:
-                assert told == pytest.approx(naive.normal(readings.z[t], away[c], sigma, cut), rel=1e-6, abs=1e-30)
+            if abs(abs(readings.z[t] - away[c]) - CUT * sigma) > 1e-9:
+                assert told == pytest.approx(naive.normal(readings.z[t], away[c], sigma), rel=1e-6, abs=1e-30)
         seen[free + band] += 1
         pairs += len(free) + len(band)
     assert evidence.pairs == pairs
@@ -76,7 +75,7 @@ def test_cells_of_equal_distance_stay_in_the_order_of_the_grid() -> None:
 
 
 def test_pairs_made_anew_are_those_that_are_stored() -> None:
-    model = plain_model(cell_distance='nearest')
+    model = plain_model()
     evidence = Evidence(GRID, model)
     evidence.extend(naive.awkward_readings(np.random.default_rng(7), GRID, 100))
     s = evidence.state
@@ -113,7 +112,7 @@ def test_densities_integrate_to_one() -> None:
     for name, value in {'x': 0.0, 'y': 0.0025, 'yaw': 0.0, 'z': 1.0, 'z_max': 3.0, 'half_angle': 0.1}.items():
         getattr(readings, name)[:] = value
     readings.sigma[:] = 0.05
-    evidence = Evidence(grid, plain_model(cut=5.0))
+    evidence = Evidence(grid, plain_model())
     evidence.extend(readings)
     _, _, density, _ = naive.pairs_of(evidence.state, 0)
     assert math.fsum(density) * grid.resolution == pytest.approx(1.0, abs=1e-5)

@@ -40,7 +40,7 @@ def test_the_truth_lies_within_the_intervals_as_often_as_they_say() -> None:
 @pytest.mark.parametrize('name', ['p_hit', 'p_rand', 'p_lost', 'sigma'])
 def test_estimating_functions_are_derivatives_of_the_log_likelihood(name: str) -> None:
     readings = drawn(np.random.default_rng(4), 300)
-    model = dataclasses.replace(TRUTH, p_hit=0.6, cut=30.0)
+    model = dataclasses.replace(TRUTH, p_hit=0.6)
     step = 1e-6
     high, low = (
         expectations(

@@ -22,21 +22,20 @@ def logit(p: float) -> float:
     return math.log(p / (1 - p))
 
 
-@pytest.mark.parametrize('cell_distance', ['center', 'nearest'])
 @pytest.mark.parametrize('depth', [0.05, 0.12, 1.0])
-def test_log_odds_are_those_of_the_twin(cell_distance: str, depth: float) -> None:
+def test_log_odds_are_those_of_the_twin(depth: float) -> None:
     readings = random_readings(np.random.default_rng(0), AREA, 80)
-    parameters = Parameters.from_flat({'live_depth': depth, 'cell_distance': cell_distance})
+    parameters = Parameters.from_flat({'live_depth': depth})
     live = LogOddsMap(parameters)
     live.add(readings)
     p = parameters.live
     logits = logit(p.live_p_occupied), logit(p.live_p_free), logit(p.live_p_free_no_echo)
-    expected = naive.live_log_odds(readings, live.grid, p.live_depth, logits, cell_distance == 'nearest')
+    expected = naive.live_log_odds(readings, live.grid, p.live_depth, logits)
     assert live.log_odds() == pytest.approx(expected, abs=1e-4, nan_ok=True)
 
 
 def test_the_weight_falls_with_the_sine_of_the_angle_from_the_axis_to_the_edge() -> None:
-    live = LogOddsMap(Parameters.from_flat({'live_p_free': 0.2, 'cell_distance': 'center'}))
+    live = LogOddsMap(Parameters.from_flat({'live_p_free': 0.2}))
     live.add(Readings.from_columns(x=0.0, y=0.0, yaw=0.0, z=[4.0], z_max=5.0, half_angle=0.6))
     rows, columns = live.grid.cells_of(np.full(5, 3.05), np.array([0.05, 0.55, 1.05, 1.55, 2.05]))
     sines = np.sin(np.arctan2([0.05, 0.55, 1.05, 1.55, 2.05], 3.05))
@@ -47,7 +46,7 @@ def test_the_weight_falls_with_the_sine_of_the_angle_from_the_axis_to_the_edge()
 
 @pytest.mark.parametrize('half_angle', [1e-6, 0.005, 0.02])
 def test_a_thin_cone_is_one_and_a_half_cells_wide(half_angle: float) -> None:
-    live = LogOddsMap(Parameters.from_flat({'live_p_free': 0.2, 'cell_distance': 'center'}))
+    live = LogOddsMap(Parameters.from_flat({'live_p_free': 0.2}))
     # the axis leaves the centres of its cells by up to half a cell
     readings = Readings.from_columns(x=0.05, y=0.05, yaw=0.1, z=[3.0], z_max=5.0, half_angle=half_angle)
     live.add(readings)

@@ -62,29 +62,28 @@ def test_there_is_a_core() -> None:
     assert threads.cores() >= 1
 
 
-def search(workers: int, memory: float, cell_distance: str, seed: int, plain: bool) -> tuple[SearchResult, Evidence]:
+def search(workers: int, memory: float, seed: int, plain: bool) -> tuple[SearchResult, Evidence]:
     readings = random_readings(np.random.default_rng(seed), AREA, 600, z_max=3.0)
     readings.half_angle[:] *= 0.3
     surfaces = PLAIN_MODEL if plain else {}
-    model = ModelParameters(p_hit=0.7, p_rand=0.1, sigma=0.06, cell_distance=cell_distance, **surfaces)
+    model = ModelParameters(p_hit=0.7, p_rand=0.1, sigma=0.06, **surfaces)
     evidence = Evidence(AREA, model, memory=memory, threads=workers)
     evidence.extend(readings)
     assert evidence.state.normals.known.any() != plain
     return Search(evidence, SearchParameters(**(PLAIN_SEARCH if plain else {}))).run(), evidence
 
 
-@pytest.mark.parametrize('cell_distance', ['center', 'nearest'])
 @pytest.mark.parametrize(('seed', 'plain'), [(0, True), (1, False)], ids=['plain', 'whole'])
 def test_neither_threads_nor_memory_change_a_bit_of_the_search(
-    monkeypatch: pytest.MonkeyPatch, cell_distance: str, seed: int, plain: bool
+    monkeypatch: pytest.MonkeyPatch, seed: int, plain: bool
 ) -> None:
-    first, evidence = search(1, np.inf, cell_distance, seed, plain)
+    first, evidence = search(1, np.inf, seed, plain)
     assert first.progress.shifts > 0
     assert first.progress.flips > 50
     monkeypatch.setattr(threads, 'LEAST_PART', 50)
     half = evidence.state.pairs.cell.nbytes / 2
     for workers, memory in ((3, np.inf), (1, half), (1, 0.0), (3, half), (3, 0.0)):
-        other, less = search(workers, memory, cell_distance, seed, plain)
+        other, less = search(workers, memory, seed, plain)
         assert (less.unstored > 0) == (memory < np.inf)
         assert np.array_equal(other.occupied, first.occupied)
         assert np.array_equal(other.evidence, first.evidence)

@@ -44,7 +44,6 @@ def random_case(
         p_rand=rng.choice([0.001, 0.1, 0.4]),
         p_lost=rng.choice([0.0, 0.25]),
         sigma=rng.choice([0.01, 0.06]),
-        cell_distance=str(rng.choice(['center', 'nearest'])),
     )
     evidence = Evidence(GRID, model, memory=memory, start=rng.random(GRID.shape) < filled)
     evidence.extend(readings)
@@ -177,7 +176,7 @@ def test_occupied_cells_that_cost_nothing_to_free_are_freed_one_after_the_other(
 def joints(evidence: Evidence, cells: np.ndarray, readings: np.ndarray | None = None) -> np.ndarray:
     slot = np.full(GRID.size, -1, np.int32)
     slot[cells] = np.arange(len(cells))
-    place, joint = np.full(GRID.size, -1, np.int32), np.zeros((len(cells), 9), np.int64)
+    place, joint = np.full(GRID.size, -1, np.int32), np.zeros((len(cells), 8), np.int64)
     which = np.arange(len(evidence)) if readings is None else readings
     try_shifts(evidence.state, which, slot, place, joint)
     assert (place == -1).all()

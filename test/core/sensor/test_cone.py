@@ -15,7 +15,7 @@ from conftest import plain_model, random_readings
 from forward_grid_mapper.core.common.grid import Grid, cone_boxes
 from forward_grid_mapper.core.common.parameters import GridParameters, ModelParameters
 from forward_grid_mapper.core.common.readings import Readings
-from forward_grid_mapper.core.sensor.cone import axis_run, distance, row_runs, within
+from forward_grid_mapper.core.sensor.cone import axis_run, rows_of, runs_of, within
 from forward_grid_mapper.core.sensor.cone_table import (
     cone_of,
     cone_table,
@@ -34,27 +34,25 @@ Make = Callable[[np.random.Generator, Grid, int], Readings]
 SOME = [naive.awkward_readings, random_readings]
 
 
-def model_of(nearest: bool) -> ModelParameters:
-    return ModelParameters(cell_distance='nearest' if nearest else 'center', surface_offset=0.3)
+MODEL = ModelParameters(surface_offset=0.3)
 
 
-def walked(table: np.ndarray, t: int, grid: Grid, nearest: bool) -> dict[int, float]:
+def walked(table: np.ndarray, t: int, grid: Grid) -> dict[int, float]:
     """Cells that `walk` finds, and their distances in cells."""
     cells, distances = np.empty(grid.size, np.int32), np.empty(grid.size)
-    n = walk(table, t, grid.shape, nearest, cells, distances)
+    n = walk(table, t, grid.shape, cells, distances)
     found = dict(zip(cells[:n].tolist(), distances[:n].tolist(), strict=True))
     assert len(found) == n, 'a cell is listed twice'
     return found
 
 
 @pytest.mark.parametrize('make', SOME)
-@pytest.mark.parametrize('nearest', [False, True])
 @pytest.mark.parametrize('grid', [GRID, Grid(0.25, -9, -11, 17, 23)], ids=['fine', 'coarse'])
-def test_cone_has_the_cells_within_the_angle_and_those_on_the_axis(make: Make, nearest: bool, grid: Grid) -> None:
-    readings, model = make(np.random.default_rng(1), grid, 150), model_of(nearest)
+def test_cone_has_the_cells_within_the_angle_and_those_on_the_axis(make: Make, grid: Grid) -> None:
+    readings, model = make(np.random.default_rng(1), grid, 150), MODEL
     table = cone_table(readings, grid, model)
     for t in range(len(readings)):
-        found = walked(table, t, grid, nearest)
+        found = walked(table, t, grid)
         smaller, larger = (naive.cells_of(readings, t, grid, model, slack) for slack in (-1e-9, 1e-9))
         assert set(smaller) <= set(found) <= set(larger)
         for cell, d in found.items():
@@ -62,14 +60,13 @@ def test_cone_has_the_cells_within_the_angle_and_those_on_the_axis(make: Make, n
 
 
 @pytest.mark.parametrize('make', SOME)
-@pytest.mark.parametrize('nearest', [False, True])
-def test_runs_of_a_row_are_apart_and_from_left_to_right(make: Make, nearest: bool) -> None:
+def test_runs_of_a_row_are_apart_and_from_left_to_right(make: Make) -> None:
     readings = make(np.random.default_rng(2), GRID, 200)
     two = 0
-    for reading in cone_table(readings, GRID, model_of(nearest)):
-        cone = cone_of(reading, nearest)
-        for row in range(max(cone.bottom, 0), min(cone.top, GRID.height - 1) + 1):
-            a, b, c, d = row_runs(cone, row, reading['reach'], GRID.width, nearest)
+    for reading in cone_table(readings, GRID, MODEL):
+        cone = cone_of(reading)
+        for row in range(*rows_of(cone, GRID.height)):
+            a, b, c, d, _, _ = runs_of(cone, row, GRID.width)
             for first, last in ((a, b), (c, d)):
                 assert last < first or 0 <= first <= last < GRID.width
             if a <= b and c <= d:
@@ -82,19 +79,13 @@ def test_runs_of_a_row_are_apart_and_from_left_to_right(make: Make, nearest: boo
     st.floats(-3, 20) | st.integers(-6, 40).map(lambda n: n / 2),
     st.floats(-15, 15) | st.integers(-30, 30).map(lambda n: n / 2),
     st.floats(-1, 12) | st.integers(-2, 24).map(lambda n: n / 2),
-    st.booleans(),
 )
-def test_within_is_the_run_of_cells_that_are_near_enough(x: float, v: float, radius: float, nearest: bool) -> None:
-    first, last = within(x, v, radius, nearest)
-    away = {column: distance(column + 0.5 - x, v, nearest) for column in range(-20, 40)}
+def test_within_is_the_run_of_cells_that_are_near_enough(x: float, v: float, radius: float) -> None:
+    first, last = within(x, v, radius)
+    away = {column: math.hypot(column + 0.5 - x, v) for column in range(-20, 40)}
     for column, d in away.items():
         if abs(d - radius) > 1e-9:
             assert (first <= column <= last) == (d <= radius)
-
-
-@given(st.floats(-40, 40), st.floats(-40, 40), st.booleans())
-def test_distance_is_that_to_the_centre_or_to_the_nearest_point(du: float, dv: float, nearest: bool) -> None:
-    assert distance(du, dv, nearest) == pytest.approx(naive.cell_distance(0, 0, du, dv, 1.0, nearest), abs=1e-12)
 
 
 def test_a_sensor_on_an_edge_of_cells_sees_one_of_the_two_rows_along_it() -> None:
@@ -105,12 +96,12 @@ def test_a_sensor_on_an_edge_of_cells_sees_one_of_the_two_rows_along_it() -> Non
     )
     table = cone_table(readings, grid, ModelParameters(sigma=0.01))
     for t in range(len(readings)):
-        rows, columns = np.divmod(list(walked(table, t, grid, False)), grid.width)
+        rows, columns = np.divmod(list(walked(table, t, grid)), grid.width)
         across, along = (rows, columns) if t < 3 else (columns, rows)
         assert set(across.tolist()) in ({9}, {10})
         # out to 0.5 m and five times half a cell; it begins on the corner of a cell behind, which belongs or not
         assert set(along.tolist()) | {10} == set(range(10, 17) if t in (0, 3) else range(3, 11))
-    cone = cone_of(table[0], False)
+    cone = cone_of(table[0])
     assert [axis_run(cone, row)[1] >= axis_run(cone, row)[0] for row in (9, 10, 11)] == [False, True, False]
 
 
@@ -121,7 +112,7 @@ def test_a_cone_of_nearly_half_a_turn_is_all_that_is_ahead(half_angle: float) ->
     for _ in range(20):
         x, y, yaw = rng.uniform(-0.5, 0.5), rng.uniform(-0.5, 0.5), rng.uniform(-4, 4)
         readings = Readings.from_columns(x=x, y=y, yaw=yaw, z=2.0, z_max=2.0, half_angle=half_angle)
-        found = set(walked(cone_table(readings, grid, plain_model()), 0, grid, False))
+        found = set(walked(cone_table(readings, grid, plain_model()), 0, grid))
         xs, ys = grid.centers()
         du, dv = np.meshgrid(xs - x, ys - y)
         ahead = du * math.cos(yaw) + dv * math.sin(yaw)
@@ -136,18 +127,17 @@ def test_a_walk_says_how_many_cells_there_are_where_it_has_too_little_room() -> 
     readings = random_readings(np.random.default_rng(4), GRID, 20)
     table = cone_table(readings, GRID, ModelParameters())
     for t in range(len(readings)):
-        whole = walked(table, t, GRID, False)
+        whole = walked(table, t, GRID)
         cells, distances = np.full(4, -1, np.int32), np.full(4, -1.0)
-        assert walk(table, t, GRID.shape, False, cells[:3], distances[:3]) == len(whole)
+        assert walk(table, t, GRID.shape, cells[:3], distances[:3]) == len(whole)
         assert cells[3] == -1, 'written beyond the end'
-        n, cells, distances = walk_resized(table, t, GRID.shape, False, cells, distances)
+        n, cells, distances = walk_resized(table, t, GRID.shape, cells, distances)
         assert dict(zip(cells[:n].tolist(), distances[:n].tolist(), strict=True)) == whole
 
 
 @pytest.mark.parametrize('make', SOME)
-@pytest.mark.parametrize('nearest', [False, True])
-def test_the_grid_of_readings_cuts_off_no_cell(make: Make, nearest: bool) -> None:
-    readings, model = make(np.random.default_rng(5), GRID, 150), model_of(nearest)
+def test_the_grid_of_readings_cuts_off_no_cell(make: Make) -> None:
+    readings, model = make(np.random.default_rng(5), GRID, 150), MODEL
     parameters = GridParameters(resolution=GRID.resolution)
     for t in range(len(readings)):
         one = readings.select(slice(t, t + 1))
@@ -165,7 +155,7 @@ def test_cones_are_those_of_the_readings_in_cells(offset: float) -> None:
     readings, model = random_readings(np.random.default_rng(6), GRID, 30), ModelParameters(surface_offset=offset)
     table = cone_table(readings, GRID, model)
     sigma = effective_sigma(readings, model, GRID.resolution)
-    reach = reach_of(readings, sigma, model.cut)
+    reach = reach_of(readings, sigma)
     for t, cone in enumerate(table):
         assert sigma[t] == naive.sigma_of(readings, t, GRID, model)
         assert reach[t] == naive.reach(readings, t, GRID, model)
@@ -180,12 +170,6 @@ def test_cones_are_those_of_the_readings_in_cells(offset: float) -> None:
         assert cone['sigma'] == pytest.approx(sigma[t] / 0.1)
 
 
-def test_the_nearest_point_of_a_cell_is_its_surface() -> None:
-    readings = random_readings(np.random.default_rng(6), GRID, 30)
-    near = [ModelParameters(cell_distance='nearest', surface_offset=offset) for offset in (0.0, 0.5)]
-    assert np.array_equal(*(cone_table(readings, GRID, model) for model in near))
-
-
 def test_a_thin_cone_has_no_holes() -> None:
     rng = np.random.default_rng(2)
     grid = Grid(0.1, -30, -30, 60, 60)
@@ -197,7 +181,7 @@ def test_a_thin_cone_has_no_holes() -> None:
     table = cone_table(readings, grid, model)
     cells, distances = np.empty(grid.size, np.int32), np.empty(grid.size)
     for t in range(len(readings)):
-        n = walk(table, t, grid.shape, False, cells, distances)
+        n = walk(table, t, grid.shape, cells, distances)
         rows, columns = np.divmod(cells[:n], grid.width)
         steps = np.arange(0.0, table['reach'][t] - 1, 0.05)
         on_axis = set(

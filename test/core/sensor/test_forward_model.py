@@ -13,6 +13,7 @@ from conftest import random_readings
 from forward_grid_mapper.core.common.grid import Grid
 from forward_grid_mapper.core.common.parameters import ModelParameters
 from forward_grid_mapper.core.learning.model_update import learn
+from forward_grid_mapper.core.sensor.density import CUT
 from forward_grid_mapper.core.sensor.forward_model import expectations, log_likelihood
 
 GRID = Grid(0.1, 3, -4, 4, 3)
@@ -24,8 +25,6 @@ def random_model(rng: np.random.Generator) -> ModelParameters:
         p_rand=rng.uniform(0.01, 0.4),
         p_lost=rng.choice([0.0, rng.uniform(0, 0.4)]),
         sigma=rng.uniform(0.03, 0.3),
-        cut=rng.choice([4.0, 5.0, 30.0]),
-        cell_distance=str(rng.choice(['center', 'nearest'])),
     )
 
 
@@ -76,7 +75,7 @@ def test_awkward_readings_have_the_likelihood_of_their_cells(seed: int) -> None:
     for t in range(len(readings)):
         z, z_max, sigma = readings.z[t], readings.z_max[t], naive.sigma_of(readings, t, grid, model)
         away = naive.cells_of(readings, t, grid, model, 1e-9)
-        ties = [abs(abs(z - d) - model.cut * sigma) < 1e-9 for d in [*away.values(), z_max]]
+        ties = [abs(abs(z - d) - CUT * sigma) < 1e-9 for d in [*away.values(), z_max]]
         # where rounding does not tell what belongs to the cone, or to the noise
         if not any(ties) and set(away) == set(naive.cells_of(readings, t, grid, model, -1e-9)):
             met = [d for c, d in away.items() if occupied.ravel()[c]]
@@ -136,7 +135,7 @@ def test_learning_never_lowers_the_likelihood() -> None:
     readings = random_readings(rng, grid, 200)
     readings.sigma[:] = 0
     occupied = (rng.random(grid.shape) < 0.1).astype(np.int8)
-    model = ModelParameters(p_hit=0.7, p_rand=0.2, p_lost=0.1, sigma=0.3, cut=40.0)
+    model = ModelParameters(p_hit=0.7, p_rand=0.2, p_lost=0.1, sigma=0.3)
     before = -math.inf
     for _ in range(10):
         now = log_likelihood(readings, grid, occupied, model)

@@ -49,7 +49,7 @@ def along_wall(count: int = 150, seed: int = 0) -> Readings:
 def sums_of(evidence: Evidence, part: tuple[int, int]) -> np.ndarray:
     s = evidence.state
     sums = np.zeros((3, evidence.grid.size), np.int64)
-    gather(s.cones, evidence.grid.shape, s.lattice.nearest, part, sums, s.stop)
+    gather(s.cones, evidence.grid.shape, part, sums, s.stop)
     return sums
 
 
@@ -126,10 +126,9 @@ def left_out(evidence: Evidence, readings: Readings, t: int, model: ModelParamet
     return out
 
 
-@pytest.mark.parametrize('cell_distance', ['center', 'nearest'])
 @pytest.mark.parametrize('readings', [along_wall(), random_readings(np.random.default_rng(2), GRID, 120)])
-def test_pairs_are_those_of_the_cone_without_what_is_grazed(cell_distance: str, readings: Readings) -> None:
-    model = dataclasses.replace(MODEL, cell_distance=cell_distance)
+def test_pairs_are_those_of_the_cone_without_what_is_grazed(readings: Readings) -> None:
+    model = MODEL
     evidence, plain = made(readings, model), made(readings, dataclasses.replace(model, grazing_angle=math.pi / 2))
     s = evidence.state
     found: list[dict[int, int]] = [{} for _ in range(GRID.size)]
@@ -159,7 +158,7 @@ def test_pairs_are_those_of_the_cone_without_what_is_grazed(cell_distance: str, 
 
 def snapshot(evidence: Evidence) -> list[object]:
     s = evidence.state
-    kept = ('through', 'runs', 'bands', 'blocking', 'weight', 'occupy', 'release', 'likelihood')
+    kept = ('through', 'runs', 'bands', 'blocking', 'multiplicity', 'occupy', 'release', 'likelihood')
     return [
         *(array.tolist() for array in s.maps),
         *(s.reading_states[name].tolist() for name in kept),
@@ -171,10 +170,9 @@ def snapshot(evidence: Evidence) -> list[object]:
 @given(
     st.integers(0, 2**32 - 1),
     st.lists(st.integers(0, GRID.size - 1), max_size=20),
-    st.sampled_from(['center', 'nearest']),
 )
-def test_after_flips_all_is_as_if_built_from_the_new_map(seed: int, cells: list[int], cell_distance: str) -> None:
-    readings, model = along_wall(60, seed), dataclasses.replace(MODEL, cell_distance=cell_distance)
+def test_after_flips_all_is_as_if_built_from_the_new_map(seed: int, cells: list[int]) -> None:
+    readings, model = along_wall(60, seed), MODEL
     start = np.random.default_rng(seed).random(GRID.shape) < 0.1
     evidence, unstored = (made(readings, model, memory=m, start=start) for m in (math.inf, 0.0))
     for c in cells:
