@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 from ..common.grid import Grid
 from ..common.parameters import ModelParameters
 from ..common.readings import Readings
-from ..runtime.jit import kernel
+from ..runtime.jit import allocating_kernel
 from ..sensor.cone_table import Cones, cone_table, walk_resized
 
 
-@kernel
+@allocating_kernel
 def _count(cones: Cones, unexplained: Any, out: Any) -> None:
     """Add 1 to the cells that are at most σ from the range of each unexplained echo."""
     flat = out.ravel()

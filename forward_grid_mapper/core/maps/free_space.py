@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ..common.readings import Floats
 from ..evidence.evidence import Evidence
 from ..evidence.state import State
-from ..runtime.jit import kernel
+from ..runtime.jit import allocating_kernel, kernel
 from ..sensor.cone import rows_of, runs_of, strength
 from ..sensor.cone_table import cone_of
 from ..sensor.density import density
@@ -61,7 +61,7 @@ def _obstacles(s: State, t: int, occupied: Any, squares: Any, left: Any) -> tupl
     return n, blocking, near
 
 
-@kernel
+@allocating_kernel
 def add_passes(s: State, begin: int, end: int, random: Floats, lost: Floats, occupied: Any, passed: Any) -> None:
     """Add to `passed` (int64, in units of UNIT) how likely the readings `begin` to `end` passed each of their cells.
 

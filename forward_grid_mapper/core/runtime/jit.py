@@ -73,11 +73,25 @@ CACHE = _cache_folder()
 _remove_unused(Path(CACHE))
 
 
-def kernel(function: F) -> F:
-    """Compile `function` at its first call, free of the GIL; keep the machine code on disk."""
+def _compiled(function: F, **options: Any) -> F:
     before, config.CACHE_DIR = config.CACHE_DIR, CACHE
     try:
-        compiled: Any = numba.njit(cache=True, nogil=True, error_model='numpy')(function)
+        compiled: Any = numba.njit(cache=True, nogil=True, error_model='numpy', **options)(function)
     finally:
         config.CACHE_DIR = before
     return cast(F, compiled)
+
+
+def kernel(function: F) -> F:
+    """Compile `function` at its first call, free of the GIL; keep the machine code on disk.
+
+    A kernel borrows the arrays of its caller: it neither makes any nor counts references, which would take longer than
+    the work where a tuple of many arrays is handed to a function for each reading. If it returns arrays, then only to
+    other kernels of this kind.
+    """
+    return _compiled(function, _nrt=False)
+
+
+def allocating_kernel(function: F) -> F:
+    """Do as `kernel` does, for a function that makes arrays."""
+    return _compiled(function)

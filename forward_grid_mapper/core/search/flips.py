@@ -12,7 +12,7 @@ from ..evidence.fixed_point import QUANTUM
 from ..evidence.neighbourhood import NEIGHBOURS, neighbour
 from ..evidence.state import State
 from ..evidence.updates import flip
-from ..runtime.jit import kernel
+from ..runtime.jit import allocating_kernel, kernel
 from .prior import Prior, prior_gain
 
 
@@ -62,7 +62,7 @@ def promising(s: State, prior: Prior, least: Least, window: tuple[int, int, int,
     return n
 
 
-@kernel
+@allocating_kernel
 def highest(s: State, cells: NDArray[np.int64], gains: Floats, workspace: Floats) -> NDArray[np.bool_]:
     """Tell which of `cells` gain more than those of their eight neighbours that gain as well; of equals, the first.
 

@@ -19,7 +19,7 @@ from ..evidence.fixed_point import QUANTUM
 from ..evidence.neighbourhood import DX, DY, NEIGHBOURS
 from ..evidence.state import State
 from ..evidence.updates import flip
-from ..runtime.jit import kernel
+from ..runtime.jit import allocating_kernel, kernel
 from .flips import Least, gain_of
 from .prior import Prior
 
@@ -84,7 +84,7 @@ def _close(s: State, prior: Prior, least: Least, path: Any, n: int) -> float:
     return 0.0
 
 
-@kernel
+@allocating_kernel
 def close_gaps(s: State, prior: Prior, least: Least, cells: NDArray[np.int64], longest: int) -> tuple[int, float]:
     """Build the bridges that gain, the shortest first; return the number of flips and the total gain.
 

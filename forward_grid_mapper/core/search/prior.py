@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from ..common.parameters import SearchParameters
 from ..evidence.neighbourhood import NEIGHBOURS, offset, opposite, patterns
-from ..runtime.jit import kernel
+from ..runtime.jit import allocating_kernel, kernel
 from ..sensor.cone_table import Floats
 
 OPPOSITE_ENOUGH = 3
@@ -77,7 +77,7 @@ def prior_gain(prior: Prior, occupied: NDArray[np.uint8], pattern: NDArray[np.ui
     return float(-gain if occupied[c] else gain)
 
 
-@kernel
+@allocating_kernel
 def prior_gains(prior: Prior, occupied: NDArray[np.uint8], pattern: NDArray[np.uint8], width: int) -> Floats:
     """Return `prior_gain` of all cells, shape (cells,)."""
     out = np.zeros(len(occupied))

@@ -24,7 +24,7 @@ from ..evidence.neighbourhood import NEIGHBOURS, neighbour, note_flip
 from ..evidence.pairs import WORDS_PER_RUN, Pairs
 from ..evidence.state import State
 from ..evidence.updates import find_observing, flip, pairs_of, pairs_with_logs
-from ..runtime.jit import kernel
+from ..runtime.jit import allocating_kernel, kernel
 from ..sensor.cone_table import Floats
 from .flips import Least, gain_of, least_gain
 from .prior import Prior
@@ -144,7 +144,7 @@ def try_shifts(s: State, readings: Any, slot: Any, place: Any, joint: Any) -> No
             place[pairs.cell[cells + k]] = -1
 
 
-@kernel
+@allocating_kernel
 def best_shifts(
     s: State, prior: Prior, least: Least, cells: NDArray[np.int64], joint: Any
 ) -> tuple[NDArray[np.int64], Floats]:

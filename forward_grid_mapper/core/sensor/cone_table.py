@@ -22,7 +22,7 @@ from ..common.errors import InputError
 from ..common.grid import Grid, cone_boxes
 from ..common.parameters import GridParameters, ModelParameters
 from ..common.readings import Readings
-from ..runtime.jit import kernel
+from ..runtime.jit import allocating_kernel, kernel
 from .cone import Cone, make_cone, rows_of, runs_of
 from .density import CUT
 
@@ -136,7 +136,7 @@ def walk(table: Any, t: int, shape: Any, cells: Any, distances: Any) -> int:
     return n
 
 
-@kernel
+@allocating_kernel
 def walk_resized(table: Any, t: int, shape: Any, cells: Any, distances: Any) -> tuple[int, NDArray[np.int32], Floats]:
     """Do as `walk` does; where the arrays are too short, go on with longer ones. Return them after the number."""
     n = walk(table, t, shape, cells, distances)

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from ..common.parameters import ModelParameters
 from ..common.readings import Floats, Readings
-from ..runtime.jit import kernel
+from ..runtime.jit import allocating_kernel, kernel
 
 CUT = 4.0
 """σ beyond which the noise density is taken as nil, so that few cells of a cone need a distance of their own: there it
@@ -62,7 +62,7 @@ def density(error: float, sigma: float) -> float:
     return 1.0 / (_ROOT * sigma) * math.exp(-0.5 * error * error) if abs(error) <= CUT else 0.0
 
 
-@kernel
+@allocating_kernel
 def _densities(error: NDArray[np.float64], sigma: NDArray[np.float64]) -> Any:
     out = np.empty(len(error))
     for t in range(len(error)):

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from ..common.grid import Grid
 from ..common.parameters import ModelParameters
 from ..common.readings import Readings
-from ..runtime.jit import kernel
+from ..runtime.jit import allocating_kernel
 from .cone_table import Cones, Floats, cone_table, walk_resized
 from .density import Causes, causes_of, density
 
@@ -47,7 +47,7 @@ class Expectations:
     log_likelihood: Floats
 
 
-@kernel
+@allocating_kernel
 def _expect(table: Cones, causes: Causes, occupied: Any, resolution: float, out: Any) -> None:
     """Fill `out` (8, N) with the rows of `Expectations`, in its order."""
     height, width = occupied.shape
