@@ -14,6 +14,7 @@ import pytest
 from forward_grid_mapper.core.common.grid import Grid
 from forward_grid_mapper.core.common.parameters import ModelParameters, SearchParameters
 from forward_grid_mapper.core.common.readings import Readings
+from forward_grid_mapper.core.search.search import Search
 
 sys.path.insert(0, str(Path(__file__).parent))
 
@@ -42,6 +43,13 @@ def plain_model(**values: Any) -> ModelParameters:
 
 def plain_search(**values: Any) -> SearchParameters:
     return SearchParameters(**{**PLAIN_SEARCH, **values})
+
+
+class FlipsAlone(Search):
+    """A search that shifts no cell."""
+
+    def _shift(self, watch: object) -> int:
+        return 0
 
 
 SHARED = Path(__file__).resolve().parents[2] / 'shared'
