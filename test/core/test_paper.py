@@ -37,7 +37,7 @@ LINE = Grid(0.1, 0, 0, 12, 1)
 
 AREA = Grid(0.1, 0, 0, 12, 9)
 
-PAPER = plain_model(p_hit=0.6, p_rand=0.1, p_lost=0.0, sigma=0.05)
+PAPER = plain_model(p_hit=0.6, p_rand=0.1, p_lost=0.0, sigma=0.051)
 
 """The same with the tails of the noise."""
 

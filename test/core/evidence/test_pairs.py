@@ -115,4 +115,4 @@ def test_densities_integrate_to_one() -> None:
     evidence = Evidence(grid, plain_model())
     evidence.extend(readings)
     _, _, density, _ = naive.pairs_of(evidence.state, 0)
-    assert math.fsum(density) * grid.resolution == pytest.approx(1.0, abs=1e-5)
+    assert math.fsum(density) * grid.resolution == pytest.approx(math.erf(CUT / math.sqrt(2)), abs=1e-5)

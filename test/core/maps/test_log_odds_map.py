@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import numpy as np
@@ -138,3 +139,24 @@ def test_empty_map() -> None:
     live = LogOddsMap(Parameters())
     live.add(random_readings(np.random.default_rng(0), AREA, 0))
     assert live.probability().shape == (0, 0)
+
+
+@pytest.mark.parametrize('seed', range(20))
+def test_when_the_grid_grew_does_not_matter(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    # a drive away from the origin, so that the grid grows to the left, too
+    count = 300
+    readings = dataclasses.replace(
+        random_readings(rng, Grid(0.1, -300, -300, 600, 600), count, z_max=3.0),
+        half_angle=np.full(count, 0.2),
+        x=np.linspace(0.0, -25.0, count) + rng.uniform(-1, 1, count),
+        y=np.linspace(0.0, 21.0, count) + rng.uniform(-1, 1, count),
+    )
+    whole = LogOddsMap(Parameters())
+    whole.add(readings)
+    cuts = np.sort(rng.choice(count, 12, replace=False))
+    parts = LogOddsMap(Parameters())
+    for which in np.split(np.arange(count), cuts):
+        parts.add(readings.select(which))
+    assert parts.grid == whole.grid
+    np.testing.assert_array_equal(parts.log_odds(), whole.log_odds())

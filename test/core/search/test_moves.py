@@ -218,7 +218,7 @@ def test_the_joint_gain_of_a_reading_is_the_difference_of_two_evaluations(filled
                 for o in neighbours(c):
                     if maps.occupied[o]:
                         continue
-                    k = 3 * (o // GRID.width - c // GRID.width + 1) + o % GRID.width - c % GRID.width + 1
+                    k = next(k for k, other in naive.neighbours_of(c, GRID.shape).items() if other == o)
                     told = (int(single.get(c, 0)) + int(single.get(o, 0)) + int(joint[i, k])) * QUANTUM
                     # both ratios are rounded, which counts for more the more unlikely the shift makes the reading
                     exact = evaluate(c, o) - before

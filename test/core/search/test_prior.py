@@ -52,7 +52,7 @@ def test_patterns_are_the_occupied_neighbours_on_the_grid(occupied: np.ndarray) 
     assert told.tolist() == [naive.pattern_of(occupied, c, occupied.shape) for c in range(occupied.size)]
     for c in range(occupied.size):
         for k, o in naive.neighbours_of(c, occupied.shape).items():
-            assert neighbour(c, k, occupied.shape[1]) == o
+            assert neighbour(c, k, *occupied.shape) == o
 
 
 @settings(deadline=None)

@@ -17,6 +17,7 @@ from forward_grid_mapper.core.common.parameters import GridParameters, ModelPara
 from forward_grid_mapper.core.common.readings import Readings
 from forward_grid_mapper.core.sensor.cone import axis_run, rows_of, runs_of, within
 from forward_grid_mapper.core.sensor.cone_table import (
+    UNIT,
     cone_of,
     cone_table,
     effective_sigma,
@@ -56,7 +57,9 @@ def test_cone_has_the_cells_within_the_angle_and_those_on_the_axis(make: Make, g
         smaller, larger = (naive.cells_of(readings, t, grid, model, slack) for slack in (-1e-9, 1e-9))
         assert set(smaller) <= set(found) <= set(larger)
         for cell, d in found.items():
-            assert d * grid.resolution == pytest.approx(larger[cell] + naive.surface(grid, model), abs=1e-12)
+            assert d * grid.resolution == pytest.approx(
+                larger[cell] + naive.surface(grid, model), abs=UNIT * grid.resolution
+            )
 
 
 @pytest.mark.parametrize('make', SOME)

@@ -61,8 +61,7 @@ def made(readings: Readings, model: ModelParameters = MODEL, **options: object) 
 
 @pytest.mark.parametrize('readings', [along_wall(), random_readings(np.random.default_rng(1), GRID, 100)])
 def test_normals_are_those_of_the_twin(readings: Readings) -> None:
-    # within 4 sigma of the range, and no cell beyond the cut
-    model = dataclasses.replace(MODEL, cut=5.0)
+    model = MODEL
     evidence = made(readings, model)
     sums = sums_of(evidence, (0, len(readings)))
     expected = naive.normals(readings, GRID, model)
