@@ -208,3 +208,14 @@ def test_boxes_hold_their_cones_tightly() -> None:
     py = np.concatenate([y[None], y + reach * np.sin(angles)])
     expected = np.stack([px.min(0), px.max(0), py.min(0), py.max(0)])
     assert np.abs(boxes - expected).max() < 1e-5
+
+
+def test_where_a_sensor_is_in_its_cell_does_not_depend_on_the_corner_of_the_grid() -> None:
+    rng = np.random.default_rng(11)
+    readings = random_readings(rng, Grid(0.1, -40, -40, 80, 80), 500)
+    near = cone_table(readings, Grid(0.1, -45, -45, 90, 90), MODEL)
+    for column, row in ((-3000, 17), (-64, -100_000), (2, 2)):
+        other = cone_table(readings, Grid(0.1, column, row, 10, 10), MODEL)
+        # to the bit, though the number of bits before the point differs
+        assert np.array_equal(other['x'] + column, near['x'] - 45)
+        assert np.array_equal(other['y'] + row, near['y'] - 45)
