@@ -110,7 +110,8 @@ def make(
     """
     reading = cones[t]
     cone = cone_of(reading)
-    n, m = at, 0
+    # with a type of its own from the start, so that what is called is compiled for one type
+    n, m = at, np.int64(0)
     for row in range(*rows_of(cone, lattice.height)):
         runs = runs_of(cone, row, lattice.width)
         v = row + 0.5 - cone.y

@@ -90,22 +90,26 @@ def evaluate(model: Model, reading_state: Any, occupied: Any, pairs: Pairs, at: 
 
 
 @kernel
-def pairs_of(s: State, t: int, new: bool) -> tuple[Pairs, int]:
-    """Return the pairs of reading t and where they begin; they are made in the workspace where they are not stored.
-
-    Those of a `new` reading are made where they will be stored. Logs are not written.
-    """
+def _make_pairs(s: State, t: int) -> None:
+    """Make the pairs of reading t where they are to be stored, or in the workspace; logs are not written."""
     reading_state = s.reading_states[t]
     pairs, at = (s.pairs, reading_state.at) if reading_state.stored else (s.workspace.pairs, 0)
-    if new or not reading_state.stored:
-        reading_state.runs, reading_state.bands = make(s.cones, s.lattice, s.normals, t, pairs, at, s.workspace)
-    return pairs, at
+    reading_state.runs, reading_state.bands = make(s.cones, s.lattice, s.normals, t, pairs, at, s.workspace)
+
+
+@kernel
+def pairs_of(s: State, t: int) -> tuple[Pairs, int]:
+    """Return the pairs of reading t and where they begin; where they are not stored, they are made, without logs."""
+    reading_state = s.reading_states[t]
+    if not reading_state.stored:
+        _make_pairs(s, t)
+    return (s.pairs, reading_state.at) if reading_state.stored else (s.workspace.pairs, 0)
 
 
 @kernel
 def pairs_with_logs(s: State, t: int) -> tuple[Pairs, int]:
     """Do as `pairs_of` does, with the logs of the map as it is."""
-    pairs, at = pairs_of(s, t, False)
+    pairs, at = pairs_of(s, t)
     reading_state = s.reading_states[t]
     if not reading_state.stored:
         evaluate(s.model, reading_state, s.maps.occupied, pairs, at, s.workspace)
@@ -147,8 +151,10 @@ def evaluate_all(s: State, begin: int, end: int, new: bool) -> None:
     for t in range(begin, end):
         if s.stop[0]:
             break
-        pairs, at = pairs_of(s, t, new)
         reading_state = s.reading_states[t]
+        if new and reading_state.stored:
+            _make_pairs(s, t)
+        pairs, at = pairs_of(s, t)
         log = at + WORDS_PER_RUN * reading_state.runs + 2 * reading_state.bands
         pairs.log[log : log + reading_state.bands] = 0
         reading_state.occupy, reading_state.release = 0, 0
@@ -171,8 +177,9 @@ def add_multiplicity(s: State, readings: Any) -> None:
         pairs, at = pairs_with_logs(s, t)
         reading_state = s.reading_states[t]
         reading_state.multiplicity += 1
+        steps = np.int64(reading_state.occupy), np.int64(reading_state.release)
         reading_state.changed = s.clock[0]
-        _add_to_free_zone(reading_state, pairs, at, maps, (reading_state.occupy, reading_state.release))
+        _add_to_free_zone(reading_state, pairs, at, maps, steps)
         begin = at + WORDS_PER_RUN * reading_state.runs
         log = begin + 2 * reading_state.bands
         for k in range(reading_state.bands):
@@ -251,7 +258,7 @@ def flip(s: State, c: int) -> None:
     step = 1 if maps.occupied[c] else -1
     s.clock[0] += 1
     for i in range(n):
-        t = s.observing[i, 0]
+        t = np.int64(s.observing[i, 0])
         # logs that are not stored are those of the map before the flip
         maps.occupied[c] ^= 1
         pairs, at = pairs_with_logs(s, t)

@@ -40,7 +40,7 @@ def extend(s: State, steps: int, barred: Any, out: Any) -> None:
                 straight = straight and o >= 0 and occupied[o] == 1
             # a true end has no neighbour ahead, nor abreast of what is ahead
             for turn in (k, (k + 1) & 7, (k + 7) & 7):
-                o = _ahead(c, turn, height, width, 1)
+                o = neighbour(c, turn, height, width)
                 straight = straight and (o < 0 or occupied[o] == 0)
             if straight:
                 for n in range(1, steps + 1):

@@ -39,7 +39,7 @@ def unsettle(s: State, since: int, settled: Any) -> None:
     for t in range(len(s.reading_states)):
         reading_state = s.reading_states[t]
         if reading_state.changed > since:
-            pairs, at = pairs_of(s, t, False)
+            pairs, at = pairs_of(s, t)
             begin = at + WORDS_PER_RUN * reading_state.runs
             for k in range(at, begin, WORDS_PER_RUN):
                 settled[pairs.cell[k] : pairs.cell[k + 1] + 1] = 0
@@ -132,14 +132,15 @@ def try_shifts(s: State, readings: Any, slot: Any, place: Any, joint: Any) -> No
         for k in range(reading_state.bands):
             place[pairs.cell[cells + k]] = k
         for i in range(n):
-            k = workspace.bucket[i]
-            c = int(pairs.cell[cells + k])
+            k = np.int64(workspace.bucket[i])
+            c = np.int64(pairs.cell[cells + k])
             _add_joint(s, reading_state, pairs, at, (c, k), place, joint[slot[c]])
         if reading_state.blocking:
             for k in range(at, cells, WORDS_PER_RUN):
                 for c in range(pairs.cell[k], pairs.cell[k + 1] + 1):
                     if slot[c] >= 0:
-                        _add_joint(s, reading_state, pairs, at, (c, -1), place, joint[slot[c]])
+                        cell = np.int64(c), np.int64(-1)
+                        _add_joint(s, reading_state, pairs, at, cell, place, joint[slot[c]])
         for k in range(reading_state.bands):
             place[pairs.cell[cells + k]] = -1
 
