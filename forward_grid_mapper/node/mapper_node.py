@@ -412,7 +412,9 @@ class MapperNode(Node):
                 break
             self._told.add(frame)
             why = (
-                'its axis leaves the plane by more than 60°' if frame in self._extrinsics.steep else 'neither is known'
+                'its transform is not normalised, or its axis leaves the plane by more than 60°'
+                if frame in self._extrinsics.unusable
+                else 'neither is known'
             )
             self.get_logger().warning(
                 f'no pose on the robot for sensor {frame}: set sensors.{frame}.pose: [x, y, yaw], or publish the '

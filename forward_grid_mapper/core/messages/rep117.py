@@ -34,7 +34,7 @@ REASONS = {
 
 
 ODOMETRY_REASONS = {
-    'bad_pose': 'the pose is not finite, absurdly far away, or its quaternion is not normalised',
+    'bad_pose': 'the pose is not finite, absurdly far away, steeper than 60 degrees, or its quaternion is not normalised',
     'long_frame_id': 'the frame_id or child_frame_id has more than 255 characters',
     'other_frame': 'the frame_id or child_frame_id is not that of the first odometry message; reset takes the new',
 }
