@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 
 from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.messages.message_types import NANOSECONDS, OdometryMessage, Pose2, RangeMessage
-from forward_grid_mapper.core.messages.pose_association import HISTORY, LATER, MOST_FRAMES, MOST_POINTS, PoseAssociator
+from forward_grid_mapper.core.messages.pose_association import LATER, MOST_FRAMES, PoseAssociator
+from forward_grid_mapper.core.messages.pose_history import HISTORY
 from forward_grid_mapper.core.messages.rep117 import REASONS, measure
 
 INF, NAN = math.inf, math.nan
@@ -250,8 +251,8 @@ def test_odometry_kept_is_bounded_unless_patient() -> None:
     for k in range(50_000):
         p.add_odometry(odometry(0.05 * k))
         q.add_odometry(odometry(0.05 * k))
-    assert len(p._stamps) < 2.2 * HISTORY / (0.05 * NANOSECONDS)
-    assert len(q._stamps) == 50_000
+    assert len(p._history) < 2.2 * HISTORY / (0.05 * NANOSECONDS)
+    assert len(q._history) == 50_000
 
 
 @settings(max_examples=60, deadline=None)
@@ -420,16 +421,6 @@ def test_what_strangers_can_make_grow_is_bounded() -> None:
     assert len(p.rejected_by_frame) <= MOST_FRAMES + 1
     assert len(p.unknown_frames) <= MOST_FRAMES
     assert sum(sum(counts.values()) for counts in p.rejected_by_frame.values()) == sum(p.rejected.values())
-
-
-def test_a_long_path_is_told_by_fewer_points() -> None:
-    p = associator()
-    for k in range(3 * MOST_POINTS):
-        p.extend_path((0.06 * k, 0.0))
-    assert len(p.path) <= MOST_POINTS
-    assert p.path[-1][0] > 0.06 * 3 * MOST_POINTS - 1.0
-    steps = np.diff(np.array(p.path)[:, 0])
-    assert steps.max() < 2.5 * np.median(steps)
 
 
 def test_a_reset_begins_with_the_odometry_that_comes() -> None:
