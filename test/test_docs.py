@@ -60,9 +60,9 @@ def test_words_that_name_nothing_are_still_in_use() -> None:
 PAGE = ROOT / 'docs' / 'planted.md'
 GOOD = """# A page
 
-See `core/search/search.py`: `Search.run`, `LEAST_GAIN`; `p_hit` 0.5, `process_bag --learn`, `~/run_em`, `search.Search`,
-`test_search.py::test_alpha_zero_leaves_the_prior`, `test_docs.py`, `sensor_msgs/Range`, `pose_gap`, `--set`, `maps.npz`
-and [here](#a-page), ![there](door.png).
+See `core/search/search.py`: `Search.run`, `LEAST_GAIN`; `p_hit` 0.5, `process_bag --learn`, `~/run_em`,
+`search.Search`, `test_search.py::test_alpha_zero_leaves_the_prior`, `test_docs.py`,
+`sensor_msgs/Range`, `pose_gap`, `--set`, `maps.npz` and [here](#a-page), ![there](door.png).
 
     python3 -m forward_grid_mapper process_bag MY_BAG -o maps --set p_hit=0.8
     python benchmarks/speed.py --only live
