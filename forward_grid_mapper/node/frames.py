@@ -75,7 +75,7 @@ class Extrinsics:
         self.unusable: set[str] = set()
 
     def __call__(self, base_frame: str, frame: str, stamp: int) -> Pose2 | Later | None:
-        """Return the pose of a sensor at a stamp, `LATER` if TF may still tell it, None if nothing will."""
+        """Return the pose of a sensor at a stamp, `LATER` if TF may still know it, None if nothing will."""
         given = self._given.get(frame.lstrip('/'))
         if given is not None:
             return given

@@ -104,7 +104,7 @@ def test_a_frame_that_is_not_there_is_asked_for_only_now_and_then(
     assert extrinsics('base', 'ghost', 99) == Pose2(1.0, 0.0, 0.0)
 
 
-def test_a_moving_mount_is_taken_at_the_readings_stamp_even_if_tf_is_late(
+def test_a_moving_sensor_is_taken_at_the_readings_stamp_even_if_tf_is_late(
     buffer: Buffer, transforms: Transforms
 ) -> None:
     buffer.known['base', 'servo'] = lambda stamp: transform(0.0, 0.0, yaw=stamp / NANOSECONDS)
