@@ -77,10 +77,10 @@ class PoseAssociator:
         Parameters
         ----------
         extrinsics : callable
-            Tells where a sensor sits on the robot.
+            Answers where a sensor sits on the robot.
         parameters : Parameters, optional
         patient : bool
-            Keep all odometry and let readings wait for it without a bound, as befits a file: then the readings placed
+            Keep all odometry and let readings wait for it without a bound, as befits a file: then the readings accepted
             do not depend on how the two streams interleave.
         clock : callable
             Returns seconds. A reading times out when `pose_timeout` has passed both by the stamps that came after it
@@ -120,7 +120,7 @@ class PoseAssociator:
 
     @property
     def readings(self) -> Readings:
-        """The readings to map from: all that were placed, or `max_readings` of them."""
+        """The readings to map from: all that were accepted, or `max_readings` of them."""
         return self.buffer.bounded()
 
     def add_range(self, message: RangeMessage) -> None:
@@ -145,7 +145,7 @@ class PoseAssociator:
         self._reject(message.frame_id, reason)
 
     def clear(self, parameters: Parameters | None = None) -> None:
-        """Forget readings, counts and path; odometry is kept, so that the next reading can be placed.
+        """Forget readings, counts and path; odometry is kept, so that the next reading gets a pose.
 
         `parameters` are those of the maps that begin now.
         """
@@ -190,7 +190,7 @@ class PoseAssociator:
             self._history.trim()
 
     def finish(self) -> None:
-        """Say that no more messages come: what still waits is placed if it can be, or rejected."""
+        """Say that no more messages come: what still waits gets a pose if there is one, or is rejected."""
         newest = self._history.newest
         if newest is not None:
             self._settle_up_to(newest)
@@ -202,7 +202,7 @@ class PoseAssociator:
         self._held.clear()
 
     def restore(self, readings: Readings) -> None:
-        """Take readings that were placed by an earlier run, as received and accepted."""
+        """Take readings that an earlier run accepted, as received and accepted."""
         if not len(readings):
             return
         self.received += len(readings)
@@ -216,8 +216,8 @@ class PoseAssociator:
     def _reject(self, frame_id: str, reason: str) -> None:
         self.rejected[reason] += 1
         known = self.rejected_by_frame
-        room = len(known) < MOST_FRAMES and len(frame_id) <= LONGEST_NAME
-        frame = frame_id if frame_id in known or room else OTHERS
+        new = len(known) < MOST_FRAMES and len(frame_id) <= LONGEST_NAME
+        frame = frame_id if frame_id in known or new else OTHERS
         self.rejected_by_frame.setdefault(frame, Counter())[reason] += 1
 
     def _reject_unknown(self, measured: Measurement) -> None:

@@ -16,7 +16,7 @@ REASONS = {
     'bad_field_of_view': 'the field of view is not between 0 and 180 degrees; parameter field_of_view overrides it',
     'empty_frame_id': 'the header has no frame_id, so the sensor is unknown',
     'long_frame_id': 'the frame_id has more than 255 characters',
-    'unknown_extrinsics': 'nothing tells where this frame is on the robot: give --sensor, a YAML or a transform',
+    'unknown_extrinsics': 'nothing says where this frame is on the robot: give --sensor, a YAML or a transform',
     'before_odometry': 'the stamp is before the first odometry, or the message came minutes late',
     'after_odometry': 'the recording ended before odometry reached the stamp',
     'no_odometry': 'odometry did not reach the stamp within pose_timeout',
@@ -50,7 +50,7 @@ LONGEST_NAME = 255
 
 
 class Measurement:
-    """A Range that passed REP 117: what it says, before it is placed. Order is that of stamps, then of arrival."""
+    """A Range that passed REP 117: what it says, before it has a pose. Order is that of stamps, then of arrival."""
 
     __slots__ = ('arrival', 'frame_id', 'half_angle', 'newest', 'number', 'sigma', 'stamp', 'z', 'z_max')
 
