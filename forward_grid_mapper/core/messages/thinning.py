@@ -1,11 +1,11 @@
 """Which readings stay when there are more than may be kept: where a sensor looked often, its newest.
 
-Readings of one sensor, from one place and in one direction, are in one *bin*. Every bin keeps its newest `level` readings,
-with one level for all bins, as high as the bound allows; where not all bins can have one more, or one at all, a hash
-decides which do. So a robot that stands still, or drives the same way again and again, gives up what repeats itself, and
-what was seen once stays. The range has no part in it: with bins by range as well, every stray echo has a bin for itself
-and stays while those that agree go: 12 000 of the simulated corridor's 96 000 readings then give a map of F1 .71;
-without it, .81, as good as the .80 of all of them.
+Readings of one sensor, from one place and in one direction, are in one *bin*. Every bin keeps its newest `level`
+readings, with one level for all bins, as high as the bound allows. Where not all bins can have one more, or one at all,
+a hash decides which do. So a robot that stands still, or drives the same way again and again, gives up what repeats
+itself, and what was seen once stays. The range has no part in it: with bins by range as well, every stray echo has a
+bin for itself and stays while those that agree go. 12 000 of the simulated corridor's 96 000 readings then give a map
+of F1 .71; without it, .81, as good as the .80 of all of them.
 
 What is kept depends on the readings alone and not on when it is decided: thinning twice, with more readings in
 between, keeps what thinning once at the end would have. (A reading is dropped only if enough others rank before it;
