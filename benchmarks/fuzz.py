@@ -141,7 +141,7 @@ class Fuzz:
         try:
             maps = Mapper(self.node.parameters).run(self.associator.readings)
         except MapperError as error:
-            # readings were placed when sigma and cut may have been less
+            # readings were accepted when sigma may have been less
             expected = not len(self.associator.readings) or 'more than max_cells' in str(error)
             require(expected, f'EM failed: {error}')
             return
@@ -226,7 +226,7 @@ def over_dds(messages: int, seed: int) -> str:
             rclpy.spin_once(robot, timeout_sec=0.1)
             require(process.poll() is None, 'the node did not start')
         hostile = Hostile(seed)
-        # whatever comes first tells the frames
+        # whatever comes first names the frames
         publishers[Odometry].publish(Hostile(seed, madness=0.0).odometry())
         time.sleep(0.1)
         for k in range(messages):

@@ -47,7 +47,7 @@ def _make_all(s: State) -> None:
 
 
 @loop
-def _explain_all(s: State) -> None:
+def _evaluate_all(s: State) -> None:
     for t in range(len(s.reading_states)):
         evaluate(s.model, s.reading_states[t], s.maps.occupied, s.pairs, s.reading_states[t].at, s.workspace)
 
@@ -69,7 +69,7 @@ def _push_free_zones(s: State, by: int) -> None:
 
 
 @loop
-def _seers(s: State, cells: Any) -> int:
+def _observing(s: State, cells: Any) -> int:
     n = 0
     for c in cells:
         n += find_observing(s, c)
@@ -109,16 +109,16 @@ class Steps(Search):
         return done
 
     def _round(self, watch: Any) -> Any:
-        return self._timed('rounds', super()._round, watch)
+        return self._timed('parallel', super()._round, watch)
 
     def _sweep(self, watch: Any) -> Any:
-        return self._timed('sweeps', super()._sweep, watch)
+        return self._timed('sequential', super()._sweep, watch)
 
     def _shift(self, watch: Any) -> Any:
         return self._timed('shifts', super()._shift, watch)
 
     def _close_gaps(self, watch: Any) -> Any:
-        return self._timed('bridges', super()._close_gaps, watch)
+        return self._timed('gap closing', super()._close_gaps, watch)
 
 
 def profile(name: str, readings: Readings, runs: int) -> None:
@@ -145,34 +145,38 @@ def profile(name: str, readings: Readings, runs: int) -> None:
         f'evidence built in {built:.3f} s, search in {searched:.3f} s:'
     )
     for step, (seconds, count, made) in search.steps.items():
-        reading_state = seconds / searched
-        print(f'  {step:10s}{seconds:9.3f} s {reading_state:6.0%}{count:6.0f} times{made:9.0f} flips or moves')
+        fraction = seconds / searched
+        print(f'  {step:12s}{seconds:9.3f} s {fraction:6.0%}{count:6.0f} times{made:9.0f} flips or moves')
     cells = np.flatnonzero(s.maps.occupied == 1)
     cells = np.random.default_rng(0).permutation(cells)[:SAMPLE]
-    observing = _seers(s, cells)
+    observing = _observing(s, cells)
     sizes = s.reading_states['bands'].astype(np.int64)
     for k in range(len(sizes)):
         words = s.pairs.cell[s.reading_states['at'][k] :][: 2 * s.reading_states['runs'][k]].astype(np.int64)
         sizes[k] += int((words[1::2] - words[::2] + 1).sum())
     touched = _touched(s, cells, sizes)
     scanned = _scanned(s, cells)
-    room, gains = np.empty(grid.size, np.int64), np.empty(grid.size)
+    found, gains = np.empty(grid.size, np.int64), np.empty(grid.size)
     window = (0, grid.height, 0, grid.width)
     prior = Prior(local_prior(p.search, np.zeros(grid.size, np.bool_)), shapes(p.search))
     n = len(readings)
     kernels: tuple[tuple[str, Callable[[], Any], tuple[tuple[int, str], ...]], ...] = (
         ('make pairs', lambda: _make_all(s), ((n, 'reading'), (pairs, 'pair'))),
-        ('evaluate', lambda: _explain_all(s), ((n, 'reading'), (bands, 'band pair'))),
+        ('evaluate', lambda: _evaluate_all(s), ((n, 'reading'), (bands, 'band pair'))),
         ('push to bands', lambda: _push_bands(s, 0), ((bands, 'band pair'),)),
         ('push to free zones', lambda: _push_free_zones(s, 0), ((free, 'free pair'),)),
         ('all readings anew', evidence.rebuild, ((n, 'reading'), (pairs, 'pair'))),
         (
             'find observing',
-            lambda: _seers(s, cells),
-            ((len(cells), 'cell'), (scanned, 'candidate'), (observing, 'seer')),
+            lambda: _observing(s, cells),
+            ((len(cells), 'cell'), (scanned, 'candidate'), (observing, 'reading that sees it')),
         ),
-        ('flip', lambda: _flip_all(s, cells), ((len(cells), 'flip'), (observing, 'seer'), (touched, 'pair touched'))),
-        ('look for gains', lambda: promising(s, prior, LEAST, window, room, gains), ((grid.size, 'cell'),)),
+        (
+            'flip',
+            lambda: _flip_all(s, cells),
+            ((len(cells), 'flip'), (observing, 'reading that sees it'), (touched, 'pair touched')),
+        ),
+        ('look for gains', lambda: promising(s, prior, LEAST, window, found, gains), ((grid.size, 'cell'),)),
     )
     print(
         f'  a flip has {scanned / len(cells):.0f} candidates, {observing / len(cells):.0f} readings that see the cell'

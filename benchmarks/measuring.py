@@ -1,4 +1,4 @@
-"""What the benchmarks share: the machine, processes of their own, memory, medians, and memory read in one stream."""
+"""What all benchmarks need: the machine, processes of their own, memory, medians, and memory read in one stream."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ PLAIN: dict[str, float] = {
 """Parameters with which the search maximises nothing but log p(Z | m) + logit(prior) x (occupied cells)."""
 
 LITTLE = 0.1
-"""Share of the machine that other processes may use during a run."""
+"""Fraction of the machine that other processes may use during a run."""
 
 PATIENCE = 'BENCHMARK_PATIENCE'
 """Name of the environment variable that says how many seconds to wait for such runs, for processes of their own too."""
@@ -80,7 +80,7 @@ class Others:
 
     @property
     def share(self) -> float:
-        """Share of all cores."""
+        """Fraction of all cores."""
         busy = self._busy() - self._all - (time.process_time() - self._own)
         return max(busy / (time.perf_counter() - self._begin) / (os.cpu_count() or 1), 0.0)
 

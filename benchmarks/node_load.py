@@ -4,7 +4,7 @@
 usage: node_load.py [--rates 480 1000 2000 ...] [--seconds 10] [--best-effort] [--em]
 
 Starts the node in a process of its own, publishes Range from 24 sonars at each rate, with odometry at 50 Hz, and
-reads the node's own account from /diagnostics. `lost` counts readings that never arrived, `cpu` is the node's share
+reads the node's own account from /diagnostics. `lost` counts readings that never arrived, `cpu` is the node's part
 of one core, `delay` the longest time from publishing a reading to taking it. With --em, EM runs all the while, again
 and again over everything that was sent so far. Needs rclpy.
 """

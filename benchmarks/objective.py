@@ -3,8 +3,8 @@
 
 usage: objective.py [--against DIR] [--seeds 3] [--data ../shared/data]
 
-The paper's two worlds, the building, and the real recordings below --data where it is there; each with a prior and a
-chance of lost echoes, and with the paper's plain maximum likelihood, in both cases without what the defaults add to the
+The paper's two worlds, the building, and the real recordings below --data where it is there; each with a prior and
+lost echoes, and with the paper's plain maximum likelihood, in both cases without what the defaults add to the
 paper's model, or the objectives would not be the same. For each map: J(m) = log p(Z | m) + logit(prior) x (occupied
 cells) in nats, from the exact forward model of this checkout; F1 in the simulated worlds, with one cell of tolerance.
 """

@@ -71,7 +71,7 @@ def feed(online: OnlineMap, readings: Readings) -> NDArray[np.float64]:
 
 def spread(milliseconds: NDArray[np.float64]) -> str:
     """Return median, 95th and 99th percentile and maximum."""
-    return ''.join(f'{np.percentile(milliseconds, share):8.2f}' for share in (50, 95, 99, 100))
+    return ''.join(f'{np.percentile(milliseconds, part):8.2f}' for part in (50, 95, 99, 100))
 
 
 def corridor(passes: int) -> Readings:

@@ -3,7 +3,7 @@
 
 usage: optimum.py [--cases 200] [--readings 12]
 
-Random readings on 4 x 3 and 4 x 4 cells. Prints the share of cases in which the search reached the true optimum, and
+Random readings on 4 x 3 and 4 x 4 cells. Prints the fraction of cases in which the search reached the true optimum, and
 how far below it ended in the others, in nats.
 """
 

@@ -69,11 +69,11 @@ PLAIN: dict[str, Any] = {
 
 ABLATIONS: dict[str, dict[str, Any]] = {
     'surfaces before the centre': {'surface_offset': 0.0},
-    'grazing readings': {'grazing_angle': 1.5708},
+    'surface normals': {'grazing_angle': 1.5708},
     'traversed cells': {'driven_cost': 0.0},
     'prior for walls': NO_SHAPES,
-    'bridges': {'bridges': 0},
-    'extension': {'extend': 0},
+    'gap closing': {'bridges': 0},
+    'wall extension': {'extend': 0},
     'unknown': {'least_passed': 0.0},
     'lost echoes': {'p_lost': 0.0},
     'neighbours (uncertainty)': {'neighbour_weight': 0.0, 'alpha': 0.8, 'uncertainty_prior': 0.3},
@@ -104,7 +104,7 @@ COLUMNS = (
 )
 
 LEGEND = f"""\
-door: least width left open, m; shut: doors that are less than half open, of all; cover: share of the columns of rough
+door: least width left open, m; shut: doors that are less than half open, of all; cover: columns of rough
 walls with an occupied cell at most one cell across; gap: longest run without, cells; cov {OFTEN}, gap {OFTEN}: the
 same over wall cells met by at least {OFTEN} readings; smooth: recall of smooth walls; dots: occupied cells in free
 space; nav_iou, leak, blocked: of ../shared/tools/score_map.py; loss: log loss of the uncertainty map, nats a cell.
@@ -203,7 +203,7 @@ def print_ablations(groups: dict[str, list[Case]], base: dict[str, Any], whole: 
 
 
 def with_true_rest(case: Case, model: dict[str, Any], known: Any) -> float:
-    """Return the log loss at the cells `known` of eq 43 given all other cells of the true map, at its best prior."""
+    """Return the log loss at the cells `known` of (43) given all other cells of the true map, at its best prior."""
     assert case.world is not None
     p = Parameters.from_flat({**model, 'grazing_angle': math.pi / 2})
     grid = grid_of(case.readings, p.model, p.grid)
@@ -220,7 +220,7 @@ def print_drawn(base: dict[str, Any], quick: bool) -> None:
     """Print log losses on readings drawn from the forward model, with the default's and with the true parameters."""
     print('\nReadings drawn from the forward model on the true map: log loss, nats a cell')
     print(f'{"drawn with":38s}{"world":16s}{"constant":>9s}{"standard":>9s}{"default":>9s}', end='')
-    print(f'{"told":>8s}{"mapped":>8s}{"rest":>7s}')
+    print(f'{"true":>8s}{"mapped":>8s}{"rest":>7s}')
     for title, model in DRAWN.items():
         for case in drawn_cases(model, quick):
             losses = []
@@ -235,9 +235,11 @@ def print_drawn(base: dict[str, Any], quick: bool) -> None:
             print(f'{title:38s}{case.group:16s}{said.base:9.3f}{standard:9.3f}{losses[0]:9.3f}', end='')
             rest = with_true_rest(case, {**base, **model}, known_cells(uncertainty, case))
             print(f'{losses[1]:8.3f}{mapped.loss:8.3f}{rest:7.3f}')
-    print('constant: the share of occupied cells everywhere; standard: the standard map at its best gains and scale;')
-    print('told: the default but with the parameters of the sensor model that the readings were drawn with;')
-    print('mapped: the default, over cells that its ML map knows as free or occupied; rest: eq 43 with these')
+    print(
+        'constant: the fraction of occupied cells everywhere; standard: the standard map at its best gains and scale;'
+    )
+    print('true: the default but with the parameters of the sensor model that the readings were drawn with;')
+    print('mapped: the default, over cells that its ML map knows as free or occupied; rest: (43) with these')
     print('parameters, the best prior, and every cell but the one asked for taken from the true map')
 
 
@@ -254,7 +256,9 @@ def print_cost(base: dict[str, Any], paper: dict[str, Any], runs: int) -> None:
         for name, flat in variants.items():
             spent = Mapper(Parameters.from_flat(flat)).run(readings).statistics['seconds']
             seconds[name].append(sum(spent[stage] for stage in ('index', 'search', 'uncertainty')))
-    print(f'\nSeconds for the corridor, {len(readings)} readings: index, search and finishing; medians of {runs} runs')
+    print(
+        f'\nSeconds for the corridor, {len(readings)} readings: index, search and uncertainty; medians of {runs} runs'
+    )
     ours = statistics.median(seconds['default'])
     for name, spent in seconds.items():
         middle = statistics.median(spent)

@@ -218,8 +218,8 @@ def drawn(group: str, recording: Recording, model: dict[str, float], seed: int =
             z[t] = rng.random() * z_max
             continue
         found = np.flatnonzero(rng.random(len(hits)) < p.model.p_hit)
-        heard = len(found) > 0 and cause >= p.model.p_rand + p.model.p_lost
-        z[t] = min(max(hits[found[0]] + p.model.sigma * rng.standard_normal(), 0.02), z_max) if heard else z_max
+        echo = len(found) > 0 and cause >= p.model.p_rand + p.model.p_lost
+        z[t] = min(max(hits[found[0]] + p.model.sigma * rng.standard_normal(), 0.02), z_max) if echo else z_max
     return simulated(group, recording.world, dataclasses.replace(old, z=z), recording.robot[:, :2])
 
 
@@ -253,10 +253,10 @@ def recorded_cases(tool: ModuleType) -> Iterator[Case]:
         if not folder.is_dir():
             print(f'no recording {name}: {folder} is absent', file=sys.stderr)
             continue
-        placed = read_drive(folder / 'bag', Parameters(), {}, odom_topic=ODOMETRY)
+        drive = read_drive(folder / 'bag', Parameters(), {}, odom_topic=ODOMETRY)
         truth, origin, resolution = tool.load(folder / 'reference.yaml')
         decided = np.where(truth > 0.65, 1.0, np.where(truth < 0.35, 0.0, np.nan))
         path_xy = np.loadtxt(folder / 'trajectory.csv', delimiter=',', ndmin=2)
         nobody = np.zeros((0, 0), np.int64)
         corner = (float(origin[0]), float(origin[1]))
-        yield Case(name, placed.associator.readings, path_xy, decided, corner, resolution, None, nobody)
+        yield Case(name, drive.associator.readings, path_xy, decided, corner, resolution, None, nobody)

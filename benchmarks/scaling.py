@@ -4,7 +4,7 @@
 usage: scaling.py [--runs 5] [--patience 0] [--most 1e8] [--plot scaling.png]
 
 Two ways to more pairs: more readings on the same cells, and finer cells for the same readings. Prints medians of the
-time from placed readings to ML map and uncertainty map, and the peak memory of a process of its own for each.
+time from readings in the map frame to ML map and uncertainty map, and the peak memory of a process of its own for each.
 """
 
 from __future__ import annotations

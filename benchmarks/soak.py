@@ -3,10 +3,10 @@
 
 usage: soak.py [--readings 1000000] [--max-readings 200000] [--journal]
 
-A robot with 24 sonars goes to and fro in the simulated corridor, each round with noise of its own: 24 000 readings in
+A robot with 24 sonars goes to and fro in the simulated corridor, each tour with noise of its own: 24 000 readings in
 four minutes. Its messages go through the callbacks of the node, in this process, as fast as they are taken; after every
 simulated second the node's timers get their turn. At the end EM runs, and the maps are scored against the world beside
-those of the first round alone. Needs rclpy.
+those of the first tour alone. Needs rclpy.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from forward_grid_mapper.node.mapper_node import MapperNode
 from forward_grid_mapper.simulation.drive import corridor_drive
 from forward_grid_mapper.simulation.score import score_map, threshold, visible_surface
 
-ROUND = 24_000
+TOUR = 24_000
 TICK = NANOSECONDS
 """Simulated time between two turns of the timers."""
 
@@ -68,10 +68,10 @@ def ros(message: RangeMessage | OdometryMessage) -> Range | Odometry:
     return made
 
 
-def messages(rounds: int) -> Iterator[RangeMessage | OdometryMessage]:
-    """Yield the messages of so many rounds by stamp, one round after the other."""
+def messages(tours: int) -> Iterator[RangeMessage | OdometryMessage]:
+    """Yield the messages of so many tours by stamp, one tour after the other."""
     shift = 0
-    for seed in range(rounds):
+    for seed in range(tours):
         drive = corridor_drive(seed, passes=2)
         last = 0
         for message in heapq.merge(drive.odometry, drive.ranges, key=lambda m: m.stamp):
@@ -143,8 +143,8 @@ def main() -> None:
         begin = time.monotonic()
         print('  readings     held   hours    RSS MB    us/msg  worst ms update ms  timers ms', flush=True)
         start = due = shown = 0
-        rounds = -(-options.readings // ROUND)
-        for message in messages(rounds):
+        tours = -(-options.readings // TOUR)
+        for message in messages(tours):
             start = start or message.stamp
             soak.take(ros(message))
             if message.stamp >= due:
@@ -166,14 +166,14 @@ def main() -> None:
         first = corridor_drive(0, passes=2)
         visible = visible_surface(first.world, first.readings.select(slice(None, None, 20)))
         live = soak.node._live
-        for name, readings in (('first round', first.readings), ('all of it', associator.readings)):
+        for name, readings in (('first tour', first.readings), ('all of it', associator.readings)):
             maps = Mapper(soak.node.parameters).run(readings)
             scores = score_map(maps.ml, maps.grid, first.world, visible)
-            told = f'ML F1 {scores.f1:.3f}, {scores.doors_open} of 6 doors, {scores.false_dots} false dots'
+            summary = f'ML F1 {scores.f1:.3f}, {scores.doors_open} of 6 doors, {scores.false_dots} false dots'
             if name == 'all of it':
                 scores = score_map(threshold(live.probability()), live.grid, first.world, visible)
-                told += f'; live map F1 {scores.f1:.3f}'
-            print(f'{name}: {len(maps.readings)} readings, {told}, {sum(maps.statistics["seconds"].values()):.1f} s')
+                summary += f'; live map F1 {scores.f1:.3f}'
+            print(f'{name}: {len(maps.readings)} readings, {summary}, {sum(maps.statistics["seconds"].values()):.1f} s')
         soak.node.destroy_node()
     rclpy.shutdown()
 

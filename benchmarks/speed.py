@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Time and memory from placed readings to ML map and uncertainty map, warm, with ratios measured in the same run.
+"""Time and memory from readings to ML map and uncertainty map, warm, with ratios measured in the same run.
 
 usage: speed.py [--runs 5] [--patience 0] [--only jobs threads memory live table2]
 
@@ -82,7 +82,7 @@ def measure_job(readings: Readings, resolution: float, runs: int) -> dict[str, f
 
 def jobs(runs: int) -> None:
     """Print the table of jobs."""
-    print('\nFrom placed readings to ML map and uncertainty map; seconds')
+    print('\nFrom readings to ML map and uncertainty map; seconds')
     print(
         f'{"":22s}{"readings":>9s}{"cells":>9s}{"pairs":>12s}{"index":>8s}{"search":>8s}{"uncert.":>8s}'
         f'{"total":>8s}{"target":>8s}{"live map":>10s}{"EM / live":>11s}{"others":>8s}'
@@ -100,7 +100,7 @@ def jobs(runs: int) -> None:
         )
     print(
         '\nMemory in bytes a pair: pairs alone, with what is kept for readings and cells, and growth of the process.\n'
-        'Time in ns a pair: one stream through the same bytes on one core, all readings explained once, all of EM.'
+        'Time in ns a pair: one stream through the same bytes on one core, all readings evaluated once, all of EM.'
     )
     print(
         f'{"":22s}{"pairs":>8s}{"kept":>8s}{"peak":>8s}{"peak MB":>9s}{"stream":>9s}{"once":>8s}{"EM":>8s}'

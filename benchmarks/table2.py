@@ -2,9 +2,9 @@
 
 For every cell, for every reading whose cone contains it: cast the reading anew, collect the occupied cells of its cone,
 and compute its likelihood with the cell occupied and with the cell free. The cell takes the more likely value. Sweeps
-over all cells go on until none flips. Model, cones and prior are those of the package, and what the printed text gets
-wrong is mended as `docs/paper.md` says, or there would be no map to compare. The list of readings of each cell is made
-beforehand, and its making is not counted.
+over all cells go on until none flips. Model, cones and prior are those of the package. Where the printed text is
+wrong it is corrected as `docs/paper.md` says, or there would be no map to compare. The list of
+readings of each cell is made beforehand, and its making is not counted.
 """
 
 from __future__ import annotations

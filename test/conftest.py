@@ -1,4 +1,4 @@
-"""What the tests share."""
+"""What all tests need."""
 
 from __future__ import annotations
 

@@ -19,7 +19,7 @@ class Decoder:
     """Decodes the messages of one type and definition.
 
     Where the bag holds no definition, those of Jazzy and Humble are tried: `sensor_msgs/Range` gained `variance` in
-    between, and the length of a message tells which of the two it is.
+    between, and the length of a message shows which of the two it is.
     """
 
     def __init__(self, msgtype: str, encoding: str, definition_format: str, definition: str) -> None:
@@ -54,7 +54,7 @@ def _cached(msgtype: str, encoding: str, definition_format: str, definition: str
 
 
 def decoder_of(channel: Channel) -> Decoder:
-    """Return the decoder for a channel's messages; channels of one type share it."""
+    """Return the decoder for a channel's messages; the same for channels of one type."""
     return _cached(channel.msgtype, channel.encoding, channel.definition_format, channel.definition)
 
 

@@ -33,7 +33,7 @@ class _Metadata(NamedTuple):
 
 
 def repair_hint(path: Path) -> str:
-    """Return how to mend a damaged bag."""
+    """Return how to repair a damaged bag."""
     if path.is_dir():
         return f'repair it with `ros2 bag reindex {path.name}`'
     try:
@@ -119,7 +119,7 @@ def _open_each(files: list[Path]) -> tuple[list[Source], list[str]]:
 def _open_single(file: Path) -> Source:
     metadata = _read_metadata(file.parent)
     if metadata and metadata.compressed and file.name in metadata.files:
-        # Only the folder's metadata tell how its files, or the messages in them, are compressed.
+        # Only the folder's metadata say how its files, or the messages in them, are compressed.
         if len(metadata.files) == 1:
             return _open_compressed(file.parent)
         raise BagError(f'{file} is one of several compressed files; open the whole folder {file.parent}.')

@@ -35,16 +35,16 @@ class McapScan(Scan):
             opcode, length = struct.unpack('<BQ', file.read(9))
             if opcode in (_DATA_END, _FOOTER):
                 return
-            room = end - file.tell()
+            left = end - file.tell()
             if not _HEADER <= opcode <= _LAST_OPCODE and opcode < 0x80:
                 return self._note(f'no record begins at byte {file.tell() - 9}')
-            if length > room and opcode != _CHUNK:
+            if length > left and opcode != _CHUNK:
                 return self._note('the file is cut off')
             if opcode in (_SCHEMA, _CHANNEL, _MESSAGE, _CHUNK):
-                content = file.read(min(length, room))
+                content = file.read(min(length, left))
                 try:
                     if opcode == _CHUNK and not in_chunk:
-                        yield from self._chunk(content, whole=length <= room)
+                        yield from self._chunk(content, whole=length <= left)
                     elif opcode == _MESSAGE:
                         key, _, time, _ = struct.unpack_from('<HIQQ', content)
                         yield key, time, content[22:]

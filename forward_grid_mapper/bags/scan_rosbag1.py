@@ -74,8 +74,8 @@ def _block(file: BinaryIO, end: int) -> tuple[bytes, bool]:
     if len(prefix) < 4:
         return b'', False
     (length,) = struct.unpack('<I', prefix)
-    room = end - file.tell()
-    return file.read(min(length, room)), length <= room
+    left = end - file.tell()
+    return file.read(min(length, left)), length <= left
 
 
 def _fields(head: bytes) -> dict[str, bytes]:

@@ -108,7 +108,7 @@ class RosbagsSource:
         assert self._scan is not None
         try:
             scan = self._scan()
-        except Exception:  # the damage is known already; the scanner could not get round it
+        except Exception:  # the damage is known already; the scanner could not get past it
             return
         try:
             for raw in scan.messages(keys):

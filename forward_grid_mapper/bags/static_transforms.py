@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from ..core.common.errors import InputError
 from ..core.messages.message_types import Pose2
+from ..core.messages.quaternions import STEEPEST, elevation_of, heading_of, rotation_of
 
-_STEEPEST = math.radians(60.0)
 Transform = NDArray[np.float64]  # homogeneous, shape (4, 4)
 
 
@@ -47,15 +47,16 @@ class StaticTransforms:
         parent, child = _plain(parent), _plain(child)
         what = f'The static transform from {parent!r} to {child!r}'
         x, y, z, w = (float(v) for v in quaternion_xyzw)
-        norm = math.sqrt(x * x + y * y + z * z + w * w)
-        if not abs(norm - 1.0) < 0.01:
-            raise InputError(f'{what} has a quaternion of length {norm:.3g} instead of 1; mend its publisher.')
+        rotation = rotation_of(x, y, z, w)
+        if rotation is None:
+            length = math.sqrt(x * x + y * y + z * z + w * w)
+            raise InputError(f'{what} has a quaternion of length {length:.4g} instead of 1; fix its publisher.')
         if not all(math.isfinite(v) for v in translation_xyz):
-            raise InputError(f'{what} has a translation that is not finite; mend its publisher.')
+            raise InputError(f'{what} has a translation that is not finite; fix its publisher.')
         if parent == child or not child:
-            raise InputError(f'{what} does not join two frames; mend its publisher.')
+            raise InputError(f'{what} does not join two frames; fix its publisher.')
         transform = np.eye(4)
-        transform[:3, :3] = _rotation(x / norm, y / norm, z / norm, w / norm)
+        transform[:3, :3] = rotation
         transform[:3, 3] = translation_xyz
         self._parents[child] = parent, transform
         self.rejected.pop(child, None)
@@ -82,13 +83,15 @@ class StaticTransforms:
                     raise InputError(self.rejected[frame])
             return None
         pose = np.linalg.inv(to_base[common]) @ to_sensor[common]
-        forward = pose[:3, 0]
-        if math.asin(min(1.0, abs(forward[2]))) > _STEEPEST:
+        forward = [float(v) for v in pose[:3, 0]]
+        yaw = heading_of(*forward)
+        if yaw is None:
+            side = 'up' if elevation_of(*forward) > 0 else 'down'
             raise InputError(
-                f'Sensor {sensor_frame!r} looks {"up" if forward[2] > 0 else "down"}, more than 60° out of the plane '
-                f'of {base_frame!r}; leave its topic out or mend its transform (the beam goes along x).'
+                f'Sensor {sensor_frame!r} looks {side}, more than {math.degrees(STEEPEST):.0f}° out of the plane of '
+                f'{base_frame!r}; leave its topic out or fix its transform (the beam goes along x).'
             )
-        return Pose2(float(pose[0, 3]), float(pose[1, 3]), math.atan2(forward[1], forward[0]))
+        return Pose2(float(pose[0, 3]), float(pose[1, 3]), yaw)
 
     def _ancestors(self, frame: str) -> dict[str, Transform]:
         """Return the frame itself and all above it, nearest first, with the pose of `frame` in each."""
@@ -105,14 +108,3 @@ class StaticTransforms:
 
 def _plain(frame: str) -> str:
     return frame.lstrip('/')
-
-
-def _rotation(x: float, y: float, z: float, w: float) -> NDArray[np.float64]:
-    """Return the rotation matrix of a normalised quaternion."""
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ]
-    )

@@ -145,9 +145,9 @@ class BagWriter:
         topic = '/tf_static'
         items = []
         for parent, child, pose in transforms:
-            placed = self._pose(pose)
+            posed = self._pose(pose)
             offset = self._make('geometry_msgs/msg/Vector3', x=pose.x, y=pose.y, z=0.0)
-            transform = self._make('geometry_msgs/msg/Transform', translation=offset, rotation=placed.orientation)
+            transform = self._make('geometry_msgs/msg/Transform', translation=offset, rotation=posed.orientation)
             header = self._header(topic, stamp, parent)
             kind = 'geometry_msgs/msg/TransformStamped'
             items.append(self._make(kind, header=header, child_frame_id=child, transform=transform))

@@ -1,4 +1,4 @@
-"""What the command lines share: errors without tracebacks, and progress once work takes longer than a second."""
+"""What all command lines need: errors without tracebacks, and progress once work takes longer than a second."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ PATIENCE = 1.0
 def run(
     parser: argparse.ArgumentParser, body: Callable[[argparse.Namespace], int], arguments: Sequence[str] | None
 ) -> int:
-    """Run a command's body with its options; return its exit code, with errors told in one line."""
+    """Run a command's body with its options; return its exit code, with errors reported in one line."""
     if isinstance(sys.stdout, io.TextIOWrapper):
         # a path may hold what the terminal cannot show
         sys.stdout.reconfigure(errors='backslashreplace')
@@ -30,7 +30,7 @@ def run(
         try:
             return body(parser.parse_args(arguments))
         finally:
-            # here an error can still be told
+            # here an error can still be reported
             sys.stdout.flush()
     except MapperError as error:
         problem = str(error)
@@ -51,7 +51,7 @@ def run(
 
 
 def _still_printing() -> bool:
-    """Return whether stdout takes text; if not, let go of it, lest Python tries again on its way out."""
+    """Return whether stdout takes text; if not, let go of it, so that Python does not try again on its way out."""
     try:
         sys.stdout.flush()
     except OSError:

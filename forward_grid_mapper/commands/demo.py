@@ -72,11 +72,11 @@ def through_node(folder: Path, bag: Path, recording: Recording, options: argpars
         ticker.say(f'replaying the bag to the node, {options.rate:g} times as fast as it was recorded')
         node.run('replay_bag', str(bag), '--rate', str(options.rate), '--quiet')
         ticker.say('running EM')
-        told = node.call('run_em')
+        answer = node.call('run_em')
         ticker.say('saving the maps')
         saved = Path(node.call('save_maps').split(', ')[0]).parent
     saved.rename(folder / 'maps')
-    return told
+    return answer
 
 
 def offline(folder: Path, bag: Path, output: Path, options: argparse.Namespace, ticker: Ticker) -> str:
@@ -110,9 +110,9 @@ def demo(options: argparse.Namespace) -> int:
         recording = record(options.world, options.seen, 1, False, options.seed, SONARS['ring']())
         bag = write_recording(folder, recording)
         if options.offline:
-            told = offline(folder, bag, output, options, ticker)
+            summary = offline(folder, bag, output, options, ticker)
         else:
-            told = through_node(folder, bag, recording, options, ticker)
+            summary = through_node(folder, bag, recording, options, ticker)
         ticker.say('scoring')
         maps = read_npz(folder / 'maps' / 'maps.npz')
         table = score_table(score_all(maps, recording))
@@ -127,7 +127,7 @@ def demo(options: argparse.Namespace) -> int:
         write_figure(folder / 'demo.png', f'The {options.world} world, simulated', rows, (left, right, bottom, top))
         with output_errors(folder):
             (folder / 'scores.txt').write_text(table + '\n', encoding='utf-8')
-    print(f'EM {"offline" if options.offline else "in the node"}: {told}\n\n{table}\n')
+    print(f'EM {"offline" if options.offline else "in the node"}: {summary}\n\n{table}\n')
     print(f'the picture is {output / "demo.png"}; the maps as for Nav2 and their report are in {output / "maps"}')
     return 0
 

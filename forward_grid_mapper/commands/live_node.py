@@ -35,7 +35,7 @@ class LiveNode:
         lines = [dump_parameters(parameters), '\n    # ---- Poses of the sensors on the robot\n\n']
         lines += [f'    sensors.{frame}.pose: [{p.x!r}, {p.y!r}, {p.yaw!r}]\n' for frame, p in extrinsics]
         (folder / 'parameters.yaml').write_text(''.join(lines), encoding='utf-8')
-        # neither other robots nor another demo shall hear this one
+        # neither other robots nor another demo may receive this one's messages
         domain = str(1 + os.getpid() % 100)
         self.environment = {**os.environ, 'ROS_DOMAIN_ID': domain, 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST'}
         self._client: Any = None
@@ -90,7 +90,7 @@ class LiveNode:
         finally:
             process.terminate()
         if code != 0:
-            raise MapperError(f'{arguments[0]} failed; {self._told()}')
+            raise MapperError(f'{arguments[0]} failed; {self._last_words()}')
 
     def call(self, service: str) -> str:
         """Call a service of type Trigger; return its message.
@@ -115,15 +115,15 @@ class LiveNode:
             rclpy.spin_once(self._client, timeout_sec=0.1)
         answer = future.result()
         if not answer.success:
-            raise MapperError(f'{service}: {answer.message}; {self._told()}')
+            raise MapperError(f'{service}: {answer.message}; {self._last_words()}')
         return str(answer.message)
 
     def _check(self, end: float) -> None:
         if self._process is None or self._process.poll() is not None:
-            raise MapperError(f'the node ended; {self._told()}')
+            raise MapperError(f'the node ended; {self._last_words()}')
         if not time.monotonic() < end < math.inf:
-            raise MapperError(f'the node does not answer; {self._told()}')
+            raise MapperError(f'the node does not answer; {self._last_words()}')
 
-    def _told(self) -> str:
+    def _last_words(self) -> str:
         lines = self._log.read_text(errors='replace').splitlines() if self._log.exists() else []
         return 'its last words: ' + ' | '.join(lines[-3:]) if lines else 'it said nothing'

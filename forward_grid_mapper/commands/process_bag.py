@@ -93,7 +93,7 @@ def _learned(maps: MapSet) -> str:
     return (
         f'learned p_hit {m.p_hit:.3f}, p_rand {m.p_rand:.3f}, p_lost {m.p_lost:.3f}, sigma {m.sigma:.3f} m together '
         f'with the map: p_hit is biased upward this way, and smooth walls may be lost; compare with a run '
-        f'without --learn; the command learn tells how sure they are, and stops before walls are lost'
+        f'without --learn; the command learn says how sure they are, and stops before walls are lost'
     )
 
 

@@ -58,7 +58,7 @@ def parser() -> argparse.ArgumentParser:
         help='how long to wait for subscribers of every topic before giving up (default 30); 0 begins at once',
     )
     quality = made.add_mutually_exclusive_group()
-    quality.add_argument('--reliable', action='store_true', default=True, help='every subscriber can hear (default)')
+    quality.add_argument('--reliable', action='store_true', default=True, help='for every kind of subscriber (default)')
     quality.add_argument('--best-effort', dest='reliable', action='store_false', help='as sensor drivers publish')
     made.add_argument('-q', '--quiet', action='store_true', help='print nothing but errors')
     return made
@@ -114,7 +114,7 @@ def _static(messages: Mapping[str, Iterable[Any]], quiet: bool) -> dict[str, lis
 
 
 def _warn(bag: Bag, player: Player) -> None:
-    """Tell what of the bag was not played as it is."""
+    """Report what of the bag was not played as it is."""
     if bag.truncated:
         _print_warning(bag.truncated)
     for topic, count in (player.unusable + Counter(bag.undecodable)).items():

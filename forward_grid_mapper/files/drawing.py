@@ -113,7 +113,7 @@ def _layout(panels: int, aspect: float) -> tuple[int, int, float, float]:
 
 
 def _frame(axes: Axes, title: str, view: tuple[float, float, float, float], outer: tuple[bool, bool]) -> None:
-    """Set limits, caption and scale; `outer` tells whether the panel bears the labels of the y and the x axis."""
+    """Set limits, caption and scale; `outer` says whether the panel bears the labels of the y and the x axis."""
     axes.set_xlim(view[0], view[1])
     axes.set_ylim(view[2], view[3])
     axes.set_aspect('equal', adjustable='datalim')
@@ -176,8 +176,8 @@ def _marker_line(marker: MarkerStyle, x: float, y: float, **options: Any) -> Lin
 
 def _head(figure: Figure, picture: Picture) -> None:
     width, height = figure.get_size_inches()
-    room = int((width - 2 * _EDGE) * 9.5)
-    title = picture.title if len(picture.title) <= room else picture.title[: room - 1] + '…'
+    most = int((width - 2 * _EDGE) * 9.5)
+    title = picture.title if len(picture.title) <= most else picture.title[: most - 1] + '…'
     x = (_EDGE + 0.05) / width
     # A dollar sign would start a formula.
     figure.text(

@@ -222,7 +222,7 @@ class Journal:
             self.trouble = ''
 
     def _failed(self, error: OSError) -> bool:
-        """Tell of a write that failed, and wait before the next try; return whether to give up."""
+        """Report a write that failed, and wait before the next try; return whether to give up."""
         trouble = error.strerror or str(error)
         if trouble != self.trouble:
             self._warn(f'journal {self.path} cannot be written: {trouble}; mapping goes on without it')

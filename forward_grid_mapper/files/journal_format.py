@@ -45,7 +45,7 @@ def block(kind: int, payload: bytes) -> bytes:
 
 
 def frames_block(map_frame: str, base_frame: str) -> bytes:
-    """Return the block that tells the frames of the drive."""
+    """Return the block with the frames of the drive."""
     return block(FRAMES, json.dumps({'map_frame': map_frame, 'base_frame': base_frame}).encode())
 
 
@@ -131,22 +131,22 @@ def read(path: Path, contents: Contents) -> Iterator[Readings]:
 
 def _chunks(data: mmap.mmap, contents: Contents) -> Iterator[Readings]:
     rows: list[bytes] = []
-    room = CHUNK * ROW.itemsize
+    left = CHUNK * ROW.itemsize
     for kind, payload in _blocks(data, contents):
         if kind == READINGS and len(payload) % ROW.itemsize == 0:
             rows.append(payload)
-            room -= len(payload)
+            left -= len(payload)
         elif kind == NAME and len(payload) >= 4:
             number = struct.unpack_from('<I', payload)[0]
             contents.names[number] = payload[4:].decode('utf-8', 'surrogatepass')
         elif kind == FRAMES:
-            told = json.loads(payload)
-            contents.map_frame, contents.base_frame = str(told['map_frame']), str(told['base_frame'])
+            frames = json.loads(payload)
+            contents.map_frame, contents.base_frame = str(frames['map_frame']), str(frames['base_frame'])
         elif kind == PATH:
             contents.path += [(x, y) for x, y in np.frombuffer(payload, '<f8').reshape(-1, 2).tolist()]
-        if room <= 0:
+        if left <= 0:
             yield _readings(rows, contents)
-            rows, room = [], CHUNK * ROW.itemsize
+            rows, left = [], CHUNK * ROW.itemsize
     if rows:
         yield _readings(rows, contents)
 

@@ -59,7 +59,7 @@ def _values(learned: Learned) -> Iterator[str]:
 def _rounds(learned: Learned) -> Iterator[str]:
     yield (
         f'{"Round":<7}{"p_hit":>8}{"p_rand":>8}{"p_lost":>8}{"sigma":>8}{"log-likelihood":>16}{"old map":>11}'
-        f'{"occupied":>10}{"by chance":>11}{"lost wall":>11}'
+        f'{"occupied":>10}{"random":>11}{"lost wall":>11}'
     )
     for number, r in enumerate(learned.rounds):
         m = r.model

@@ -33,7 +33,7 @@ def write_npz(path: Path | str, maps: MapSet) -> None:
     """Write the maps as compressed arrays, none of them pickled.
 
     `live_map`, `ml_map` and `uncertainty_map` are float32 probabilities, NaN where unknown, row 0 with the smallest y;
-    `dynamic` (float32) counts echoes in free space that the map does not explain, of people, say. `origin` (2,) is
+    `dynamic` (float32) counts echoes in free space that come from nothing on the map: of people, say. `origin` (2,) is
     the corner of cell (0, 0) and `resolution` the edge of a cell, metres; `log_likelihood` and `objective` are in nats;
     `parameters` is a JSON text.
 

@@ -110,7 +110,7 @@ def free_name(parent: Path | str, stem: str) -> Path:
 
 
 def _is_empty_folder(path: Path) -> bool:
-    """Tell an empty folder (True) from a free name (False); refuse everything else."""
+    """Return True for an empty folder, False for a free name; refuse everything else."""
     if not os.path.lexists(path):
         return False
     if not path.is_dir():

@@ -14,7 +14,7 @@ from ..core.maps.map_set import MapSet
 from .output_folder import output_errors
 from .panels import Box, Panel, Picture
 
-# More cells than that along a side cannot be told apart in the picture.
+# More cells than that along a side cannot be distinguished in the picture.
 _MAX_SIDE = 2400
 _MARGIN = 0.03
 

@@ -1,4 +1,4 @@
-"""What is to be said of a map with its results: whether it explains the readings, and whether it knows them all."""
+"""What users are warned of: readings that do not fit the map, and readings that it was not made from."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import numpy as np
 from ..core.maps.map_set import MapSet
 
 TOO_MANY = 0.5
-"""Share of unexplained readings from which on the map is doubted."""
+"""Fraction of unexplained readings above which a warning is due."""
 
 ENOUGH = 20
 """Readings below which nothing can be said."""
@@ -19,13 +19,13 @@ def quality_warning(maps: MapSet) -> str:
     if count < ENOUGH or unexplained <= TOO_MANY * count:
         return ''
     return (
-        f'{unexplained} of {count} readings have chance as their likeliest cause: the map does not explain what was '
+        f'{unexplained} of {count} readings are most likely random measurements: the map does not fit what was '
         f'measured; are the poses of the sensors, odometry and the field of view right?'
     )
 
 
 def thinned(used: int, accepted: int) -> str:
-    """Return what is to be told where `max_readings` let EM have only `used` of the readings; empty otherwise."""
+    """Return a note where `max_readings` let EM have only `used` of the readings; empty otherwise."""
     if used >= accepted:
         return ''
     return (

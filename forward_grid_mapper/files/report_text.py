@@ -1,4 +1,4 @@
-"""The report as a page of text that tells at a glance whether the run was good."""
+"""The report as a page of text that says at a glance whether the run was good."""
 
 from __future__ import annotations
 
@@ -72,12 +72,12 @@ def _sensors(data: dict[str, Any]) -> Iterator[str]:
     if not sensors:
         return
     width = max(12, *(len(name) + 2 for name in sensors))
-    heads = ('accepted', 'no echo', 'random', 'short')
+    heads = ('accepted', 'max range', 'random', 'short')
     yield f'{"Sensors":<{width}}{"".join(f"{head:>10}" for head in heads)}  verdict'
     for name, row in sorted(sensors.items()):
         total, health = row.get('accepted'), row.get('health') or {}
         shares = [_share(row.get(key), total) for key in ('no_echo', 'unexplained')]
-        # of a sensor without readings there is no share
+        # a sensor without readings has no fraction of them
         shares.append(_share(health.get('short'), 1))
         cells = ''.join(f'{cell:>10}' for cell in (_number(total), *shares))
         yield f'  {name:<{width - 2}}{cells}  {health.get("verdict", "")}'.rstrip()
@@ -109,7 +109,7 @@ def _result(data: dict[str, Any]) -> Iterator[str]:
         yield from _line('Objective', f'{objective:,.1f} nats')
     if (unexplained := result.get('unexplained')) is not None:
         share = _share(unexplained, readings)
-        yield from _line('Unexplained', f'{unexplained:,} readings ({share}) have chance as their likeliest cause')
+        yield from _line('Unexplained', f'{unexplained:,} readings ({share}) are most likely random measurements')
     work = [f'{statistics[key]:,} {key}' for key in ('pairs', 'sweeps', 'flips', 'shifts') if statistics.get(key)]
     if (converged := statistics.get('converged')) is not None:
         work.append('converged' if converged else 'NOT converged: max_sweeps was reached')

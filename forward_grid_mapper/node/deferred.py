@@ -32,7 +32,7 @@ class Reply:
             self._service.transmit(response, header)
 
     def arrived(self, header: Any) -> None:
-        """Learn whom to answer, which the executor tells only after the handler returned."""
+        """Learn whom to answer, which the executor knows only after the handler returned."""
         with self._lock:
             self._header, response = header, self._response
         if response is not None:

@@ -19,7 +19,7 @@ SILENCE = 3.0
 
 
 NEARLY = 0.9
-"""Share of `max_readings` from which on a warning tells that readings will go."""
+"""Fraction of `max_readings` from which on a warning says that readings will go."""
 
 SHOWN = 20
 """Names of frames that a message lists."""

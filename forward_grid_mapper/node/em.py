@@ -35,7 +35,7 @@ class Outcome:
 class Run:
     """One run of EM, from map `start` or from the empty one.
 
-    `stage` and `progress` tell where it stands; `finished` is set after `done` was called.
+    `stage` and `progress` say where it stands; `finished` is set after `done` was called.
     """
 
     mapper: Mapper
@@ -63,7 +63,7 @@ class EmWorker:
     """Runs EM on snapshots of the readings, one at a time."""
 
     def __init__(self, watch: Callable[[Run], None], log: Callable[[str], Any]) -> None:
-        """`watch` hears of every stage and sweep, in the run's thread; `log` takes errors that are not the user's."""
+        """`watch` is called at every stage and sweep, by the run's thread; `log` takes errors that no user caused."""
         self._watch, self._log = watch, log
         self._lock = threading.Lock()
         self._run: Run | None = None
@@ -120,7 +120,7 @@ class EmWorker:
             # a run must never take the live map with it
             self._log(f'EM failed: {error!r}')
             outcome = Outcome(None, f'EM failed: {error!r}')
-        # whoever is told that the run has ended may start the next
+        # whoever learns that the run has ended may start the next
         self._run = None
         try:
             done(outcome)
@@ -136,5 +136,5 @@ def summary(maps: MapSet, seconds: float) -> str:
         f'objective {maps.objective:.1f}, {s["flips"]} flips, {s["shifts"]} shifts, {s["occupied"]} occupied cells, '
         f'{seconds:.2f} seconds'
         + ('' if s['converged'] else ', NOT converged: raise max_sweeps')
-        + (f'; BUT {told}' if (told := quality_warning(maps)) else '')
+        + (f'; BUT {warning}' if (warning := quality_warning(maps)) else '')
     )

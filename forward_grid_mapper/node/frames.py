@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-import math
 import time
 from collections import deque
 from collections.abc import Mapping
 from typing import Any
 
-from ..core.messages.message_types import NANOSECONDS, OdometryMessage, Pose2, yaw_of
+from ..core.messages.message_types import NANOSECONDS, OdometryMessage, Pose2, planar_pose
 from ..core.messages.pose_association import JUMP, LATER, Later
-
-STEEPEST = math.sin(math.radians(60.0))
-"""A sensor whose axis leaves the plane by more cannot be mapped in it."""
 
 PATIENCE = 0.2
 """Seconds before a frame that TF did not know is asked for again, so that a missing one costs next to nothing."""
@@ -70,25 +66,16 @@ class Transforms:
         return found.transform
 
 
-def planar(transform: Any) -> Pose2 | None:
-    """Return a transform projected on the plane, or None if its x axis leaves it too steeply or it is not valid."""
-    q, offset = transform.rotation, transform.translation
-    yaw = yaw_of(q)
-    if yaw is None or abs(2.0 * (q.x * q.z - q.w * q.y)) > STEEPEST:
-        return None
-    return Pose2(float(offset.x), float(offset.y), yaw)
-
-
 class Extrinsics:
     """Poses of the sensors on the robot: those given as parameters win over TF."""
 
     def __init__(self, given: Mapping[str, Pose2], transforms: Transforms) -> None:
         self._given = {frame.lstrip('/'): pose for frame, pose in given.items()}
         self._transforms = transforms
-        self.steep: set[str] = set()
+        self.unusable: set[str] = set()
 
     def __call__(self, base_frame: str, frame: str, stamp: int) -> Pose2 | Later | None:
-        """Return the pose of a sensor at a stamp, `LATER` if TF may still tell it, None if nothing will."""
+        """Return the pose of a sensor at a stamp, `LATER` if TF may still know it, None if nothing will."""
         given = self._given.get(frame.lstrip('/'))
         if given is not None:
             return given
@@ -97,9 +84,9 @@ class Extrinsics:
         transform = self._transforms.lookup(base_frame, frame, stamp)
         if transform is None:
             return LATER
-        pose = planar(transform)
+        pose = planar_pose(transform.translation, transform.rotation)
         if pose is None:
-            self.steep.add(frame)
+            self.unusable.add(frame)
         return pose
 
 
@@ -129,7 +116,7 @@ class MapFrame:
         while self._held:
             first = self._held[0]
             transform = self._transforms.lookup(self._map_frame, first.frame_id, first.stamp)
-            pose = planar(transform) if transform is not None else None
+            pose = planar_pose(transform.translation, transform.rotation) if transform is not None else None
             if pose is not None and first.pose is not None:
                 ready.append(first._replace(frame_id=self._map_frame, pose=pose.compose(first.pose)))
             elif first.pose is None:

@@ -25,7 +25,7 @@ Parameters: --ros-args -p NAME:=VALUE, or --params-file FILE (config/mapper.yaml
 and odom with -r sonar:=/my/sonar -r odom:=/my/odom."""
 
 
-TELL_EVERY = 10.0
+LOG_EVERY = 10.0
 """Seconds between two reports of callbacks that fail."""
 
 
@@ -38,8 +38,8 @@ def _raise_stop() -> None:
 
 
 def _spin(executor: Any, node: Any) -> None:
-    """Spin until `_Stop` or the end of ROS; a callback that fails is told, and must not take the map with it."""
-    told = 0.0
+    """Spin until `_Stop` or the end of ROS; a callback that fails is logged, and must not take the map with it."""
+    logged = 0.0
     while executor.context.ok():
         try:
             executor.spin()
@@ -47,15 +47,15 @@ def _spin(executor: Any, node: Any) -> None:
             raise
         except Exception:
             now = time.monotonic()
-            if now > told + TELL_EVERY:
-                told = now
+            if now > logged + LOG_EVERY:
+                logged = now
                 node.get_logger().error(f'a callback failed, mapping goes on: {traceback.format_exc()}')
             # one that fails all the time must not take all of the time
             time.sleep(0.001)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the node until it is told to stop; return the exit code."""
+    """Run the node until it has to stop; return the exit code."""
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGINT, signal.SIG_DFL)
     arguments = sys.argv[1:] if arguments is None else list(arguments)

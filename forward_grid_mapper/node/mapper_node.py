@@ -50,7 +50,7 @@ MAPS = ('live_map', 'ml_map', 'uncertainty_map')
 
 
 class MapperNode(Node):
-    """Maps what it hears. All callbacks run in one thread; EM and saving run in others and publish by themselves."""
+    """Maps what it receives. All callbacks run in one thread; EM and saving run in others and publish by themselves."""
 
     def __init__(self, **options: Any) -> None:
         """Declare the parameters; `start` begins to listen.
@@ -71,7 +71,7 @@ class MapperNode(Node):
         self._live_count = self._published = self._explained = 0
         self._paused = False
         self._last_run = 'none yet'
-        self._told: set[str] = set()
+        self._reported: set[str] = set()
         # EM's results count only if nothing was reset since it began; both are published under the lock, so that
         # maps that were forgotten cannot come after the empty ones
         self._generation = self._run_generation = 0
@@ -110,9 +110,9 @@ class MapperNode(Node):
         quality = self._quality(node.range_reliability)
         for topic in dict.fromkeys(node.range_topics):
             self.create_subscription(Range, topic, self._on_range, quality)
-        heard = {self.resolve_topic_name(topic): quality for topic in node.range_topics}
-        heard[self.resolve_topic_name(node.odom_topic)] = self._quality(node.odom_reliability)
-        self._surroundings = Surroundings(self, heard)
+        received = {self.resolve_topic_name(topic): quality for topic in node.range_topics}
+        received[self.resolve_topic_name(node.odom_topic)] = self._quality(node.odom_reliability)
+        self._surroundings = Surroundings(self, received)
         self.create_timer(1.0, self._report, clock=self._steady)
         if node.online:
             self._online = OnlineWorker(self.parameters, self._publish_online, self.get_logger().error)
@@ -264,8 +264,8 @@ class MapperNode(Node):
                 self.get_logger().warning(f'EM: {outcome.message}')
             else:
                 maps = outcome.maps
-                if told := quality_warning(maps):
-                    self.get_logger().warning(f'EM: {told}')
+                if warning := quality_warning(maps):
+                    self.get_logger().warning(f'EM: {warning}')
                 self._last_run = summary(maps, sum(maps.statistics['seconds'].values()))
                 self.get_logger().info(f'EM: {self._last_run}')
             done(outcome)
@@ -340,8 +340,8 @@ class MapperNode(Node):
             maps = self._maps_to_save()
             # one after the other, so that each finds a name of its own
             with self._saving:
-                told = self._write(maps.with_live(*live), self._explained)
-            reply.send(True, told)
+                answer = self._write(maps.with_live(*live), self._explained)
+            reply.send(True, answer)
         except MapperError as error:
             reply.send(False, str(error))
         except Exception as error:
@@ -407,12 +407,14 @@ class MapperNode(Node):
 
     def _report(self) -> None:
         associator = self._associator
-        for frame in sorted(associator.unknown_frames - self._told)[: diagnostics.SHOWN]:
-            if len(self._told) >= MOST_FRAMES:
+        for frame in sorted(associator.unknown_frames - self._reported)[: diagnostics.SHOWN]:
+            if len(self._reported) >= MOST_FRAMES:
                 break
-            self._told.add(frame)
+            self._reported.add(frame)
             why = (
-                'its axis leaves the plane by more than 60°' if frame in self._extrinsics.steep else 'neither is known'
+                'its transform is not normalised, or its axis leaves the plane by more than 60°'
+                if frame in self._extrinsics.unusable
+                else 'neither is known'
             )
             self.get_logger().warning(
                 f'no pose on the robot for sensor {frame}: set sensors.{frame}.pose: [x, y, yaw], or publish the '

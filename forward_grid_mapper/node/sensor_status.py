@@ -26,7 +26,7 @@ class SensorWatch:
     def judge(self, maps: MapSet | None, wanted: Callable[[], bool]) -> None:
         """Make the table of a run's maps, in the run's own thread; None, of a run that failed, changes nothing.
 
-        `wanted` tells at the end whether the run still counts.
+        `wanted` says at the end whether the run still counts.
         """
         if maps is not None:
             table = sensor_health(maps)
@@ -46,9 +46,9 @@ class SensorWatch:
         table = self._table
         values = {**_counts(readings), **{sensor: str(row) for sensor, row in table.items()}}
         warning = health_warning(table)
-        told = warning or ('none stands out' if table else 'judged when EM has run')
+        message = warning or ('none stands out' if table else 'judged when EM has run')
         level = DiagnosticStatus.WARN if warning else DiagnosticStatus.OK
-        return status(f'{name}: sensors', level, told, name, values)
+        return status(f'{name}: sensors', level, message, name, values)
 
 
 def _counts(readings: Readings) -> dict[str, str]:
@@ -56,6 +56,6 @@ def _counts(readings: Readings) -> dict[str, str]:
     total = np.bincount(readings.sensor, minlength=len(names))
     silent = np.bincount(readings.sensor, weights=~readings.echo, minlength=len(names))
     return {
-        name: f'{count} readings, {quiet / max(count, 1):.0%} no echo'
+        name: f'{count} readings, {quiet / max(count, 1):.0%} max range'
         for name, count, quiet in zip(names, total.tolist(), silent.tolist(), strict=True)
     }

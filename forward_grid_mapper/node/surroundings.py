@@ -1,4 +1,4 @@
-"""What is wrong around the node, which it can only see by asking: publishers that it cannot hear, and namesakes."""
+"""Faults around the node, which it can only see by asking: publishers it cannot receive from, and namesakes."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ PERIOD = 3.0
 
 
 class Surroundings:
-    """Looks around now and then, and tells of each fault once in the log and as long as it lasts in diagnostics."""
+    """Looks around now and then, and reports each fault once in the log and as long as it lasts in diagnostics."""
 
     def __init__(self, node: Any, subscriptions: dict[str, QoSProfile]) -> None:
         """`subscriptions` are the topics that the node listens to."""
         self._node, self._subscriptions = node, subscriptions
-        self._told: set[str] = set()
+        self._reported: set[str] = set()
         self._next = 0.0
         self._faults: list[str] = []
 
@@ -28,8 +28,8 @@ class Surroundings:
             self._next = now + PERIOD
             self._faults = [*self._deaf(), *self._namesakes()]
             for fault in self._faults:
-                if fault not in self._told and len(self._told) < 100:
-                    self._told.add(fault)
+                if fault not in self._reported and len(self._reported) < 100:
+                    self._reported.add(fault)
                     self._node.get_logger().warning(fault)
         return self._faults
 
@@ -42,7 +42,7 @@ class Surroundings:
                     offered = publisher.qos_profile.reliability.name.lower()
                     faults.append(
                         f'{publisher.node_name} publishes {topic} as {offered}, and this node asks for '
-                        f'{wanted.reliability.name.lower()}: it hears nothing; set range_reliability or '
+                        f'{wanted.reliability.name.lower()}: nothing of it is received; set range_reliability or '
                         f'odom_reliability to {offered}'
                     )
         return list(dict.fromkeys(faults))

@@ -1,4 +1,4 @@
-"""What a recorded drive gives, wherever it was recorded: placed readings, and an account of how they came about."""
+"""What a recorded drive gives, wherever it was recorded: readings in the map frame, and an account of all messages."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class Drive:
     Attributes
     ----------
     associator : PoseAssociator
-        With all readings placed.
+        With all readings in the map frame.
     source : dict
         What was read and rejected, for the report.
     live : LogOddsMapOfAll
@@ -62,6 +62,6 @@ class Drive:
 
 
 def thinning_note(associator: PoseAssociator) -> list[str]:
-    """Return what is to be told where `max_readings` lets EM have only some of the readings."""
+    """Return a note where `max_readings` lets EM have only some of the readings."""
     count = len(associator.buffer)
     return list(filter(None, [thinned(min(count, associator.parameters.max_readings or count), count)]))

@@ -1,4 +1,4 @@
-"""A journal that a node kept becomes placed readings, as a bag does."""
+"""A journal that a node kept becomes readings in the map frame, as a bag does."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def read_journal(
     range_topics: Sequence[str] | None = None,
     odom_topic: str | None = None,
 ) -> Drive:
-    """Read a journal file; its readings are placed already.
+    """Read a journal file; its readings are in the map frame already.
 
     Raises
     ------
@@ -50,7 +50,9 @@ def read_journal(
         associator.extend_path(point)
     warnings = [f'{path.name}: {contents.harm}'] if contents.harm else []
     if extrinsics:
-        warnings.append('a journal holds placed readings: the poses of sensors that were given change nothing')
+        warnings.append(
+            'a journal holds readings in the map frame: the poses of sensors that were given change nothing'
+        )
     source = {
         'bag': readable(path),
         'odom_frame': associator.map_frame,

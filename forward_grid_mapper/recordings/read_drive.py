@@ -1,4 +1,4 @@
-"""A recorded drive becomes placed readings: the offline counterpart of the node's subscriptions."""
+"""A recorded drive becomes readings in the map frame: the offline counterpart of the node's subscriptions."""
 
 from __future__ import annotations
 
@@ -57,13 +57,13 @@ class Extrinsics:
         """Frames with a given pose that no reading asked for."""
         return sorted(set(self._given) - {frame.lstrip('/') for frame in self.used})
 
-    def explain(self, base_frame: str, frames: Sequence[str]) -> str:
+    def advice(self, base_frame: str, frames: Sequence[str]) -> str:
         """Say what to do about frames without a pose."""
         known = self._transforms.frames
-        told = f'/tf_static joins {", ".join(known[:12])}' if known else 'the bag has no /tf_static'
+        joined = f'/tf_static joins {", ".join(known[:12])}' if known else 'the bag has no /tf_static'
         reasons = ''.join(f' {self.unusable[frame]}' for frame in frames if frame in self.unusable)
         return (
-            f'no pose on the robot (frame {base_frame or "?"}) is known for {", ".join(frames)}: {told}.{reasons} '
+            f'no pose on the robot (frame {base_frame or "?"}) is known for {", ".join(frames)}: {joined}.{reasons} '
             f'Give --sensor {frames[0]}=x,y,yaw for each, or sensors.{frames[0]}.pose in --params'
         )
 
@@ -76,7 +76,7 @@ def read_drive(
     odom_topic: str | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Drive:
-    """Read a bag and place its readings, or take those of a journal.
+    """Read a bag and bring its readings into the map frame, or take those of a journal.
 
     Parameters
     ----------
@@ -94,7 +94,7 @@ def read_drive(
     BagError
         If the bag cannot be read, or the topics are not there or ambiguous.
     InputError
-        If not a single reading could be placed; says why.
+        If not a single reading got a pose; says why.
     """
     journal = drive_file(Path(path))
     if journal is not None:
@@ -119,7 +119,7 @@ def read_drive(
         undecodable = dict(bag.undecodable)
         warnings = _warnings(bag, associator, lookup)
     if not len(associator.buffer):
-        raise _nothing_placed(associator, lookup, spans, undecodable)
+        raise _nothing_associated(associator, lookup, spans, undecodable)
     stamps = associator.readings.stamp
     source = {
         'bag': readable(path),
@@ -153,7 +153,7 @@ def _warnings(bag: Bag, associator: PoseAssociator, lookup: Extrinsics) -> list[
     for topic, count in bag.undecodable.items():
         warnings.append(f'{count} messages on {topic} do not fit their type and were skipped')
     if associator.unknown_frames:
-        warnings.append(lookup.explain(associator.base_frame, sorted(associator.unknown_frames)))
+        warnings.append(lookup.advice(associator.base_frame, sorted(associator.unknown_frames)))
     if unused := lookup.unused:
         warnings.append(
             f'poses were given for {", ".join(unused)}, but no reading has such a frame; is the name right?'
@@ -172,17 +172,17 @@ def _warnings(bag: Bag, associator: PoseAssociator, lookup: Extrinsics) -> list[
     return warnings
 
 
-def _nothing_placed(
+def _nothing_associated(
     associator: PoseAssociator, lookup: Extrinsics, spans: Mapping[str, Sequence[int]], undecodable: Mapping[str, int]
 ) -> Exception:
-    """Return the error that says why no reading could be placed, and what to do."""
+    """Return the error that says why no reading got a pose, and what to do."""
     ranges, odometry = spans['ranges'], spans['odometry']
     lost = '; '.join(f'{count} on {topic} do not fit their type' for topic, count in undecodable.items())
     if not ranges or not odometry:
         kind = 'Range' if not ranges else 'Odometry'
         return BagError(f'the chosen topics hold no readable {kind} message{f" ({lost})" if lost else ""}')
     if set(associator.rejected) == {'unknown_extrinsics'}:
-        return InputError(lookup.explain(associator.base_frame, sorted(associator.unknown_frames)))
+        return InputError(lookup.advice(associator.base_frame, sorted(associator.unknown_frames)))
     if ranges[1] < odometry[0] or ranges[0] > odometry[1]:
         a, b, c, d = (stamp / NANOSECONDS for stamp in (*ranges, *odometry))
         return InputError(

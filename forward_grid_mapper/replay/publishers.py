@@ -31,7 +31,7 @@ class Publishers:
     ros_arguments : sequence of str
         From `--ros-args` on, for rclpy.
     reliable : bool
-        Whether ranges and odometry are sent until they are acknowledged; best-effort subscribers hear both kinds.
+        Whether ranges and odometry are sent until they are acknowledged; best-effort subscribers receive both kinds.
     stop : StopSignal
         Ends every wait.
     """
@@ -121,7 +121,7 @@ class Publishers:
                 self._publishers[topic].publish(message)
                 break
             except RCLError as error:
-                # DDS waits for room in the history for a tenth of a second only
+                # DDS waits for space in the history for a tenth of a second only
                 if time.monotonic() > deadline:
                     raise InputError(f'subscribers of {topic} take nothing since {PATIENCE:.0f} s ({error})') from error
 

@@ -14,7 +14,7 @@ STEP_BACK = NANOSECONDS
 """A topic whose stamps go back by more begins anew: the recording spans two runs of a clock."""
 
 LATE = 0.5
-"""Seconds by which messages may be late before the rest is shifted, lest they come in a burst."""
+"""Seconds by which messages may be late before the rest is shifted, so that they do not come in a burst."""
 
 
 class Timeline:

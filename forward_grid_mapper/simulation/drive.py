@@ -151,14 +151,14 @@ def building_drive(
     person: bool = False,
     sonars: SonarArray | None = None,
 ) -> Recording:
-    """Drive `laps` rounds through every room of `building_world`, none quite like the other: 1750 sweeps each.
+    """Drive `laps` times through every room of `building_world`, none quite like the other: 1750 sweeps each.
 
     By default 16 sonars with cones of 30 degrees, which makes 28 000 readings a lap.
     """
     world, tour = building_world(), building_tour()
     rng = np.random.default_rng([seed, laps])
-    rounds = [tour[:-1] + rng.uniform(-0.05, 0.05, tour[:-1].shape) for _ in range(laps)]
-    waypoints = np.concatenate([*rounds, tour[-1:]])
+    tours = [tour[:-1] + rng.uniform(-0.05, 0.05, tour[:-1].shape) for _ in range(laps)]
+    waypoints = np.concatenate([*tours, tour[-1:]])
     length, count = Trajectory.through(waypoints).length, 1750 * laps
     sweeps = (np.arange(count) + 0.5) / count * length
     sonars = sonars or sonar_ring(16, field_of_view=math.radians(30.0))
@@ -166,11 +166,11 @@ def building_drive(
 
 
 def _people(world: World, robot: Floats, rng: np.random.Generator) -> Floats:
-    """Return where the person stands at each sweep, shape (T, 2), NaN where there is no room behind the robot."""
+    """Return where the person stands at each sweep, shape (T, 2), NaN where there is no space behind the robot."""
     distance = np.clip(rng.normal(_PERSON_DISTANCE, 0.1, len(robot)), 0.7, 1.3)
     behind = robot[:, 2] + np.pi + rng.normal(0.0, 0.1, len(robot))
-    room, _ = cast(robot[:, :2], behind[:, None], world.segments, 3.0)
-    distance = np.where(distance + PERSON_RADIUS < room[:, 0], distance, np.nan)
+    free, _ = cast(robot[:, :2], behind[:, None], world.segments, 3.0)
+    distance = np.where(distance + PERSON_RADIUS < free[:, 0], distance, np.nan)
     people: Floats = robot[:, :2] + distance[:, None] * np.stack([np.cos(behind), np.sin(behind)], axis=1)
     return people
 

@@ -30,9 +30,9 @@ class Scores:
     Attributes
     ----------
     precision : float
-        Share of the map's occupied cells that lie at most one cell from a wall.
+        Fraction of the map's occupied cells that lie at most one cell from a wall.
     recall : float
-        Share of the visible wall cells that are found.
+        Fraction of the visible wall cells that are found.
     f1 : float
         Harmonic mean of the two.
     false_dots : int
@@ -46,8 +46,8 @@ class Scores:
     rough_coverage : float
         Recall on all other walls.
     column_coverage : float
-        Share of the visible cells of the other walls with an occupied cell at most one cell *across* the wall: dots on
-        every second or third cell, which recall forgives, lower it.
+        Fraction of the visible cells of the other walls with an occupied cell at most one cell *across* the wall. Dots
+        on every second or third cell, which recall forgives, lower it.
     longest_gap : int
         Longest run along such a wall, in cells, without coverage in that sense.
     """
@@ -83,7 +83,7 @@ def visible_surface(world: World, readings: Readings, depth: float = math.inf) -
     readings : Readings
     depth : float
         Leave out what lies more than this many metres behind the nearest wall of the same cone. A sonar answers for the
-        nearest wall alone, so without a bound the surface holds walls that no reading could tell of.
+        nearest wall alone, so without a bound the surface holds walls that no reading could show.
 
     Returns
     -------
@@ -187,7 +187,7 @@ def _grow(cells: Mask) -> Mask:
 
 
 def _coverage(world: World, occupied: Mask, asked: Mask) -> tuple[float, int]:
-    """Return the share of `asked` wall cells with an occupied cell across the wall, and the longest run without."""
+    """Return the fraction of `asked` wall cells with an occupied cell across the wall, and the longest run without."""
     padded = np.pad(occupied, 1)
     covered: list[Mask] = []
     longest = 0

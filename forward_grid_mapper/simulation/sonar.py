@@ -41,7 +41,7 @@ class SonarArray:
     field_of_view : float
         Full opening angle, radians.
     max_range, min_range : float
-        Metres; an echo from farther than `max_range` is not heard.
+        Metres; an echo from farther than `max_range` is not reported.
     """
 
     yaws: tuple[float, ...]
@@ -110,11 +110,11 @@ class NoiseModel:
     Attributes
     ----------
     sigma : float
-        Standard deviation of a heard range, metres.
+        Standard deviation of the range of an echo, metres.
     p_random : float
         Probability of a range drawn evenly from min_range to max_range.
     p_lost : float
-        Probability that no echo is heard.
+        Probability that an echo is lost.
     """
 
     sigma: float = 0.0
@@ -147,7 +147,7 @@ def measure(
     Returns
     -------
     float64, shape (T, n)
-        Ranges in metres, +inf where no echo was heard. Echoes from nearer than min_range are reported at min_range.
+        Ranges in metres, +inf where there was no echo. Echoes from nearer than min_range are reported at min_range.
     """
     poses = sonars.poses(robot).reshape(-1, 3)
     draws = rng.random((3, len(poses)))

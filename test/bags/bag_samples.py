@@ -15,7 +15,7 @@ SECOND = 1_000_000_000
 START = 1_700_000_000 * SECOND
 COUNT = 200
 SUFFIXES = {'mcap': '.mcap', 'sqlite3': '.db3', 'ros1': '.bag'}
-MOUNTS = [('base_link', 'sonar_0', Pose2(0.1, 0.2, 0.5)), ('base_link', 'sonar_1', Pose2(-0.1, 0.0, math.pi / 2))]
+EXTRINSICS = [('base_link', 'sonar_0', Pose2(0.1, 0.2, 0.5)), ('base_link', 'sonar_1', Pose2(-0.1, 0.0, math.pi / 2))]
 
 
 def sample_messages(count: int = COUNT) -> list[RangeMessage | OdometryMessage]:
@@ -33,7 +33,7 @@ def write_sample(folder: Path, kind: str, *, shared_topic: bool = True, count: i
     """Write a bag of this format; return its path."""
     path = folder / (f'{name}.bag' if kind == 'ros1' else name)
     with BagWriter(path, kind) as writer:
-        writer.write_static_transforms(MOUNTS, START)
+        writer.write_static_transforms(EXTRINSICS, START)
         for message in sample_messages(count):
             if isinstance(message, RangeMessage):
                 writer.write_range('/sonar' if shared_topic else f'/{message.frame_id}', message)

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from bag_samples import (
     COUNT,
-    MOUNTS,
+    EXTRINSICS,
     SECOND,
     START,
     SUFFIXES,
@@ -62,7 +62,7 @@ def test_topics_and_transforms(tmp_path: Path, kind: str) -> None:
         assert bag.choose_topics() == Topics(('/sonar_0', '/sonar_1'), '/odom')
         assert list(bag.messages(bag.choose_topics())) == sample_messages()
         transforms = bag.static_transforms()
-        for parent, child, pose in MOUNTS:
+        for parent, child, pose in EXTRINSICS:
             assert transforms.lookup(parent, child) == pytest.approx(pose)
 
 

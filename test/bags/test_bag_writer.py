@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from bag_samples import MOUNTS, START, SUFFIXES, write_sample
+from bag_samples import EXTRINSICS, START, SUFFIXES, write_sample
 from rosbags.highlevel import AnyReader
 from rosbags.interfaces import QosDurability, QosReliability
 
@@ -30,7 +30,7 @@ def final_path(folder: Path, kind: str) -> Path:
 def test_grid_and_latched_topics(tmp_path: Path, kind: str) -> None:
     path = final_path(tmp_path, kind)
     with BagWriter(path, kind) as writer:
-        writer.write_static_transforms(MOUNTS, START)
+        writer.write_static_transforms(EXTRINSICS, START)
         writer.write_range('/sonar', RANGE, radiation_type=1, time=START + 5)
         writer.write_grid('/map', GRID, VALUES, 'odom', START + 7)
     with AnyReader([path]) as reader:

@@ -134,7 +134,7 @@ def refusal(capsys: pytest.CaptureFixture[str], folder: Path, *arguments: object
     assert out == ''
     assert 'Traceback' not in err
     message = err.partition('process_bag: error: ')[2]
-    assert message, f'no error was told: {err!r}'
+    assert message, f'no error was printed: {err!r}'
     assert everything_in(folder) == before
     return message.rstrip('\n')
 

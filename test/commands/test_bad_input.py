@@ -242,8 +242,8 @@ def test_odometry_that_ends_early_and_has_a_gap(tmp_path: Path) -> None:
 
 def shuffled(of: type[Message] | tuple[type[Message], ...]) -> list[tuple[int, Message]]:
     """The messages of these types logged up to a second late, each by itself."""
-    chance = random.Random(1)
-    late = [(time + (chance.randrange(SECOND) if isinstance(m, of) else 0), m) for time, m in in_turn(turning())]
+    generator = random.Random(1)
+    late = [(time + (generator.randrange(SECOND) if isinstance(m, of) else 0), m) for time, m in in_turn(turning())]
     return sorted(late, key=lambda item: item[0])
 
 
@@ -268,15 +268,15 @@ RANGE, ODOMETRY = type(tape().ranges[0]), type(tape().odometry[0])
     ],
 )
 def test_the_order_of_logging_does_not_matter(tmp_path: Path, late: type[Message]) -> None:
-    placed = []
+    readings = []
     for name, logged in (('in_turn', in_turn(turning())), ('shuffled', shuffled(late))):
         bag = write_tape(tmp_path / name, turning(), logged=logged)
         drive = read_drive(bag, Parameters(), {})
         assert not drive.source['warnings']
-        placed.append(in_canonical_order(drive.associator.readings))
-    assert len(placed[0]) == len(placed[1]) == COUNT
+        readings.append(in_canonical_order(drive.associator.readings))
+    assert len(readings[0]) == len(readings[1]) == COUNT
     for column in ('stamp', 'x', 'y', 'yaw', 'z'):
-        assert getattr(placed[0], column).tolist() == getattr(placed[1], column).tolist(), column
+        assert getattr(readings[0], column).tolist() == getattr(readings[1], column).tolist(), column
 
 
 # ---- ranges

@@ -62,8 +62,8 @@ def test_parameters_count(tmp_path: Path, capsys: pytest.CaptureFixture[str]) ->
 def test_as_in_the_paper_is_what_the_parameter_file_says() -> None:
     values = load_parameters(Path(__file__).parents[2] / 'config' / 'paper.yaml').values
     uncertainty = {'alpha', 'uncertainty_prior', 'neighbour_weight'}
-    told = {name: value for name, value in values.items() if name not in uncertainty}
-    assert {name: pytest.approx(value, abs=1e-4) for name, value in experiment.PAPER.items()} == told
+    given = {name: value for name, value in values.items() if name not in uncertainty}
+    assert {name: pytest.approx(value, abs=1e-4) for name, value in experiment.PAPER.items()} == given
 
 
 @pytest.mark.parametrize(

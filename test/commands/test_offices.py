@@ -16,7 +16,7 @@ LEAST = {
     ('office_a', 'live_map'): (0.75, 0.0),
     ('office_b', 'live_map'): (0.66, 0.0),
 }
-"""The share of the floor that a robot may use in map and reference alike (nav_iou), and F1 of the wall cells."""
+"""The fraction of the floor that a robot may use in map and reference alike (nav_iou), and F1 of the wall cells."""
 
 
 @pytest.mark.parametrize('run', ['office_a', 'office_b'])

@@ -44,7 +44,7 @@ def plain(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def readings_placed(drive: Tape) -> PoseAssociator:
-    """The drive's messages placed without any bag."""
+    """The drive's messages as readings, without any bag."""
     extrinsics = dict(drive.extrinsics)
     associator = PoseAssociator(lambda base, frame, stamp: extrinsics[frame], patient=True)
     for message in drive.odometry:
@@ -91,10 +91,10 @@ def test_maps_are_those_of_the_pipeline_without_a_bag(plain: Path) -> None:
 
 def test_readings_are_where_the_simulation_took_them() -> None:
     truth = door_drive(1, NOISY, 0, front_array()).readings
-    placed = readings_placed(tape()).readings
+    found = readings_placed(tape()).readings
     for column in ('x', 'y', 'yaw', 'z', 'z_max', 'half_angle'):
-        np.testing.assert_allclose(getattr(placed, column), getattr(truth, column), atol=1e-6)
-    np.testing.assert_array_equal(placed.stamp, truth.stamp)
+        np.testing.assert_allclose(getattr(found, column), getattr(truth, column), atol=1e-6)
+    np.testing.assert_array_equal(found.stamp, truth.stamp)
 
 
 # ---- what is written

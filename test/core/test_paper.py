@@ -107,7 +107,7 @@ def terms(readings: Readings, t: int, grid: Grid, occupied: np.ndarray, model: M
     return naive.causes(readings.z[t], readings.z_max[t], sigma, met, model)
 
 
-# The standard map: eq 1-15, Table 1
+# The standard map: (1)-(17), Table 1
 
 
 def test_one_reading_gives_back_its_inverse_model_and_not_eq_4_as_printed() -> None:
@@ -130,18 +130,45 @@ def test_readings_that_say_nothing_leave_the_standard_map_at_its_prior() -> None
     assert p[np.isfinite(p)] == pytest.approx(0.5, abs=1e-3)
 
 
-# The forward model: eq 16-32
+def closed_form(each: np.ndarray, prior: float) -> np.ndarray:
+    """(16) as it must be meant: the log-odds of every reading, less the prior's T times, plus the prior's once.
+
+    `each`, shape (T, cells), has the occupancy of the cells given each reading alone.
+    """
+    return np.log(each / (1 - each)).sum(axis=0) - (len(each) - 1) * math.log(prior / (1 - prior))
 
 
-def test_a_sum_of_densities_in_eq_16_would_let_three_readings_be_forgotten() -> None:
-    grid = Grid(0.1, 0, 0, 6, 1)
-    readings = along(0.25, 0.25, 0.25, 0.6, 0.6, 0.6, 0.6, z_max=0.6)
-    maps = every_map(grid)
-    densities = np.array([[sum(terms(readings, t, grid, m, PAPER)) for t in range(7)] for m in maps])
-    assert not maps[densities.sum(axis=1).argmax()].any()
-    best = maps[np.log(densities).sum(axis=1).argmax()]
-    assert np.flatnonzero(best).tolist() == [2]
-    assert found(readings, grid, kind=FlipsAlone) == [2]
+def test_the_standard_map_is_the_closed_form_of_eq_16_with_logarithms() -> None:
+    parameters = Parameters.from_flat({'resolution': 0.1})
+    readings = random_readings(np.random.default_rng(1), AREA, 40)
+    live = LogOddsMap(parameters)
+    live.add(readings)
+    each = []
+    for t in range(len(readings)):
+        alone = LogOddsMap(parameters)
+        alone.add(readings.select(np.array([t])))
+        p = alone.probability(live.grid)
+        # a reading leaves the cells beside its cone at the prior, which is one half
+        each.append(np.where(np.isnan(p), 0.5, p))
+    odds = np.array(each, np.float64)
+    known = np.isfinite(live.log_odds())
+    assert live.log_odds()[known] == pytest.approx(closed_form(odds, 0.5)[known], abs=1e-4)
+    printed = (odds / (1 - odds)).sum(axis=0)
+    assert printed[known].min() > 0, 'without logarithms, no cell is ever free'
+
+
+@pytest.mark.parametrize('prior', [0.2, 0.5, 0.7])
+def test_the_closed_form_takes_the_prior_off_with_every_reading_and_adds_it_once(prior: float) -> None:
+    each = np.random.default_rng(2).uniform(0.05, 0.95, (12, 5))
+    h = math.log(prior / (1 - prior))
+    recursive = np.full(5, h)
+    for p in each:
+        recursive += np.log(p / (1 - p)) - h
+    assert closed_form(each, prior) == pytest.approx(recursive)
+    assert closed_form(np.full((12, 5), prior), prior) == pytest.approx(h), 'readings that say nothing leave the prior'
+
+
+# The forward model: (18)-(28)
 
 
 def test_sigma_of_eq_22_is_a_standard_deviation() -> None:
@@ -197,7 +224,7 @@ def test_every_obstacle_of_the_cone_counts_not_only_one() -> None:
     assert gain_of(7, readings, line(3)) == pytest.approx(-math.log(e.random[0]), abs=1e-5)
 
 
-# EM: eq 33-40, Table 2
+# EM: (29)-(40), Table 2
 
 
 def squares(readings: Readings, grid: Grid, occupied: np.ndarray, model: ModelParameters) -> float:
@@ -353,7 +380,7 @@ def test_the_search_starts_from_the_empty_map_since_what_nobody_saw_stays_full()
     assert not empty.occupied[unseen].any()
 
 
-# Uncertainty: eq 41-45
+# Uncertainty: (41)-(45)
 
 
 def test_the_mixed_marginal_is_that_of_eq_42_to_45_with_the_prior_counted_once() -> None:

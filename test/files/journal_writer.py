@@ -1,6 +1,6 @@
 """Writes a journal as a node does, until it is killed: `journal_writer.py FOLDER`.
 
-Reading number n has n as its x. The file `FOLDER.accepted` tells how many there were and when (int64, int64).
+Reading number n has n as its x. The file `FOLDER.accepted` says how many there were and when (int64, int64).
 """
 
 from __future__ import annotations

@@ -43,8 +43,8 @@ def made(first: int, count: int, names: tuple[str, ...] = ('left', 'right')) -> 
     )
 
 
-def opened(folder: Path, told: list[str] | None = None) -> tuple[Journal, list[Readings]]:
-    journal = Journal(folder, (told if told is not None else []).append)
+def opened(folder: Path, reported: list[str] | None = None) -> tuple[Journal, list[Readings]]:
+    journal = Journal(folder, (reported if reported is not None else []).append)
     return journal, list(journal.restore())
 
 
@@ -77,8 +77,8 @@ def test_what_is_put_comes_back(tmp_path: Path) -> None:
     expected = made(0, 300)
     for column in ('x', 'y', 'yaw', 'z', 'z_max', 'half_angle', 'sigma', 'stamp'):
         assert np.array_equal(getattr(back, column), getattr(expected, column))
-    told = [back.sensor_names[k] for k in back.sensor]
-    assert told == [names[k % (k // 100 + 3)] for k in range(300)]
+    found = [back.sensor_names[k] for k in back.sensor]
+    assert found == [names[k % (k // 100 + 3)] for k in range(300)]
     assert (again.contents.map_frame, again.contents.base_frame) == FRAMES
     assert again.contents.path == [(0.0, 0.0), (100.0, 0.0), (200.0, 0.0)]
     assert again.contents.harm == ''
@@ -107,10 +107,10 @@ def test_an_end_that_is_torn_anywhere(tmp_path: Path) -> None:
     assert last == 30
     for length in (0, 3, len(MAGIC), len(MAGIC) + 5, len(whole) - 100, len(whole) - 1):
         path.write_bytes(whole[:length])
-        told: list[str] = []
-        journal, chunks = opened(path.parent, told)
+        reported: list[str] = []
+        journal, chunks = opened(path.parent, reported)
         kept = sum(map(len, chunks))
-        assert bool(told) == (length not in (0, len(MAGIC)))
+        assert bool(reported) == (length not in (0, len(MAGIC)))
         written(journal, made(kept, 7))
         journal.close()
         found, contents = numbers(path)
@@ -177,17 +177,17 @@ def test_a_new_drive_begins_a_new_file(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize('number', [errno.ENOSPC, errno.EIO])
-def test_a_full_disk_is_told_once_and_waited_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int) -> None:
+def test_a_full_disk_is_reported_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int) -> None:
     monkeypatch.setattr(journal_module, 'RETRY', 0.01)
-    told: list[str] = []
-    journal, _ = opened(tmp_path, told)
+    reported: list[str] = []
+    journal, _ = opened(tmp_path, reported)
     written(journal, made(0, 10))
     full = True
     write = os.pwrite
 
     def pwrite(file: int, data: bytes, at: int) -> int:
         if full and len(data) > 100:
-            # as much as there is room for
+            # as much as there is space for
             return write(file, data[:50], at)
         if full:
             raise OSError(number, os.strerror(number))
@@ -198,8 +198,8 @@ def test_a_full_disk_is_told_once_and_waited_for(tmp_path: Path, monkeypatch: py
         journal.put(made(10 * k, 10), FRAMES)
     until(lambda: journal.trouble)
     time.sleep(0.1)
-    assert len(told) == 1
-    assert os.strerror(number) in told[0]
+    assert len(reported) == 1
+    assert os.strerror(number) in reported[0]
     assert journal.unwritten == 50
     assert numbers(journal.path)[0] == list(range(10))
     full = False
@@ -213,8 +213,8 @@ def test_a_full_disk_is_told_once_and_waited_for(tmp_path: Path, monkeypatch: py
 def test_what_waits_for_a_disk_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(journal_module, 'RETRY', 0.01)
     monkeypatch.setattr(journal_module, 'MOST_PENDING', 10 * 10 * ROW.itemsize)
-    told: list[str] = []
-    journal, _ = opened(tmp_path, told)
+    reported: list[str] = []
+    journal, _ = opened(tmp_path, reported)
     write = os.pwrite
 
     def pwrite(file: int, data: bytes, at: int) -> int:
@@ -225,7 +225,7 @@ def test_what_waits_for_a_disk_is_bounded(tmp_path: Path, monkeypatch: pytest.Mo
         journal.put(made(10 * k, 10, (f'sonar {k}',)), FRAMES)
     assert journal.unwritten <= 110
     assert journal.lost == 500 - journal.unwritten
-    assert any('lost from here on' in text for text in told)
+    assert any('lost from here on' in text for text in reported)
     monkeypatch.setattr(os, 'pwrite', write)
     until(lambda: not journal.unwritten)
     written(journal, made(490, 10, ('sonar 49',)))
@@ -336,5 +336,5 @@ def test_kill_at_any_moment_loses_less_than_a_second(tmp_path: Path) -> None:
     writers = 5
     with ThreadPoolExecutor(writers) as pool:
         runs = [pool.submit(killed_again_and_again, tmp_path / f'{k}', KILLS // writers, k) for k in range(writers)]
-    # the writer's share of it is a quarter of a second, as the node's
+    # the writer's part of it is a quarter of a second, as the node's
     assert 0.0 < max(run.result() for run in runs) < 1.0

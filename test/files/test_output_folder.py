@@ -82,7 +82,7 @@ def test_nothing_stays_after_a_failure(tmp_path: Path, failure: type[BaseExcepti
     assert not exists or not names_in(target)
 
 
-def test_a_full_disk_is_told(tmp_path: Path) -> None:
+def test_a_full_disk_is_reported(tmp_path: Path) -> None:
     with pytest.raises(OutputError, match='disk is full'), output_folder(tmp_path / 'maps'):
         raise OSError(errno.ENOSPC, 'No space left on device')
     assert not list(tmp_path.iterdir())

@@ -1,4 +1,4 @@
-"""Maps that explain little are doubted, aloud."""
+"""Maps that fit few readings come with a warning."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def test_readings_that_no_map_explains(tmp_path: Path) -> None:
     # echoes from anywhere, taken from one place
     wild = dataclasses.replace(drive, x=0 * drive.x, y=0 * drive.y, z=rng.uniform(0.2, 1.0, len(drive)) * drive.z_max)
     wild = Mapper(Parameters()).run(wild)
-    told = quality_warning(wild)
-    assert 'are the poses of the sensors' in told
+    warning = quality_warning(wild)
+    assert 'are the poses of the sensors' in warning
     report = write_results(tmp_path / 'maps', wild, {}, np.zeros((0, 2)), 'wild')
-    assert told in report['warnings']
+    assert warning in report['warnings']

@@ -1,4 +1,4 @@
-"""What the tests of faults share: drives, and a journal that gives a node many readings at once."""
+"""What all tests of faults need: drives, and a journal that gives a node many readings at once."""
 
 from __future__ import annotations
 

@@ -123,7 +123,7 @@ class Robot:
         return value
 
     def meet(self) -> None:
-        """Wait until the node hears the robot."""
+        """Wait until the node receives from the robot."""
         both = (self.range_out, self.odom_out)
         self.until(lambda: all(p.get_subscription_count() for p in both), 20.0, 'the node subscribes')
 
@@ -169,7 +169,7 @@ class Robot:
         return self.until(self.ask(service, kind, **fields).result, seconds, f'{service} answers')
 
     def ask(self, service: str, kind: Any = Trigger, **fields: Any) -> Any:
-        # every client hears the answers to all of them, and keeps the last 10 unless told otherwise
+        # every client receives the answers to all of them, and keeps the last 10 unless asked otherwise
         client = self.node.create_client(kind, f'{self.name}/{service}', qos_profile=QoSProfile(depth=100))
         self.until(client.service_is_ready, 20.0, f'{service} is there')
         return client.call_async(kind.Request(**fields))

@@ -1,4 +1,4 @@
-"""EM in the background: however a run ends, whoever waits is told, and the next one can begin."""
+"""EM in the background: however a run ends, whoever waits gets an answer, and the next one can begin."""
 
 from __future__ import annotations
 
@@ -30,10 +30,11 @@ def outcome_of(worker: EmWorker) -> Outcome:
 
 
 @pytest.mark.parametrize(
-    ('error', 'told'), [(MemoryError(), 'does not fit the memory'), (ValueError('odd'), "EM failed: ValueError('odd')")]
+    ('error', 'reported'),
+    [(MemoryError(), 'does not fit the memory'), (ValueError('odd'), "EM failed: ValueError('odd')")],
 )
 def test_a_run_that_fails_says_why_and_the_next_begins(
-    monkeypatch: pytest.MonkeyPatch, error: Exception, told: str
+    monkeypatch: pytest.MonkeyPatch, error: Exception, reported: str
 ) -> None:
     logged: list[str] = []
     worker = EmWorker(lambda run: None, logged.append)
@@ -43,7 +44,7 @@ def test_a_run_that_fails_says_why_and_the_next_begins(
 
     with monkeypatch.context() as patch:
         patch.setattr(Mapper, 'run', fail)
-        assert told in outcome_of(worker).message
+        assert reported in outcome_of(worker).message
     maps = outcome_of(worker).maps
     assert maps is not None
     assert len(maps.readings) == 1
@@ -51,5 +52,5 @@ def test_a_run_that_fails_says_why_and_the_next_begins(
 
 def test_a_run_that_cannot_fit_does_not_begin(monkeypatch: pytest.MonkeyPatch) -> None:
     worker = EmWorker(lambda run: None, print)
-    monkeypatch.setattr(em, 'shortage', lambda cells, readings: 'there is no room')
-    assert outcome_of(worker) == Outcome(None, 'there is no room')
+    monkeypatch.setattr(em, 'shortage', lambda cells, readings: 'there is no space')
+    assert outcome_of(worker) == Outcome(None, 'there is no space')

@@ -13,7 +13,7 @@ pytest.importorskip('rclpy', reason='stamps are asked for with rclpy')
 from forward_grid_mapper.core.messages.message_types import NANOSECONDS, OdometryMessage, Pose2, RangeMessage
 from forward_grid_mapper.core.messages.pose_association import LATER, PoseAssociator
 from forward_grid_mapper.node import frames
-from forward_grid_mapper.node.frames import Extrinsics, MapFrame, Transforms, planar
+from forward_grid_mapper.node.frames import Extrinsics, MapFrame, Transforms
 
 
 class TransformError(Exception):
@@ -83,13 +83,12 @@ def test_without_tf_an_unknown_frame_is_unknown_at_once() -> None:
 
 
 def test_poses_are_projected_and_steep_sensors_refused(buffer: Buffer, transforms: Transforms) -> None:
-    pose = planar(transform(1.0, 2.0, yaw=2.5, pitch=0.5))
-    assert pose is not None
-    assert pose.yaw == pytest.approx(2.5)
+    buffer.known['base', 'ahead'] = transform(1.0, 2.0, yaw=2.5, pitch=0.5)
     buffer.known['base', 'down'] = transform(0.0, 0.0, pitch=1.5)
     extrinsics = Extrinsics({}, transforms)
+    assert extrinsics('base', 'ahead', 0) == pytest.approx((1.0, 2.0, 2.5))
     assert extrinsics('base', 'down', 0) is None
-    assert extrinsics.steep == {'down'}
+    assert extrinsics.unusable == {'down'}
 
 
 def test_a_frame_that_is_not_there_is_asked_for_only_now_and_then(
@@ -105,7 +104,7 @@ def test_a_frame_that_is_not_there_is_asked_for_only_now_and_then(
     assert extrinsics('base', 'ghost', 99) == Pose2(1.0, 0.0, 0.0)
 
 
-def test_a_moving_mount_is_taken_at_the_readings_stamp_even_if_tf_is_late(
+def test_a_moving_sensor_is_taken_at_the_readings_stamp_even_if_tf_is_late(
     buffer: Buffer, transforms: Transforms
 ) -> None:
     buffer.known['base', 'servo'] = lambda stamp: transform(0.0, 0.0, yaw=stamp / NANOSECONDS)

@@ -86,8 +86,8 @@ def test_a_node_that_is_killed_goes_on_where_it_was(start: Any, domain: int, tmp
         assert report['sensors']['sonar/left']['accepted'] == sent
         assert report['input']['map_frame'] == 'odom'
         # a reset begins a new drive and keeps the old one
-        told = robot.call('reset').message
-        assert 'the journal keeps them in drive_0001.journal' in told
+        answer = robot.call('reset').message
+        assert 'the journal keeps them in drive_0001.journal' in answer
         robot.until(lambda: accepted(robot) == 0)
         robot.sent = 0
         robot.play(drive(5000, 50))
@@ -114,12 +114,12 @@ def test_node_and_offline_keep_the_same_readings(start: Any, robot: Robot, tmp_p
     assert robot.diagnostics['readings']['readings kept to map from'] == '300 of at most 300'
     assert robot.call('run_em').message.startswith('300 readings')
     saved = Path(robot.call('save_maps').message.split(', ')[0]).parent
-    told = json.loads((saved / 'report.json').read_text())['warnings']
-    assert any('EM maps from 300 of 1500 readings' in text for text in told)
-    assert not any('came after EM' in text for text in told)
+    warnings = json.loads((saved / 'report.json').read_text())['warnings']
+    assert any('EM maps from 300 of 1500 readings' in text for text in warnings)
+    assert not any('came after EM' in text for text in warnings)
     out = tmp_path / 'offline'
     assert process_bag([str(folder), '-o', str(out), '-q', '--set', 'max_readings=300']) == 0
-    assert told == json.loads((out / 'report.json').read_text())['warnings']
+    assert warnings == json.loads((out / 'report.json').read_text())['warnings']
     ours, offline = read_npz(saved / 'maps.npz'), read_npz(out / 'maps.npz')
     assert ours.grid == offline.grid
     for name in ('live', 'ml', 'uncertainty'):

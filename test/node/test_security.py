@@ -1,4 +1,4 @@
-"""The policy for SROS 2 names exactly what the node has, and the node writes only where it was told to."""
+"""The policy for SROS 2 names exactly what the node has, and the node writes only where it was asked to."""
 
 from __future__ import annotations
 
@@ -38,9 +38,9 @@ def test_the_policy_names_what_the_node_has(start: Any, robot: Robot) -> None:
         return {name for name, _ in found}
 
     robot.until(lambda: '/clock' in names(node.get_subscriber_names_and_types_by_node(NAME, '/')))
-    heard = names(node.get_subscriber_names_and_types_by_node(NAME, '/'))
+    received = names(node.get_subscriber_names_and_types_by_node(NAME, '/'))
     # tf2_ros may not be installed
-    assert heard | WITH_TF == allowed('topics', 'subscribe')
+    assert received | WITH_TF == allowed('topics', 'subscribe')
     assert names(node.get_publisher_names_and_types_by_node(NAME, '/')) == allowed('topics', 'publish')
     assert names(node.get_service_names_and_types_by_node(NAME, '/')) == allowed('services', 'reply')
 

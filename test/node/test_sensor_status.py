@@ -19,7 +19,7 @@ from forward_grid_mapper.simulation.sonar import NOISY
 from forward_grid_mapper.simulation.world import rooms_world
 
 
-def told(status: DiagnosticStatus) -> dict[str, str]:
+def values(status: DiagnosticStatus) -> dict[str, str]:
     return {pair.key: pair.value for pair in status.values}
 
 
@@ -29,7 +29,7 @@ def test_the_dead_sensor_is_named_once_em_has_run() -> None:
     watch = SensorWatch()
     before = watch.status('mapper', readings)
     assert before.name == 'mapper: sensors' and before.level == DiagnosticStatus.OK
-    assert told(before)['sonar_04'].endswith('readings, 100% no echo')
+    assert values(before)['sonar_04'].endswith('readings, 100% max range')
     assert len(before.values) == 24
 
     maps = Mapper(Parameters()).run(readings)
@@ -40,8 +40,8 @@ def test_the_dead_sensor_is_named_once_em_has_run() -> None:
     after = watch.status('mapper', readings)
     assert after.level == DiagnosticStatus.WARN
     assert 'sonar_04 (never hears anything)' in after.message and after.message.count('sonar_') == 1
-    assert told(after)['sonar_04'].endswith('never hears anything')
-    assert told(after)['sonar_05'].endswith(': ok')
+    assert values(after)['sonar_04'].endswith('never hears anything')
+    assert values(after)['sonar_05'].endswith(': ok')
 
     watch.clear()
     assert watch.status('mapper', readings.select(slice(0))).level == DiagnosticStatus.OK

@@ -1,4 +1,4 @@
-"""Faults around the node that it tells of: publishers that it cannot hear, and nodes of the same name."""
+"""Faults around the node that it reports: publishers that it cannot receive from, and nodes of the same name."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from robot import Robot
 from sensor_msgs.msg import Range
 
 
-def test_a_publisher_that_cannot_be_heard_and_a_namesake(start: Any, robot: Robot) -> None:
+def test_a_publisher_that_does_not_fit_and_a_namesake(start: Any, robot: Robot) -> None:
     options = ('-p', 'range_reliability:=reliable', '-p', 'odom_reliability:=reliable')
     node = start(*options)
     robot.meet()
     robot.until(lambda: 'readings' in robot.diagnostics)
-    assert 'hears nothing' not in node.output
+    assert 'nothing of it is received' not in node.output
     best_effort = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
     publisher = robot.node.create_publisher(Range, 'sonar', best_effort)
     said = 'robot publishes /sonar as best_effort, and this node asks for reliable'

@@ -32,7 +32,7 @@ RANGE = 'sensor_msgs/msg/Range'
 ODOMETRY = 'nav_msgs/msg/Odometry'
 CLOCK = 'rosgraph_msgs/msg/Clock'
 SENSORS = {'/sonar': RANGE, '/odom': ODOMETRY}
-MOUNTS = [('base_link', 'sonar_0', Pose2(0.1, 0.2, 0.5)), ('base_link', 'sonar_1', Pose2(-0.1, 0.0, 1.5))]
+EXTRINSICS = [('base_link', 'sonar_0', Pose2(0.1, 0.2, 0.5)), ('base_link', 'sonar_1', Pose2(-0.1, 0.0, 1.5))]
 
 
 def write_bag(
@@ -46,7 +46,7 @@ def write_bag(
     """Write ranges of two sensors and odometry in turn, all stamps different; return the bag's path."""
     path = folder / ('drive.bag' if kind == 'ros1' else 'drive')
     with BagWriter(path, kind) as writer:
-        writer.write_static_transforms(MOUNTS, START)
+        writer.write_static_transforms(EXTRINSICS, START)
         for i in range(count):
             stamp = START + round(i * period * NANOSECONDS)
             writer.write_odometry('/odom', OdometryMessage(stamp, 'odom', 'base_link', Pose2(i / 8, -i / 16, 0.25)))
@@ -128,7 +128,7 @@ class Listener:
             assert time.monotonic() < deadline, f'{len(self.got)} messages came, then none'
             self._executor.spin_once(timeout_sec=0.05)
 
-    def hear(self, replay: Replay) -> tuple[int, str, str]:
+    def receive(self, replay: Replay) -> tuple[int, str, str]:
         """Take messages until a replay has ended; return its exit code, output and errors."""
         self.spin(until=lambda: not replay.running)
         self.spin(until=lambda: True)

@@ -1,4 +1,4 @@
-"""`replay_bag` over DDS, heard from another process."""
+"""`replay_bag` over DDS, received by another process."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def stamps_of(messages: list[Any]) -> list[int]:
 def test_every_message_arrives_in_order_as_it_was(dds: Wire, tmp_path: Path, kind: str) -> None:
     bag = write_bag(tmp_path, kind)
     listener = dds.listen()
-    code, out, err = listener.hear(dds.replay(bag, '--rate', 10))
+    code, out, err = listener.receive(dds.replay(bag, '--rate', 10))
     assert code == 0, err
     assert '40 Range and 40 Odometry' in out
     assert listener.plain == messages_in(bag)
@@ -48,7 +48,7 @@ def test_a_best_effort_listener_hears_everything(dds: Wire, tmp_path: Path) -> N
     bag = write_bag(tmp_path, topic=lambda frame: f'/{frame}')
     topics = {'/sonar_0': RANGE, '/sonar_1': RANGE, '/odom': ODOMETRY}
     listener = dds.listen(topics, reliable=False)
-    code, _, err = listener.hear(dds.replay(bag, '--rate', 10, '--best-effort'))
+    code, _, err = listener.receive(dds.replay(bag, '--rate', 10, '--best-effort'))
     assert code == 0, err
     assert listener.plain == messages_in(bag)
     assert {message.header.frame_id for message in listener.on('/sonar_1')} == {'sonar_1'}
@@ -58,7 +58,7 @@ def test_a_real_drive_arrives_whole(dds: Wire, shared: Path) -> None:
     bag = shared / 'data' / 'office_a' / 'bag'
     options = ('--odom-topic', '/odom', '--rate', 60)
     listener = dds.listen({**{f'/sonar_{i}': RANGE for i in range(8)}, '/odom': ODOMETRY})
-    code, _, err = listener.hear(dds.replay(bag, *options))
+    code, _, err = listener.receive(dds.replay(bag, *options))
     assert code == 0, err
     assert sorted(map(repr, listener.plain)) == sorted(map(repr, messages_in(bag, '/odom')))
 
@@ -80,7 +80,7 @@ def test_it_keeps_the_pace_of_the_stamps(dds: Wire, tmp_path: Path) -> None:
 def test_the_clock_follows_the_bag_and_ticks_between_messages(dds: Wire, tmp_path: Path) -> None:
     bag = write_bag(tmp_path, count=5, period=1.0)
     listener = dds.listen({**SENSORS, '/clock': CLOCK})
-    code, _, err = listener.hear(dds.replay(bag, '--rate', 4, '--clock', 20))
+    code, _, err = listener.receive(dds.replay(bag, '--rate', 4, '--clock', 20))
     assert code == 0, err
     times = [NANOSECONDS * message.clock.sec + message.clock.nanosec for message in listener.on('/clock')]
     assert times == sorted(times)
@@ -95,7 +95,7 @@ def test_the_clock_follows_the_bag_and_ticks_between_messages(dds: Wire, tmp_pat
 def test_it_plays_as_often_as_asked(dds: Wire, tmp_path: Path) -> None:
     bag = write_bag(tmp_path, count=10)
     listener = dds.listen({**SENSORS, '/clock': CLOCK})
-    code, out, err = listener.hear(dds.replay(bag, '--rate', 10, '--loop', 2, '--clock'))
+    code, out, err = listener.receive(dds.replay(bag, '--rate', 10, '--loop', 2, '--clock'))
     assert code == 0, err
     assert '20 Range and 20 Odometry' in out
     assert stamps_of(listener.on('/odom')) == 2 * [START + i * NANOSECONDS // 10 for i in range(10)]
@@ -128,7 +128,7 @@ def test_without_listeners_it_names_the_topics(dds: Wire, tmp_path: Path) -> Non
 def test_with_listeners_that_do_not_fit_it_says_why(dds: Wire, tmp_path: Path) -> None:
     listener = dds.listen({'/robot/odom': ODOMETRY, '/sonar': RANGE})
     replay = dds.replay(write_bag(tmp_path), '--wait', 8, '--best-effort')
-    code, _, err = listener.hear(replay)
+    code, _, err = listener.receive(replay)
     assert code == 1
     assert '/odom: nav_msgs/msg/Odometry is listened to on /robot/odom' in err
     assert '/sonar: listener wants it reliable' in err
@@ -138,7 +138,7 @@ def test_topics_can_be_renamed(dds: Wire, tmp_path: Path) -> None:
     bag = write_bag(tmp_path)
     listener = dds.listen({'/robot/odom': ODOMETRY, '/robot/sonar': RANGE}, reliable=False)
     options = ('--rate', 20, '--remap', 'odom:=/robot/odom', '--ros-args', '-r', '/sonar:=/robot/sonar')
-    code, _, err = listener.hear(dds.replay(bag, *options))
+    code, _, err = listener.receive(dds.replay(bag, *options))
     assert code == 0, err
     assert listener.plain == messages_in(bag)
 

@@ -82,7 +82,7 @@ def test_topics_are_renamed_with_or_without_slash() -> None:
 
 
 @pytest.mark.parametrize(
-    ('remap', 'told'),
+    ('remap', 'reported'),
     [
         ('/sonar', 'OLD:=NEW'),
         (':=/sonar', 'OLD:=NEW'),
@@ -91,8 +91,8 @@ def test_topics_are_renamed_with_or_without_slash() -> None:
         ('/sonar:=/odom', 'both'),
     ],
 )
-def test_a_wrong_renaming_is_told(remap: str, told: str) -> None:
-    with pytest.raises(ParameterError, match=told):
+def test_a_wrong_renaming_is_reported(remap: str, reported: str) -> None:
+    with pytest.raises(ParameterError, match=reported):
         renamed(TOPICS, [remap])
 
 

@@ -112,8 +112,8 @@ def test_noise_statistics():
     z = measure(room(), ONE, robot, noise, np.random.default_rng(5))[:, 0]
     assert np.isinf(z).mean() == pytest.approx(0.2, abs=0.01)
     near = np.abs(z - 2.95) < 0.25
-    share = 0.7 + 0.1 * 0.5 / (6.0 - 0.1)
-    assert near.mean() == pytest.approx(share, abs=0.01)
+    fraction = 0.7 + 0.1 * 0.5 / (6.0 - 0.1)
+    assert near.mean() == pytest.approx(fraction, abs=0.01)
     assert z[near].mean() == pytest.approx(2.95, abs=0.002)
     assert z[near].std() == pytest.approx(0.05, abs=0.004)
     random = z[np.isfinite(z) & ~near]

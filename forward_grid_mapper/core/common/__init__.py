@@ -1,1 +1,1 @@
-"""What every other layer uses: errors, the grid, the parameter table, and readings placed in the map frame."""
+"""What every other layer uses: errors, the grid, the parameter table, and readings in the map frame."""

@@ -1,8 +1,8 @@
-"""Exceptions whose text tells the user what is wrong and what to do."""
+"""Exceptions whose text says to the user what is wrong and what to do."""
 
 
 class MapperError(Exception):
-    """Base of all errors that are the user's to mend; shown without a traceback."""
+    """Base of all errors that the user can fix; shown without a traceback."""
 
 
 class ParameterError(MapperError):

@@ -1,4 +1,4 @@
-"""Readings placed in the map frame: the columns that everything downstream works on."""
+"""Readings in the map frame: the columns that everything downstream works on."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Readings:
-    """N readings placed in the map frame, in the order of acceptance.
+    """N readings in the map frame, in the order of acceptance.
 
     Attributes
     ----------
@@ -50,7 +50,7 @@ class Readings:
 
     @property
     def echo(self) -> NDArray[np.bool_]:
-        """Whether something was heard, shape (N,)."""
+        """Whether there was an echo, shape (N,)."""
         return self.z < self.z_max
 
     def select(self, which: NDArray[np.generic] | slice) -> Readings:

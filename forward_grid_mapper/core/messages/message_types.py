@@ -1,4 +1,4 @@
-"""The two messages that mapping needs, free of ROS, and their making from any ROS message.
+"""The two messages that mapping needs, free of ROS, and the conversion of any ROS message into them.
 
 `sensor_msgs/Range` and `nav_msgs/Odometry` have the same attributes in rclpy and in rosbags (ROS 1 and ROS 2), so one
 duck-typed conversion serves the node and the offline tool alike.
@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import math
 from typing import Any, NamedTuple
+
+from .quaternions import yaw_of
 
 NANOSECONDS = 1_000_000_000
 
@@ -44,7 +46,7 @@ class RangeMessage(NamedTuple):
 class OdometryMessage(NamedTuple):
     """One `nav_msgs/Odometry`: pose of `child_frame_id` in `frame_id`, `stamp` in nanoseconds.
 
-    `pose` is None when the message's own pose is not finite or its quaternion is not normalised.
+    `pose` is None where `planar_pose` makes none of the message's.
     """
 
     stamp: int
@@ -58,13 +60,25 @@ def stamp_of(header: Any) -> int:
     return int(header.stamp.sec) * NANOSECONDS + int(header.stamp.nanosec)
 
 
-def yaw_of(quaternion: Any) -> float | None:
-    """Return the heading of the x axis in radians; None if the quaternion is not finite or not normalised."""
-    x, y, z, w = (float(quaternion.x), float(quaternion.y), float(quaternion.z), float(quaternion.w))
-    norm = x * x + y * y + z * z + w * w
-    if not abs(norm - 1.0) < 0.05:
-        return None
-    return math.atan2(2.0 * (w * z + x * y), w * w + x * x - y * y - z * z)
+def planar_pose(position: Any, orientation: Any) -> Pose2 | None:
+    """Return a pose of any library, projected on the plane.
+
+    Parameters
+    ----------
+    position
+        With attributes `x` and `y`, metres.
+    orientation
+        A quaternion with attributes `x`, `y`, `z` and `w`.
+
+    Returns
+    -------
+    Pose2 or None
+        `yaw` is the heading of the x axis. None if a number is not finite, the quaternion is not normalised, or the x
+        axis leaves the plane too steeply (`quaternions`).
+    """
+    x, y, q = float(position.x), float(position.y), orientation
+    yaw = yaw_of(float(q.x), float(q.y), float(q.z), float(q.w))
+    return Pose2(x, y, yaw) if yaw is not None and math.isfinite(x) and math.isfinite(y) else None
 
 
 def range_message(message: Any) -> RangeMessage:
@@ -82,12 +96,10 @@ def range_message(message: Any) -> RangeMessage:
 
 def odometry_message(message: Any) -> OdometryMessage:
     """Return the `OdometryMessage` of a `nav_msgs/Odometry` of any library."""
-    position = message.pose.pose.position
-    x, y, yaw = float(position.x), float(position.y), yaw_of(message.pose.pose.orientation)
-    finite = math.isfinite(x) and math.isfinite(y) and yaw is not None
+    pose = message.pose.pose
     return OdometryMessage(
         stamp_of(message.header),
         str(message.header.frame_id),
         str(message.child_frame_id),
-        Pose2(x, y, yaw) if finite and yaw is not None else None,
+        planar_pose(pose.position, pose.orientation),
     )

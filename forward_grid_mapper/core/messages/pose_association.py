@@ -7,18 +7,18 @@ messages give the same readings however fast they arrive. A clock is asked only 
 from __future__ import annotations
 
 import heapq
-import math
 import time
-from bisect import bisect_left
 from collections import Counter
 from collections.abc import Callable
 
 from ..common.parameters import Parameters
 from ..common.readings import Readings
-from ..sensor.density import CUT
+from .map_extent import MapExtent, possible
 from .message_types import NANOSECONDS, OdometryMessage, Pose2, RangeMessage
+from .pose_history import PoseHistory
 from .reading_buffer import ReadingBuffer
-from .rep117 import LONGEST_NAME, _Measurement, measure
+from .rep117 import LONGEST_NAME, Measurement, measure
+from .robot_path import RobotPath
 
 
 class Later:
@@ -31,61 +31,19 @@ ExtrinsicsLookup = Callable[[str, str, int], 'Pose2 | Later | None']
 """(base frame, sensor frame, stamp in ns) → pose of the sensor in the base frame, `LATER`, or None if unknown."""
 
 
-HISTORY = 600 * NANOSECONDS
-"""Odometry older than this, relative to the newest, is forgotten: Range messages are late by less, even where a bag is
-replayed faster than they can be taken."""
-
-MOST_POSES = 100_000
-"""Odometry messages that are kept at the most; 15 MB."""
-
 JUMP = NANOSECONDS
 """Odometry older than the newest by more than this means that the clock jumped back, not that messages overtook."""
 
 RETRY = NANOSECONDS // 20
 """How often, in message time, a pose that may still become known is asked for again."""
 
-FARTHEST = 2e7
-"""Metres from the origin beyond which no pose can be right: half the way round the Earth."""
-
-PATH_STEP = 0.05
-"""Metres between points of the robot's path, as long as it is short."""
-
-MOST_POINTS = 100_000
-"""Points of the path; when there are more, every other one goes."""
-
-FASTEST = 100.0
-"""Metres a second between two odometry messages, beyond which the pose jumped: no robot was ever in between."""
-
-STRIDE = 1.0
-"""Metres that the pose may jump in no time, as a localisation does that corrects itself."""
-
-LARGEST_CONE = 2_000_000
-"""Cells that one reading may touch, so that none keeps the node busy for longer than a moment."""
-
-
 MOST_FRAMES = 1000
-"""Sensor frames that are told apart in the counts; whatever comes after them is counted as `OTHERS`."""
-
+"""Sensor frames with counts of their own; whatever comes after them is counted as `OTHERS`."""
 
 OTHERS = '(other frames)'
 
 MOST_WAITING = 100_000
 """Readings that may wait for odometry at once, so that memory stays bounded without any."""
-
-
-def interpolate(before: Pose2, after: Pose2, fraction: float) -> Pose2:
-    """Return the pose at `fraction` of the way: position linear, yaw by the shortest way."""
-    turn = math.remainder(after.yaw - before.yaw, 2 * math.pi)
-    return Pose2(
-        before.x + fraction * (after.x - before.x),
-        before.y + fraction * (after.y - before.y),
-        before.yaw + fraction * turn,
-    )
-
-
-def _possible(pose: Pose2) -> bool:
-    """Whether a pose is finite and on Earth; `max` and `min` would hide a NaN."""
-    return abs(pose.x) < FARTHEST and abs(pose.y) < FARTHEST and math.isfinite(pose.yaw)
 
 
 class PoseAssociator:
@@ -103,8 +61,6 @@ class PoseAssociator:
         Sensor frames without a mounting pose.
     map_frame, base_frame : str
         The frames of the first odometry message; empty before it.
-    path : list of (x, y)
-        Where the robot drove, in metres: a point every `PATH_STEP`, or the double, and so on, of a long drive.
     time_jumps : int
         How often odometry's clock jumped back.
     """
@@ -121,10 +77,10 @@ class PoseAssociator:
         Parameters
         ----------
         extrinsics : callable
-            Tells where a sensor sits on the robot.
+            Answers where a sensor sits on the robot.
         parameters : Parameters, optional
         patient : bool
-            Keep all odometry and let readings wait for it without a bound, as befits a file: then the readings placed
+            Keep all odometry and let readings wait for it without a bound, as befits a file: then the readings accepted
             do not depend on how the two streams interleave.
         clock : callable
             Returns seconds. A reading times out when `pose_timeout` has passed both by the stamps that came after it
@@ -134,7 +90,7 @@ class PoseAssociator:
         self._extrinsics = extrinsics
         self.parameters = (parameters or Parameters()).association
         self._all = parameters or Parameters()
-        self._box = (math.inf, -math.inf, math.inf, -math.inf)
+        self._extent = MapExtent()
         self._patient = patient
         self.buffer = ReadingBuffer(self.parameters.max_readings)
         self.received = self.odometry_received = 0
@@ -144,13 +100,11 @@ class PoseAssociator:
         self.unknown_frames: set[str] = set()
         self.map_frame = self.base_frame = ''
         self.time_jumps = 0
-        self._waiting: list[_Measurement] = []
-        self.path: list[tuple[float, float]] = []
-        self._path_step = PATH_STEP
-        self._stamps: list[int] = []
-        self._poses: list[Pose2] = []
+        self._waiting: list[Measurement] = []
+        self._path = RobotPath()
+        self._history = PoseHistory()
         self._newest_range: int | None = None
-        self._held: list[tuple[_Measurement, Pose2]] = []
+        self._held: list[tuple[Measurement, Pose2]] = []
         self._next_try = self._next_look = 0
         self._other_frame = False
 
@@ -160,8 +114,13 @@ class PoseAssociator:
         return len(self._waiting) + len(self._held)
 
     @property
+    def path(self) -> list[tuple[float, float]]:
+        """Where the robot drove, (x, y) in metres (`robot_path`)."""
+        return self._path.points
+
+    @property
     def readings(self) -> Readings:
-        """The readings to map from: all that were placed, or `max_readings` of them."""
+        """The readings to map from: all that were accepted, or `max_readings` of them."""
         return self.buffer.bounded()
 
     def add_range(self, message: RangeMessage) -> None:
@@ -171,7 +130,7 @@ class PoseAssociator:
         if isinstance(measured, str):
             self._reject(message.frame_id, measured)
             return
-        measured.newest = self._stamps[-1] if self._stamps else None
+        measured.newest = self._history.newest
         if self.waiting >= MOST_WAITING and not self._patient:
             self._reject(message.frame_id, 'too_many_waiting')
             return
@@ -186,15 +145,14 @@ class PoseAssociator:
         self._reject(message.frame_id, reason)
 
     def clear(self, parameters: Parameters | None = None) -> None:
-        """Forget readings, counts and path; odometry is kept, so that the next reading can be placed.
+        """Forget readings, counts and path; odometry is kept, so that the next reading gets a pose.
 
         `parameters` are those of the maps that begin now.
         """
         self._all = parameters or self._all
         if self._other_frame:
             self.map_frame = self.base_frame = ''
-            self._stamps.clear()
-            self._poses.clear()
+            self._history.clear()
         self.buffer.clear()
         self.rejected.clear()
         self.odometry_rejected.clear()
@@ -202,15 +160,14 @@ class PoseAssociator:
         self.unknown_frames.clear()
         self._waiting.clear()
         self._held.clear()
-        self.path.clear()
-        self._path_step = PATH_STEP
+        self._path.clear()
         self.received = self.odometry_received = self.time_jumps = 0
-        self._box = (math.inf, -math.inf, math.inf, -math.inf)
+        self._extent.clear()
 
     def add_odometry(self, message: OdometryMessage) -> None:
         """Take one Odometry message."""
         self.odometry_received += 1
-        if message.pose is None or not _possible(message.pose):
+        if message.pose is None or not possible(message.pose):
             self.odometry_rejected['bad_pose'] += 1
             return
         if max(len(message.frame_id), len(message.child_frame_id)) > LONGEST_NAME:
@@ -224,89 +181,64 @@ class PoseAssociator:
             return
         self._other_frame = False
         self.extend_path(message.pose[:2])
-        stamps, poses = self._stamps, self._poses
-        if stamps and message.stamp < stamps[-1] - JUMP:
-            self._jump_back()
-        if not stamps or message.stamp > stamps[-1]:
-            stamps.append(message.stamp)
-            poses.append(message.pose)
-        else:
-            at = bisect_left(stamps, message.stamp)
-            if stamps[at] == message.stamp:
-                poses[at] = message.pose
-            else:
-                stamps.insert(at, message.stamp)
-                poses.insert(at, message.pose)
+        newest = self._history.newest
+        if newest is not None and message.stamp < newest - JUMP:
+            self._jump_back(newest)
+        self._history.add(message.stamp, message.pose)
         self._settle()
-        if self._patient:
-            return
-        # trimmed by halves, so that the cost a message is constant
-        old = bisect_left(stamps, stamps[-1] - HISTORY) if len(stamps) < MOST_POSES else MOST_POSES // 2
-        if old > 64 and old >= len(stamps) // 2:
-            del stamps[: old - 1], poses[: old - 1]
+        if not self._patient:
+            self._history.trim()
 
     def finish(self) -> None:
-        """Say that no more messages come: what still waits is placed if it can be, or rejected."""
-        if self._stamps:
-            self._settle_up_to(self._stamps[-1])
+        """Say that no more messages come: what still waits gets a pose if there is one, or is rejected."""
+        newest = self._history.newest
+        if newest is not None:
+            self._settle_up_to(newest)
         for measured in sorted(self._waiting):
-            self._reject(measured.frame_id, 'after_odometry' if self._stamps else 'no_odometry')
+            self._reject(measured.frame_id, 'no_odometry' if newest is None else 'after_odometry')
         self._waiting.clear()
         for measured, _ in self._held:
             self._reject_unknown(measured)
         self._held.clear()
 
     def restore(self, readings: Readings) -> None:
-        """Take readings that were placed by an earlier run, as received and accepted."""
+        """Take readings that an earlier run accepted, as received and accepted."""
         if not len(readings):
             return
         self.received += len(readings)
-        left, right, bottom, top = self._box
-        reach = float(readings.z.max())
-        self._box = (
-            min(left, float(readings.x.min()) - reach),
-            max(right, float(readings.x.max()) + reach),
-            min(bottom, float(readings.y.min()) - reach),
-            max(top, float(readings.y.max()) + reach),
-        )
+        self._extent.restore(readings)
         self.buffer.extend(readings)
 
     def extend_path(self, point: tuple[float, float]) -> None:
         """Add a point to the robot's path, if it lies far enough from the last one."""
-        if self.path and math.dist(self.path[-1], point) <= self._path_step:
-            return
-        self.path.append(point)
-        if len(self.path) > MOST_POINTS:
-            del self.path[1::2]
-            self._path_step *= 2
+        self._path.extend(point)
 
     def _reject(self, frame_id: str, reason: str) -> None:
         self.rejected[reason] += 1
         known = self.rejected_by_frame
-        room = len(known) < MOST_FRAMES and len(frame_id) <= LONGEST_NAME
-        frame = frame_id if frame_id in known or room else OTHERS
+        new = len(known) < MOST_FRAMES and len(frame_id) <= LONGEST_NAME
+        frame = frame_id if frame_id in known or new else OTHERS
         self.rejected_by_frame.setdefault(frame, Counter())[reason] += 1
 
-    def _reject_unknown(self, measured: _Measurement) -> None:
+    def _reject_unknown(self, measured: Measurement) -> None:
         if len(self.unknown_frames) < MOST_FRAMES:
             self.unknown_frames.add(measured.frame_id)
         self._reject(measured.frame_id, 'unknown_extrinsics')
 
-    def _jump_back(self) -> None:
-        self._settle_up_to(self._stamps[-1])
+    def _jump_back(self, newest: int) -> None:
+        self._settle_up_to(newest)
         self.time_jumps += 1
         for measured in (*self._waiting, *(held for held, _ in self._held)):
             self._reject(measured.frame_id, 'time_jump')
         self._waiting.clear()
         self._held.clear()
         self._next_try = self._next_look = 0
-        self._stamps.clear()
-        self._poses.clear()
+        self._history.clear()
         self._newest_range = None
 
     def _settle(self) -> None:
         """Place or reject every waiting reading whose fate is known."""
-        newest = self._stamps[-1] if self._stamps else None
+        newest = self._history.newest
         if newest is not None:
             # odometry may be late by up to JUMP, and a file can wait for it
             self._settle_up_to(newest - JUMP if self._patient else newest)
@@ -352,28 +284,14 @@ class PoseAssociator:
         while self._waiting and self._waiting[0].stamp <= stamp:
             self._place(heapq.heappop(self._waiting))
 
-    def _place(self, measured: _Measurement) -> None:
-        stamps = self._stamps
-        after = bisect_left(stamps, measured.stamp)
-        if stamps[after] == measured.stamp:
-            pose = self._poses[after]
-        elif after == 0:
-            self._reject(measured.frame_id, 'before_odometry')
+    def _place(self, measured: Measurement) -> None:
+        pose = self._history.at(measured.stamp, self.parameters.max_pose_gap)
+        if isinstance(pose, str):
+            self._reject(measured.frame_id, pose)
             return
-        else:
-            gap = stamps[after] - stamps[after - 1]
-            if gap > self.parameters.max_pose_gap * NANOSECONDS:
-                self._reject(measured.frame_id, 'pose_gap')
-                return
-            apart = math.dist(self._poses[after - 1][:2], self._poses[after][:2])
-            if apart > STRIDE + FASTEST * gap / NANOSECONDS:
-                self._reject(measured.frame_id, 'pose_jump')
-                return
-            fraction = (measured.stamp - stamps[after - 1]) / gap
-            pose = interpolate(self._poses[after - 1], self._poses[after], fraction)
         self._add_extrinsics(measured, pose)
 
-    def _add_extrinsics(self, measured: _Measurement, pose: Pose2) -> None:
+    def _add_extrinsics(self, measured: Measurement, pose: Pose2) -> None:
         """Add the sensor's pose on the robot to the robot's, and keep the reading."""
         extrinsic = self._extrinsics(self.base_frame, measured.frame_id, measured.stamp)
         if isinstance(extrinsic, Later):
@@ -383,7 +301,7 @@ class PoseAssociator:
             self._reject_unknown(measured)
             return
         sensor = pose.compose(extrinsic)
-        reason = self._misfit(sensor, measured)
+        reason = self._extent.admit(sensor, measured, self._all)
         if reason:
             self._reject(measured.frame_id, reason)
             return
@@ -398,34 +316,3 @@ class PoseAssociator:
             sigma=measured.sigma,
             stamp=measured.stamp,
         )
-
-    def _reach(self, measured: _Measurement) -> float:
-        """Return how far from the sensor the maps take note of a reading, and two cells more, in metres."""
-        p = self._all
-        cell = p.grid.resolution
-        explained = measured.z + CUT * max(measured.sigma or p.model.sigma, cell / 2)
-        return max(min(explained, measured.z_max), measured.z + max(p.live.live_depth, cell / 2)) + 2 * cell
-
-    def _misfit(self, sensor: Pose2, measured: _Measurement) -> str:
-        """Return why the map cannot grow to hold a reading; if it can, note that it does."""
-        reach = self._reach(measured)
-        cell = self._all.grid.resolution
-        if not _possible(sensor):
-            return 'too_far_away'
-        left, right, bottom, top = self._box
-        if left <= right:
-            away = max(left - sensor.x, sensor.x - right, bottom - sensor.y, sensor.y - top)
-            if away > self.parameters.max_jump:
-                return 'far_from_map'
-        box = (
-            min(left, sensor.x - reach),
-            max(right, sensor.x + reach),
-            min(bottom, sensor.y - reach),
-            max(top, sensor.y + reach),
-        )
-        if not ((box[1] - box[0]) / cell + 1) * ((box[3] - box[2]) / cell + 1) <= self._all.grid.max_cells:
-            return 'too_far_away'
-        if measured.half_angle * (reach / cell) ** 2 > LARGEST_CONE:
-            return 'large_cone'
-        self._box = box
-        return ''

@@ -1,4 +1,4 @@
-"""The readings that were placed so far: a buffer that grows up to a bound, and can be looked at from any thread."""
+"""The readings that were accepted so far: a buffer that grows up to a bound, and can be looked at from any thread."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class ReadingBuffer:
     bound : int
         Readings that `bounded` returns at the most; up to an eighth more are held. 0 is no bound.
     before_thinning : list of callable
-        Called before readings are dropped, by the thread that appends: the last chance to look at those that are new.
+        Called before readings are dropped, by the thread that appends: the last moment to look at those that are new.
     """
 
     _TYPES = {f.name: np.float64 for f in fields(Readings) if f.name not in ('stamp', 'sensor', 'sensor_names')} | {
@@ -57,7 +57,7 @@ class ReadingBuffer:
     def append(self, sensor: str, **values: float) -> None:
         """Add one reading of the sensor named `sensor`; `values` are the other columns of `Readings`."""
         if self._size == len(self._columns['z']):
-            self._make_room(1)
+            self._reserve(1)
         values['sensor'] = self._names.setdefault(sensor, len(self._names))
         values['number'] = self._count
         for name, column in self._columns.items():
@@ -69,7 +69,7 @@ class ReadingBuffer:
     def extend(self, readings: Readings) -> None:
         """Add many readings at once."""
         count = len(readings)
-        self._make_room(count)
+        self._reserve(count)
         sensors = np.array(
             [self._names.setdefault(name, len(self._names)) for name in readings.sensor_names] or [0], np.int32
         )
@@ -103,12 +103,12 @@ class ReadingBuffer:
             return readings
         return readings.select(kept(readings, self.bound))
 
-    def _make_room(self, count: int) -> None:
-        room = len(self._columns['z'])
-        while room < self._size + count:
-            room *= 2
-        if room > len(self._columns['z']):
-            grown = {name: np.empty(room, column.dtype) for name, column in self._columns.items()}
+    def _reserve(self, count: int) -> None:
+        size = len(self._columns['z'])
+        while size < self._size + count:
+            size *= 2
+        if size > len(self._columns['z']):
+            grown = {name: np.empty(size, column.dtype) for name, column in self._columns.items()}
             for name, column in self._columns.items():
                 grown[name][: self._size] = column[: self._size]
             with self._lock:

@@ -16,7 +16,7 @@ REASONS = {
     'bad_field_of_view': 'the field of view is not between 0 and 180 degrees; parameter field_of_view overrides it',
     'empty_frame_id': 'the header has no frame_id, so the sensor is unknown',
     'long_frame_id': 'the frame_id has more than 255 characters',
-    'unknown_extrinsics': 'nothing tells where this frame is on the robot: give --sensor, a YAML or a transform',
+    'unknown_extrinsics': 'nothing says where this frame is on the robot: give --sensor, a YAML or a transform',
     'before_odometry': 'the stamp is before the first odometry, or the message came minutes late',
     'after_odometry': 'the recording ended before odometry reached the stamp',
     'no_odometry': 'odometry did not reach the stamp within pose_timeout',
@@ -34,7 +34,7 @@ REASONS = {
 
 
 ODOMETRY_REASONS = {
-    'bad_pose': 'the pose is not finite, absurdly far away, or its quaternion is not normalised',
+    'bad_pose': 'the pose is not finite, absurdly far away or on end, or its quaternion is not normalised',
     'long_frame_id': 'the frame_id or child_frame_id has more than 255 characters',
     'other_frame': 'the frame_id or child_frame_id is not that of the first odometry message; reset takes the new',
 }
@@ -42,15 +42,15 @@ ODOMETRY_REASONS = {
 
 
 NEAREST = 0.001
-"""Metres below which a range is none: what drivers send of a sensor that is dead."""
+"""Least range in metres that is taken for one: the drivers of dead sensors send less."""
 
 
 LONGEST_NAME = 255
-"""Characters of a frame's name."""
+"""Most characters of a frame's name, so that names cost no memory to speak of; no TF tree has longer ones."""
 
 
-class _Measurement:
-    """A Range that passed REP 117: what it says, before it is placed. Order is that of stamps, then of arrival."""
+class Measurement:
+    """A Range that passed REP 117: what it says, before it has a pose. Order is that of stamps, then of arrival."""
 
     __slots__ = ('arrival', 'frame_id', 'half_angle', 'newest', 'number', 'sigma', 'stamp', 'z', 'z_max')
 
@@ -60,11 +60,11 @@ class _Measurement:
         self.number, self.arrival = 0, 0.0
         self.newest: int | None = None
 
-    def __lt__(self, other: _Measurement) -> bool:
+    def __lt__(self, other: Measurement) -> bool:
         return (self.stamp, self.number) < (other.stamp, other.number)
 
 
-def measure(message: RangeMessage, parameters: AssociationParameters) -> _Measurement | str:
+def measure(message: RangeMessage, parameters: AssociationParameters) -> Measurement | str:
     """Apply REP 117 and the overrides to one Range message; return what it says, or the reason of its rejection.
 
     A fixed-distance ranger (min_range = max_range) answers -inf for "something within max_range" and +inf for
@@ -99,4 +99,4 @@ def measure(message: RangeMessage, parameters: AssociationParameters) -> _Measur
         if parameters.over_range == 'discard':
             return 'over_range'
         z = z_max
-    return _Measurement(message, z, z_max, angle / 2, sigma)
+    return Measurement(message, z, z_max, angle / 2, sigma)

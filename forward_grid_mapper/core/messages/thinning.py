@@ -1,11 +1,11 @@
 """Which readings stay when there are more than may be kept: where a sensor looked often, its newest.
 
-Readings of one sensor, from one place and in one direction, share a *bin*. Every bin keeps its newest `level` readings,
-with one level for all bins, as high as the bound allows; where not all bins can have one more, or one at all, chance
-decides which do. So a robot that stands still, or drives its round again and again, gives up what repeats itself, and
-what was seen once stays. The range has no part in it: with bins by range as well, every stray echo has a bin for itself
-and stays while those that agree go: 12 000 of the simulated corridor's 96 000 readings then give a map of F1 .71;
-without it, .81, as good as the .80 of all of them.
+Readings of one sensor, from one place and in one direction, are in one *bin*. Every bin keeps its newest `level`
+readings, with one level for all bins, as high as the bound allows. Where not all bins can have one more, or one at all,
+a hash decides which do. So a robot that stands still, or drives the same way again and again, gives up what repeats
+itself, and what was seen once stays. The range has no part in it: with bins by range as well, every stray echo has a
+bin for itself and stays while those that agree go. 12 000 of the simulated corridor's 96 000 readings then give a map
+of F1 .71; without it, .81, as good as the .80 of all of them.
 
 What is kept depends on the readings alone and not on when it is decided: thinning twice, with more readings in
 between, keeps what thinning once at the end would have. (A reading is dropped only if enough others rank before it;
@@ -23,10 +23,10 @@ from numpy.typing import NDArray
 from ..common.readings import Readings
 
 SQUARE = 0.2
-"""Edge of the squares that the sensor's place is told by, metres."""
+"""Edge in metres of the squares in which sensors count as being in one place."""
 
 SECTOR = math.radians(10.0)
-"""Width of the sectors that the direction of its axis is told by."""
+"""Width in radians of the sectors in which axes count as one direction."""
 
 Words = NDArray[np.uint64]
 
@@ -43,8 +43,8 @@ def kept(readings: Readings, bound: int) -> NDArray[np.int64]:
     begins = np.flatnonzero(first)
     rank = np.arange(len(bins)) - np.repeat(begins, np.diff(begins, append=len(bins)))
     # readings of rank r are the r-th newest of their bins; whole ranks stay until one does not fit
-    room = bound - np.cumsum(np.bincount(rank))
-    level = int(np.count_nonzero(room >= 0))
+    remaining = bound - np.cumsum(np.bincount(rank))
+    level = int(np.count_nonzero(remaining >= 0))
     stay = rank < level
     last = np.flatnonzero(rank == level)
     left = bound - int(np.count_nonzero(stay))
@@ -54,7 +54,7 @@ def kept(readings: Readings, bound: int) -> NDArray[np.int64]:
 
 
 def _bins(readings: Readings) -> Words:
-    """Return a hash of each reading's bin; two bins share one with a chance of 1 in 10^19."""
+    """Return a hash of each reading's bin; two bins have the same one with a probability of 1e-19."""
     r = readings
     names = [hashlib.blake2b(name.encode('utf-8', 'surrogatepass'), digest_size=8).digest() for name in r.sensor_names]
     sensor = np.array([int.from_bytes(name, 'little') for name in names] or [0], np.uint64)[r.sensor]

@@ -1,10 +1,14 @@
 """The search for the maximum likelihood map: EM with flips in both directions, and moves.
 
-First come rounds in which all cells flip at once that gain, and gain more than their neighbours. They begin with far
-too many occupied cells and thin them out, which leads to better maps than to add one cell at a time, and takes a few
-passes over the readings. When rounds no longer help, sweeps go over the cells that gain, most promising first, until
-no single flip gains anything; then occupied cells are moved to neighbours, and so on until neither gains. Ties keep
-the state, but for occupied cells at the end that nothing needs: those are freed.
+What is called EM here is iterated conditional modes (ICM) with block moves. The causes of the readings are summed out,
+so every step climbs the exact marginal likelihood.
+
+*Parallel updates* come first: all cells flip at once that gain, and gain more than their neighbours. They begin with
+far too many occupied cells and thin them out. This leads to better maps than adding one cell at a time, and takes a few
+passes over the readings. When they no longer help, *sequential updates* go over the cells that gain, the most promising
+first, until no single flip gains. *Block moves* follow: occupied cells move to neighbours in one step. Sequential
+updates and block moves alternate until neither gains. Ties keep the state, except at the end: occupied cells that
+nothing needs are freed.
 
 All this happens twice: at first as if the cells of a map were independent, then, from the map found so, with what the
 prior says of walls (`prior`), and with bridges (`bridges`) when nothing else gains. In either part the objective

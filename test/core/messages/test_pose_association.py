@@ -1,4 +1,4 @@
-"""Placing of readings: REP 117, interpolation, waiting, and the account of every message."""
+"""Pose association of readings: REP 117, interpolation, waiting, and the account of every message."""
 
 from __future__ import annotations
 
@@ -12,11 +12,12 @@ from hypothesis import strategies as st
 
 from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.messages.message_types import NANOSECONDS, OdometryMessage, Pose2, RangeMessage
-from forward_grid_mapper.core.messages.pose_association import HISTORY, LATER, MOST_FRAMES, MOST_POINTS, PoseAssociator
+from forward_grid_mapper.core.messages.pose_association import LATER, MOST_FRAMES, PoseAssociator
+from forward_grid_mapper.core.messages.pose_history import HISTORY
 from forward_grid_mapper.core.messages.rep117 import REASONS, measure
 
 INF, NAN = math.inf, math.nan
-MOUNT = Pose2(0.2, 0.1, math.pi / 2)
+SENSOR = Pose2(0.2, 0.1, math.pi / 2)
 
 
 def sonar(seconds: float = 0.0, **changes: object) -> RangeMessage:
@@ -39,7 +40,7 @@ class Clock:
 
 def associator(patient: bool = False, clock: Clock | None = None, **values: object) -> PoseAssociator:
     return PoseAssociator(
-        lambda base, frame, stamp: MOUNT if frame.startswith('sonar') else None,
+        lambda base, frame, stamp: SENSOR if frame.startswith('sonar') else None,
         Parameters.from_flat(values),
         patient,
         clock or Clock(),
@@ -108,7 +109,7 @@ def test_variance_and_overrides() -> None:
     assert (measured.sigma, measured.half_angle, measured.z, measured.z_max) == (0.2, 0.25, 2.0, 2.0)
 
 
-def test_poses_are_interpolated_and_the_mount_is_added() -> None:
+def test_poses_are_interpolated_and_the_extrinsics_are_added() -> None:
     p = associator()
     p.add_odometry(odometry(10.0, 1.0, 2.0, 3.0))
     p.add_range(sonar(10.25))
@@ -164,7 +165,7 @@ def test_a_reading_times_out_by_stamps_and_by_the_clock() -> None:
 
 def test_a_pose_that_becomes_known_later_is_waited_for() -> None:
     clock, known = Clock(), {'sonar'}
-    p = PoseAssociator(lambda base, frame, stamp: MOUNT if frame in known else LATER, clock=clock)
+    p = PoseAssociator(lambda base, frame, stamp: SENSOR if frame in known else LATER, clock=clock)
     p.add_odometry(odometry(0.0))
     p.add_range(sonar(0.0, frame_id='late'))
     p.add_range(sonar(0.0, frame_id='never'))
@@ -186,7 +187,7 @@ def test_an_exact_stamp_needs_no_bracket() -> None:
     assert len(p.buffer) == 1
 
 
-def test_unknown_mount_is_counted_and_named() -> None:
+def test_unknown_extrinsics_are_counted_and_named() -> None:
     p = associator()
     p.add_odometry(odometry(0.0))
     p.add_range(sonar(0.0, frame_id='mystery'))
@@ -216,7 +217,7 @@ def test_odometry_that_overtakes_is_sorted_in() -> None:
     for second, x in ((0.0, 0.0), (0.4, 4.0), (0.2, 1.0)):
         p.add_odometry(odometry(second, x))
     p.add_range(sonar(0.1))
-    assert p.readings.x[0] == pytest.approx(0.5 + MOUNT.x)
+    assert p.readings.x[0] == pytest.approx(0.5 + SENSOR.x)
 
 
 def test_bad_odometry_is_counted() -> None:
@@ -250,13 +251,13 @@ def test_odometry_kept_is_bounded_unless_patient() -> None:
     for k in range(50_000):
         p.add_odometry(odometry(0.05 * k))
         q.add_odometry(odometry(0.05 * k))
-    assert len(p._stamps) < 2.2 * HISTORY / (0.05 * NANOSECONDS)
-    assert len(q._stamps) == 50_000
+    assert len(p._history) < 2.2 * HISTORY / (0.05 * NANOSECONDS)
+    assert len(q._history) == 50_000
 
 
 @settings(max_examples=60, deadline=None)
 @given(st.integers(0, 2**32 - 1))
-def test_a_patient_placer_does_not_care_about_interleaving(seed: int) -> None:
+def test_a_patient_associator_does_not_care_about_interleaving(seed: int) -> None:
     rng = random.Random(seed)
     poses = [odometry(0.1 * k + 0.01 * rng.random(), k, -k, 0.1 * k) for k in range(30) if rng.random() < 0.8]
     ranges = [sonar(3.2 * rng.random() - 0.1, range=rng.choice([1.0, 2.0, INF, NAN])) for _ in range(60)]
@@ -420,16 +421,6 @@ def test_what_strangers_can_make_grow_is_bounded() -> None:
     assert len(p.rejected_by_frame) <= MOST_FRAMES + 1
     assert len(p.unknown_frames) <= MOST_FRAMES
     assert sum(sum(counts.values()) for counts in p.rejected_by_frame.values()) == sum(p.rejected.values())
-
-
-def test_a_long_path_is_told_by_fewer_points() -> None:
-    p = associator()
-    for k in range(3 * MOST_POINTS):
-        p.extend_path((0.06 * k, 0.0))
-    assert len(p.path) <= MOST_POINTS
-    assert p.path[-1][0] > 0.06 * 3 * MOST_POINTS - 1.0
-    steps = np.diff(np.array(p.path)[:, 0])
-    assert steps.max() < 2.5 * np.median(steps)
 
 
 def test_a_reset_begins_with_the_odometry_that_comes() -> None:

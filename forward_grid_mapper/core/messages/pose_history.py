@@ -1,0 +1,102 @@
+"""The robot's poses over time, as odometry gives them, and the pose at any stamp in between."""
+
+from __future__ import annotations
+
+import math
+from bisect import bisect_left
+
+from .message_types import NANOSECONDS, Pose2
+
+HISTORY = 600 * NANOSECONDS
+"""Nanoseconds before the newest pose from which on poses are forgotten: Range messages are late by less, even where a
+bag is replayed faster than they can be taken."""
+
+MOST_POSES = 100_000
+"""Poses that are kept at the most; 15 MB."""
+
+FEWEST = 64
+"""Poses below which none is forgotten, so that trimming costs nothing where there are few."""
+
+FASTEST = 100.0
+"""Metres a second between two poses, beyond which the pose jumped: no robot drives faster."""
+
+STRIDE = 1.0
+"""Metres that the pose may jump in no time, as a localisation does that corrects itself."""
+
+
+def interpolate(before: Pose2, after: Pose2, fraction: float) -> Pose2:
+    """Return the pose at `fraction` of the way: position linear, yaw by the shortest way."""
+    turn = math.remainder(after.yaw - before.yaw, 2 * math.pi)
+    return Pose2(
+        before.x + fraction * (after.x - before.x),
+        before.y + fraction * (after.y - before.y),
+        before.yaw + fraction * turn,
+    )
+
+
+class PoseHistory:
+    """Poses by stamp, in nanoseconds, at most one for each stamp."""
+
+    def __init__(self) -> None:
+        self._stamps: list[int] = []
+        self._poses: list[Pose2] = []
+
+    def __len__(self) -> int:
+        return len(self._stamps)
+
+    @property
+    def newest(self) -> int | None:
+        """The latest stamp; None while there is none."""
+        return self._stamps[-1] if self._stamps else None
+
+    def clear(self) -> None:
+        """Forget every pose."""
+        self._stamps.clear()
+        self._poses.clear()
+
+    def add(self, stamp: int, pose: Pose2) -> None:
+        """Add a pose, in any order of stamps; it replaces one of the same stamp."""
+        stamps, poses = self._stamps, self._poses
+        if not stamps or stamp > stamps[-1]:
+            stamps.append(stamp)
+            poses.append(pose)
+            return
+        at = bisect_left(stamps, stamp)
+        if stamps[at] == stamp:
+            poses[at] = pose
+        else:
+            stamps.insert(at, stamp)
+            poses.insert(at, pose)
+
+    def trim(self) -> None:
+        """Forget poses older than `HISTORY`, and the older half of more than `MOST_POSES`.
+
+        They go by halves, so that the cost of a message is constant.
+        """
+        stamps = self._stamps
+        old = bisect_left(stamps, stamps[-1] - HISTORY) if len(stamps) < MOST_POSES else MOST_POSES // 2
+        if old > FEWEST and old >= len(stamps) // 2:
+            del stamps[: old - 1], self._poses[: old - 1]
+
+    def at(self, stamp: int, max_gap: float) -> Pose2 | str:
+        """Return the pose at a stamp, or the reason why there is none (`rep117.REASONS`).
+
+        Parameters
+        ----------
+        stamp : int
+            Nanoseconds, not after `newest`.
+        max_gap : float
+            Seconds between two poses that may be bridged.
+        """
+        stamps, poses = self._stamps, self._poses
+        after = bisect_left(stamps, stamp)
+        if stamps[after] == stamp:
+            return poses[after]
+        if after == 0:
+            return 'before_odometry'
+        gap = stamps[after] - stamps[after - 1]
+        if gap > max_gap * NANOSECONDS:
+            return 'pose_gap'
+        if math.dist(poses[after - 1][:2], poses[after][:2]) > STRIDE + FASTEST * gap / NANOSECONDS:
+            return 'pose_jump'
+        return interpolate(poses[after - 1], poses[after], (stamp - stamps[after - 1]) / gap)

@@ -1,0 +1,45 @@
+"""Quaternions in the plane: the one conversion of an orientation into a heading, for the node and for bags alike."""
+
+from __future__ import annotations
+
+import math
+
+TOLERANCE = 0.01
+"""Bound on |x² + y² + z² + w² − 1|, no unit. tf2 refuses what is beyond, so the node and a bag take the same ones."""
+
+STEEPEST = math.radians(60.0)
+"""Largest angle between an x axis and the plane, radians. Beyond it the heading is ill-defined, and the cone of a
+sensor is foreshortened to less than half its length."""
+
+Rotation = tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]]
+"""Rows of a rotation matrix; its first column is the x axis."""
+
+
+def rotation_of(x: float, y: float, z: float, w: float) -> Rotation | None:
+    """Return the rotation of a quaternion, brought to length one; None if it is not finite or not normalised."""
+    square = x * x + y * y + z * z + w * w
+    # a NaN compares false
+    if not abs(square - 1.0) <= TOLERANCE:
+        return None
+    s = 2.0 / square
+    return (
+        (1.0 - s * (y * y + z * z), s * (x * y - z * w), s * (x * z + y * w)),
+        (s * (x * y + z * w), 1.0 - s * (x * x + z * z), s * (y * z - x * w)),
+        (s * (x * z - y * w), s * (y * z + x * w), 1.0 - s * (x * x + y * y)),
+    )
+
+
+def elevation_of(x: float, y: float, z: float) -> float:
+    """Return the angle of a direction above the plane, radians; negative below it."""
+    return math.atan2(z, math.hypot(x, y))
+
+
+def heading_of(x: float, y: float, z: float) -> float | None:
+    """Return the heading of an x axis in the plane, radians; None if it leaves the plane by more than `STEEPEST`."""
+    return None if abs(elevation_of(x, y, z)) > STEEPEST else math.atan2(y, x)
+
+
+def yaw_of(x: float, y: float, z: float, w: float) -> float | None:
+    """Return the heading of a quaternion's x axis, radians; None if it is not normalised, or too steep."""
+    rotation = rotation_of(x, y, z, w)
+    return None if rotation is None else heading_of(rotation[0][0], rotation[1][0], rotation[2][0])

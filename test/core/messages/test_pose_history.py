@@ -1,0 +1,54 @@
+"""Poses of the robot over time."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from forward_grid_mapper.core.messages.message_types import NANOSECONDS, Pose2
+from forward_grid_mapper.core.messages.pose_history import HISTORY, MOST_POSES, PoseHistory, interpolate
+
+SECOND = NANOSECONDS
+
+
+def history(*poses: tuple[float, Pose2]) -> PoseHistory:
+    made = PoseHistory()
+    for seconds, pose in poses:
+        made.add(round(seconds * SECOND), pose)
+    return made
+
+
+def test_yaw_goes_the_shortest_way() -> None:
+    pose = interpolate(Pose2(0.0, 2.0, 3.1), Pose2(1.0, 4.0, -3.1), 0.25)
+    assert pose == pytest.approx((0.25, 2.5, 3.1 + 0.25 * (2 * math.pi - 6.2)))
+
+
+def test_poses_in_any_order_and_the_last_of_one_stamp() -> None:
+    made = history((2.0, Pose2(2, 0, 0)), (1.0, Pose2(1, 0, 0)), (1.5, Pose2(9, 0, 0)), (1.5, Pose2(1.5, 0, 0)))
+    assert (len(made), made.newest) == (3, 2 * SECOND)
+    assert made.at(round(1.25 * SECOND), 1.0) == pytest.approx((1.25, 0, 0))
+    assert made.at(round(1.5 * SECOND), 0.001) == Pose2(1.5, 0, 0), 'an exact stamp bridges no gap'
+    made.clear()
+    assert (len(made), made.newest) == (0, None)
+
+
+def test_reasons_why_there_is_no_pose() -> None:
+    made = history((1.0, Pose2(0, 0, 0)), (3.0, Pose2(0, 0, 0)), (3.1, Pose2(11.5, 0, 0)), (3.2, Pose2(0.6, 0, 0)))
+    assert made.at(0, 9.0) == 'before_odometry'
+    assert made.at(2 * SECOND, 1.9) == 'pose_gap'
+    assert made.at(2 * SECOND, 2.0) == Pose2(0, 0, 0)
+    assert made.at(round(3.05 * SECOND), 9.0) == 'pose_jump'
+    assert isinstance(made.at(round(3.15 * SECOND), 9.0), Pose2), '10.9 m in 0.1 s: a drive and one correction'
+
+
+def test_old_poses_go() -> None:
+    made = PoseHistory()
+    for k in range(MOST_POSES + 1):
+        made.add(k, Pose2(k, 0, 0))
+        made.trim()
+    assert len(made) <= MOST_POSES // 2 + 3
+    made = history(*((10.0 * k, Pose2(k, 0, 0)) for k in range(200)))
+    made.trim()
+    assert len(made) * 10 * SECOND <= HISTORY + 20 * SECOND
+    assert made.newest == 1990 * SECOND

@@ -1,0 +1,119 @@
+"""Every name in README.md and docs/ exists: files, functions, parameters, commands, tests, topics, links."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from doc_names import DEPRECATED, PAGES, ROOT, wrong_commands, wrong_defaults, wrong_links, wrong_names
+
+ALLOWED = {
+    '.venv': 'the folder that the scripts set up',
+    '[ros]': 'an extra of setup.py',
+    'src': 'a folder of a colcon workspace',
+    '.bag': 'the ending of ROS 1 bags',
+    'mode: raw': 'a line of map_server files',
+    'use_sim_time:=true': 'a parameter of every ROS node',
+    'set_parameters': 'a service of every ROS node',
+    'NUMBA_CACHE_DIR': 'an environment variable of numba',
+    '~/.cache': 'a folder of the user',
+    '~/.ros/log': 'a folder of the user',
+    'office_a': 'a recording that is not part of the project',
+    'office_b': 'a recording that is not part of the project',
+    'others': 'a column of the tables that the benchmarks print',
+    'ml_map.pgm': 'a name of a map and an ending',
+    'maps_DATE_TIME/': 'a folder that the node makes',
+    'drive_NNNN.journal': 'a file that the node makes',
+}
+"""Words in code spans that name nothing in the repository, and why they may stand there."""
+
+of_each_page = pytest.mark.parametrize('page', PAGES, ids=[str(page.relative_to(ROOT)) for page in PAGES])
+
+
+@of_each_page
+def test_every_name_exists(page: Path) -> None:
+    assert wrong_names(page.read_text(encoding='utf-8'), page, ALLOWED) == []
+
+
+@of_each_page
+def test_every_command_line_would_run(page: Path) -> None:
+    assert wrong_commands(page.read_text(encoding='utf-8'), page) == []
+
+
+@of_each_page
+def test_every_link_leads_somewhere(page: Path) -> None:
+    assert wrong_links(page.read_text(encoding='utf-8'), page) == []
+
+
+@of_each_page
+def test_defaults_are_those_of_the_table(page: Path) -> None:
+    assert wrong_defaults(page.read_text(encoding='utf-8')) == []
+
+
+def test_words_that_name_nothing_are_still_in_use() -> None:
+    pages = '\n'.join(page.read_text(encoding='utf-8') for page in PAGES)
+    assert [word for word in ALLOWED if f'`{word}`' not in pages] == []
+
+
+# The tests above can fail: each of these has one wrong name
+
+PAGE = ROOT / 'docs' / 'planted.md'
+GOOD = """# A page
+
+See `core/search/search.py`: `Search.run`, `LEAST_GAIN`; `p_hit` 0.5, `process_bag --learn`, `~/run_em`,
+`search.Search`, `test_search.py::test_alpha_zero_leaves_the_prior`, `test_docs.py`,
+`sensor_msgs/Range`, `pose_gap`, `--set`, `maps.npz` and [here](#a-page), ![there](door.png).
+
+    python3 -m forward_grid_mapper process_bag MY_BAG -o maps --set p_hit=0.8
+    python benchmarks/speed.py --only live
+"""
+
+
+def wrong(text: str) -> list[str]:
+    return [*wrong_names(text, PAGE, {}), *wrong_commands(text, PAGE), *wrong_links(text, PAGE), *wrong_defaults(text)]
+
+
+def test_a_page_of_good_names_has_no_wrong_one() -> None:
+    assert wrong(GOOD) == []
+
+
+@pytest.mark.parametrize(
+    ('good', 'bad'),
+    [
+        ('core/search/search.py', 'core/search.py'),
+        ('Search.run', 'Search.walk'),
+        ('LEAST_GAIN', 'LEAST_LOSS'),
+        ('`p_hit` 0.5', '`p_hid` 0.5'),
+        ('process_bag --learn', 'process_bag --lern'),
+        ('process_bag --learn', 'process_bags'),
+        ('~/run_em', '~/run_me'),
+        ('search.Search', 'search.Find'),
+        ('test_alpha_zero_leaves_the_prior', 'test_alpha_zero_leaves_nothing'),
+        ('`test_docs.py`', '`test_doc.py`'),
+        ('`test_docs.py`', 'test_doc'),
+        ('sensor_msgs/Range', 'sensor_msgs/Ranger'),
+        ('`pose_gap`', '`pose_hole`'),
+        ('`--set`', '`--sit`'),
+        ('`maps.npz`', '`maps.npy`'),
+        ('(#a-page)', '(#no-page)'),
+        ('(door.png)', '(window.png)'),
+        ('grid_mapper process_bag', 'grid_mapper process_bags'),
+        (' -o maps', ' --into maps'),
+        ('p_hit=0.8', 'p_hid=0.8'),
+        ('benchmarks/speed.py', 'benchmarks/sped.py'),
+        ('--only live', '--just live'),
+        ('# A page\n', '# A page\n\n**Bold** (`p_hit` 0.123).\n'),
+        ('# A page\n', '# A page\n\n| parameter | default |\n|---|---|\n| `max_sweeps` | `123` |\n'),
+        ('# A page\n', '# A page\n\nIn core/finishing.py it is so.\n'),
+    ],
+)
+def test_a_wrong_name_is_found(good: str, bad: str) -> None:
+    assert good in GOOD
+    assert wrong(GOOD.replace(good, bad)) != []
+
+
+@pytest.mark.skipif(not DEPRECATED, reason='no parameter has a former name')
+def test_a_former_name_must_be_called_so() -> None:
+    name = sorted(DEPRECATED)[0]
+    assert wrong(f'Set `{name}`.\n') == [f'{name} is deprecated']
+    assert wrong(f'Set `{name}`, which is deprecated.\n') == []
