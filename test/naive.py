@@ -14,6 +14,7 @@ from forward_grid_mapper.core.evidence.state import State
 from forward_grid_mapper.core.evidence.tile_index import Tiles
 from forward_grid_mapper.core.search.prior import Prior
 from forward_grid_mapper.core.sensor.density import CUT
+from forward_grid_mapper.core.sensor.surface_normals import THROUGH, SurfaceNormals
 
 
 def axis_crosses(x: float, y: float, yaw: float, length: float, left: float, bottom: float, size: float) -> bool:
@@ -86,9 +87,36 @@ def sigma_of(readings: Readings, t: int, grid: Grid, model: ModelParameters) -> 
     return max(readings.sigma[t] if readings.sigma[t] > 0 else model.sigma, grid.resolution / 2)
 
 
-def obstacles(readings: Readings, t: int, grid: Grid, occupied: np.ndarray, model: ModelParameters) -> list[float]:
+def left_out(
+    readings: Readings, t: int, grid: Grid, model: ModelParameters, normals: SurfaceNormals | None
+) -> set[int]:
+    """The cells that reading t meets beyond the incidence angle and passes, by the definition."""
+    if normals is None or not len(normals.known):
+        return set()
+    xs, ys = grid.centers()
+    out = set()
+    for c in cells_of(readings, t, grid, model):
+        dx, dy = xs[c % grid.width] - readings.x[t], ys[c // grid.width] - readings.y[t]
+        d = math.hypot(dx, dy) - surface(grid, model)
+        if normals.known[c] and d < readings.z[t] - THROUGH * sigma_of(readings, t, grid, model):
+            along = abs(normals.x[c] * dx + normals.y[c] * dy)
+            if along / math.hypot(dx, dy) < math.cos(model.grazing_angle):
+                out.add(c)
+    return out
+
+
+def obstacles(
+    readings: Readings,
+    t: int,
+    grid: Grid,
+    occupied: np.ndarray,
+    model: ModelParameters,
+    normals: SurfaceNormals | None = None,
+) -> list[float]:
     """Distances of the occupied cells that reading t can meet."""
-    return [d for c, d in cells_of(readings, t, grid, model).items() if occupied.ravel()[c] == 1]
+    passed = left_out(readings, t, grid, model, normals)
+    cells = cells_of(readings, t, grid, model)
+    return [d for c, d in cells.items() if occupied.ravel()[c] == 1 and c not in passed]
 
 
 def likelihood(z: float, z_max: float, sigma: float, distances: list[float], model: ModelParameters) -> float:
@@ -101,10 +129,16 @@ def likelihood(z: float, z_max: float, sigma: float, distances: list[float], mod
     return total + mixture_weight * normal(z, z_max, sigma)
 
 
-def log_likelihood(readings: Readings, grid: Grid, occupied: np.ndarray, model: ModelParameters) -> float:
+def log_likelihood(
+    readings: Readings,
+    grid: Grid,
+    occupied: np.ndarray,
+    model: ModelParameters,
+    normals: SurfaceNormals | None = None,
+) -> float:
     total = 0.0
     for t in range(len(readings)):
-        met = obstacles(readings, t, grid, occupied, model)
+        met = obstacles(readings, t, grid, occupied, model, normals)
         total += math.log(sum(causes(readings.z[t], readings.z_max[t], sigma_of(readings, t, grid, model), met, model)))
     return total
 

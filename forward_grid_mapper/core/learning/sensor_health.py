@@ -29,8 +29,7 @@ from ..common.readings import Floats
 from ..maps.log_odds_map import LogOddsMap
 from ..maps.map_set import MapSet
 from ..runtime.jit import kernel
-from ..sensor.cone import make_cone, row_runs
-from ..sensor.cone_table import offset_of
+from ..sensor.cone import make_cone, rows_of, runs_of
 from ..sensor.forward_model import ForwardModel
 
 NEAR = 0.5
@@ -103,12 +102,12 @@ def _first_obstacles(cones: Any, occupied: Any, out: Any) -> None:
         across, up = max(reading.x, width - reading.x), max(reading.y, height - reading.y)
         reach = min(reading.reach, math.hypot(across, up))
         axis, half = (reading.axis_x, reading.axis_y), (reading.sine, reading.cosine)
-        cone = make_cone(reading.x, reading.y, axis, half, reach)
+        cone = make_cone(reading.x, reading.y, axis, half, (reach, 0.0))
         nearest = np.inf
-        for row in range(max(cone.bottom, 0), min(cone.top, height - 1) + 1):
+        for row in range(*rows_of(cone, height)):
             v = row + 0.5 - cone.y
-            a, b, c, d = row_runs(cone, row, reach, width, False)
-            for first, last in ((a, b), (c, d)):
+            runs = runs_of(cone, row, width)
+            for first, last in ((runs.first, runs.last), (runs.first2, runs.last2)):
                 for column in range(first, last + 1):
                     if occupied[row, column]:
                         u = column + 0.5 - cone.x
@@ -125,7 +124,7 @@ def first_obstacles(forward: ForwardModel, ml: NDArray[np.int8]) -> Floats:
     cones['reach'] = cones['z_max']
     out = np.empty(len(cones))
     _first_obstacles(cones, np.ascontiguousarray(ml == 1), out)
-    return (out - offset_of(forward.model)) * forward.grid.resolution
+    return (out - forward.model.surface_offset) * forward.grid.resolution
 
 
 def commonest_range(z: Floats) -> tuple[int, float]:
