@@ -50,7 +50,7 @@ def random_normals(rng: np.random.Generator, grid: Grid, angle: float) -> Surfac
 @pytest.mark.parametrize('seed', range(30))
 def test_with_normals_it_is_that_of_all_correspondences_with_surfaces_that_answer(seed: int) -> None:
     rng = np.random.default_rng(400 + seed)
-    readings, model = random_readings(rng, GRID, 80), dataclasses.replace(random_model(rng), grazing_angle=0.6)
+    readings, model = random_readings(rng, GRID, 80), dataclasses.replace(random_model(rng), grazing_angle=0.6, sigma=0.05)
     readings.sigma[:] *= 0.3
     normals = random_normals(rng, GRID, model.grazing_angle)
     occupied = (rng.random(GRID.shape) < 0.7).astype(np.int8)
