@@ -12,8 +12,10 @@ from forward_grid_mapper.core.common.parameters import ModelParameters
 from forward_grid_mapper.core.common.readings import Readings
 from forward_grid_mapper.core.evidence.state import State
 from forward_grid_mapper.core.evidence.tile_index import Tiles
+from forward_grid_mapper.core.maps.wall_extension import MOST_AGAINST, STRAIGHT_RUN
 from forward_grid_mapper.core.search.prior import Prior
 from forward_grid_mapper.core.sensor.density import CUT
+from forward_grid_mapper.core.sensor.surface_normals import THROUGH, SurfaceNormals
 
 
 def axis_crosses(x: float, y: float, yaw: float, length: float, left: float, bottom: float, size: float) -> bool:
@@ -86,9 +88,36 @@ def sigma_of(readings: Readings, t: int, grid: Grid, model: ModelParameters) -> 
     return max(readings.sigma[t] if readings.sigma[t] > 0 else model.sigma, grid.resolution / 2)
 
 
-def obstacles(readings: Readings, t: int, grid: Grid, occupied: np.ndarray, model: ModelParameters) -> list[float]:
+def left_out(
+    readings: Readings, t: int, grid: Grid, model: ModelParameters, normals: SurfaceNormals | None
+) -> set[int]:
+    """The cells that reading t meets beyond the incidence angle and passes, by the definition."""
+    if normals is None or not len(normals.known):
+        return set()
+    xs, ys = grid.centers()
+    out = set()
+    for c in cells_of(readings, t, grid, model):
+        dx, dy = xs[c % grid.width] - readings.x[t], ys[c // grid.width] - readings.y[t]
+        d = math.hypot(dx, dy) - surface(grid, model)
+        if normals.known[c] and d < readings.z[t] - THROUGH * sigma_of(readings, t, grid, model):
+            along = abs(normals.x[c] * dx + normals.y[c] * dy)
+            if along / math.hypot(dx, dy) < math.cos(model.grazing_angle):
+                out.add(c)
+    return out
+
+
+def obstacles(
+    readings: Readings,
+    t: int,
+    grid: Grid,
+    occupied: np.ndarray,
+    model: ModelParameters,
+    normals: SurfaceNormals | None = None,
+) -> list[float]:
     """Distances of the occupied cells that reading t can meet."""
-    return [d for c, d in cells_of(readings, t, grid, model).items() if occupied.ravel()[c] == 1]
+    passed = left_out(readings, t, grid, model, normals)
+    cells = cells_of(readings, t, grid, model)
+    return [d for c, d in cells.items() if occupied.ravel()[c] == 1 and c not in passed]
 
 
 def likelihood(z: float, z_max: float, sigma: float, distances: list[float], model: ModelParameters) -> float:
@@ -101,10 +130,16 @@ def likelihood(z: float, z_max: float, sigma: float, distances: list[float], mod
     return total + mixture_weight * normal(z, z_max, sigma)
 
 
-def log_likelihood(readings: Readings, grid: Grid, occupied: np.ndarray, model: ModelParameters) -> float:
+def log_likelihood(
+    readings: Readings,
+    grid: Grid,
+    occupied: np.ndarray,
+    model: ModelParameters,
+    normals: SurfaceNormals | None = None,
+) -> float:
     total = 0.0
     for t in range(len(readings)):
-        met = obstacles(readings, t, grid, occupied, model)
+        met = obstacles(readings, t, grid, occupied, model, normals)
         total += math.log(sum(causes(readings.z[t], readings.z_max[t], sigma_of(readings, t, grid, model), met, model)))
     return total
 
@@ -239,7 +274,13 @@ def prior_gain(prior: Prior, occupied: np.ndarray, c: int, shape: tuple[int, int
     return after - before
 
 
-def log_likelihoods(readings: Readings, grid: Grid, maps: np.ndarray, model: ModelParameters) -> np.ndarray:
+def log_likelihoods(
+    readings: Readings,
+    grid: Grid,
+    maps: np.ndarray,
+    model: ModelParameters,
+    normals: SurfaceNormals | None = None,
+) -> np.ndarray:
     """Those of many maps, shape (maps, cells), at once."""
     mixture_weight = 1 - model.p_rand - model.p_lost
     total = np.zeros(len(maps))
@@ -248,7 +289,10 @@ def log_likelihoods(readings: Readings, grid: Grid, maps: np.ndarray, model: Mod
         no_echo = normal(z, z_max, sigma)
         unmapped = model.p_rand / z_max + lost(z, z_max, sigma, model)
         likelihood, left = np.full(len(maps), unmapped), np.full(len(maps), mixture_weight)
+        passed = left_out(readings, t, grid, model, normals)
         for c, d in sorted(cells_of(readings, t, grid, model).items(), key=lambda pair: pair[1]):
+            if c in passed:
+                continue
             answers = model.p_hit * maps[:, c]
             likelihood += left * answers * normal(z, d, sigma)
             left *= 1 - answers
@@ -310,3 +354,68 @@ def passed(
                 p += chance / total * ((1 - model.p_hit) ** len(blocking) if behind else 1.0)
             out[c] += p * strength(readings, t, grid, c) * (1 if weight is None else weight[t])
     return out
+
+
+def evidence(
+    readings: Readings, grid: Grid, occupied: np.ndarray, model: ModelParameters, normals: SurfaceNormals | None
+) -> np.ndarray:
+    """log p(Z | cell occupied, rest of the map) - log p(Z | cell free, rest of the map), shape (cells,)."""
+    both = np.repeat(occupied.reshape(1, 1, -1), grid.size, axis=1).repeat(2, axis=0)
+    for c in range(grid.size):
+        both[:, c, c] = 0, 1
+    free, full = (log_likelihoods(readings, grid, maps, model, normals) for maps in both)
+    return full - free
+
+
+STEPS = [(1, 0), (1, 1), (0, 1), (-1, 1), (-1, 0), (-1, -1), (0, -1), (1, -1)]
+
+
+def drawn_out(occupied: np.ndarray, told: np.ndarray, seen: np.ndarray, steps: int, barred: np.ndarray) -> np.ndarray:
+    """Cells by which straight walls go on: the docstring of `extend`. Shapes (height, width); `told` in nats."""
+    height, width = occupied.shape
+    out = np.zeros(occupied.shape, np.uint8)
+
+    def at(x: int, y: int) -> bool:
+        return 0 <= x < width and 0 <= y < height and occupied[y, x] == 1
+
+    for y, x in np.argwhere(occupied == 1):
+        for k, (dx, dy) in enumerate(STEPS):
+            ahead = [STEPS[k], STEPS[(k + 1) % 8], STEPS[k - 1]]
+            straight = all(at(x - n * dx, y - n * dy) for n in range(STRAIGHT_RUN))
+            if not straight or any(at(x + u, y + v) for u, v in ahead):
+                continue
+            for n in range(1, steps + 1):
+                u, v = x + n * dx, y + n * dy
+                if not (0 <= u < width and 0 <= v < height):
+                    break
+                if barred[v, u] or occupied[v, u] or not seen[v, u] or told[v, u] < -MOST_AGAINST:
+                    break
+                out[v, u] = 1
+    return out
+
+
+def handed_out(
+    readings: Readings,
+    grid: Grid,
+    occupied: np.ndarray,
+    model: ModelParameters,
+    normals: SurfaceNormals | None,
+    traversed: np.ndarray,
+    steps: int,
+    least_passed: float,
+) -> np.ndarray:
+    """The map that is handed out, made of the one that the search found."""
+    seen = np.zeros(grid.size, int)
+    for t in range(len(readings)):
+        seen[list(cells_of(readings, t, grid, model))] += 1
+    seen = seen.reshape(grid.shape)
+    ml = np.where(seen > 0, occupied.reshape(grid.shape).astype(int), -1)
+    ml[traversed & (ml < 0)] = 0
+    through = passed(readings, grid, occupied, model).reshape(grid.shape) >= least_passed
+    known = (ml == 0) & (traversed | through)
+    told = evidence(readings, grid, occupied, model, normals).reshape(grid.shape)
+    told = np.where(occupied.reshape(grid.shape) == 1, -told, told)
+    ahead = drawn_out(occupied.reshape(grid.shape), told, seen, steps, known)
+    ml[ahead == 1] = 1
+    ml[(ml == 0) & (box_sum(known.astype(int)) == 0)] = -1
+    return ml

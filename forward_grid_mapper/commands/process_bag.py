@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from ..core.common.errors import ParameterError
-from ..core.mapping import Mapper
+from ..core.joint_learning import map_and_learn
 from ..core.maps.map_set import MapSet
 from ..files.map_files import occupancy_values
 from ..files.output_folder import free_name, output_folder, readable
@@ -67,7 +67,7 @@ def process(options: argparse.Namespace) -> int:
             ticker.reading,
         )
         read = time.perf_counter() - begin
-        maps = Mapper(parameters, options.learn).run(drive.associator.readings, ticker.mapping)
+        maps = map_and_learn(drive.associator.readings, parameters, options.learn, ticker.mapping)
         maps = drive.live.on(maps)
         maps.statistics['seconds'] = {'reading the bag': read, **maps.statistics['seconds']}
         ticker.say('writing')

@@ -1,4 +1,4 @@
-"""Learning of the model together with the map: rounds of map search and updates, and warnings_ about what came out.
+"""Learning of the model together with the map: rounds of map search and updates, and warnings about what came out.
 
 Each round makes the map of the values so far and updates them, on that map, until they stay. The next round's map tells
 whether the new values are any good: where it has lost walls that the first map showed, they are refused, and learning
@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -16,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .common.grid import Grid
+from .common.grid import part_of
 from .common.parameters import ModelParameters, Parameters
 from .common.readings import Readings
 from .learning.lost_walls import Stretch, lost_walls
@@ -25,7 +26,7 @@ from .learning.standard_errors import LEARNED, Estimate, estimates
 from .mapping import Mapper
 from .maps.map_set import MapSet
 from .search.search import Progress
-from .sensor.forward_model import expectations, log_likelihood
+from .sensor.forward_model import ForwardModel
 
 Watch = Callable[[str, Progress | None], None]
 
@@ -51,13 +52,14 @@ class Round:
         The values; of round 0, those that learning started from.
     readings : int
     log_likelihood : float
-        Of the readings, given these values and the map searched with them, in nats.
+        Of the readings, given these values and the map made with them, in nats.
     log_likelihood_before : float
-        The same with the map that the values were learned from; NaN in round 0.
+        The same, at the same values and with the same normals, of the map that the values were learned from; NaN in
+        round 0.
     occupied : int
         Occupied cells of the map.
     unexplained : int
-        Echoes that this map leaves to chance or to a lost echo.
+        Echoes that this map takes for random measurements.
     lost : tuple of Stretch
         Walls of the first map that this one has given up.
     """
@@ -106,14 +108,41 @@ class Learned:
     warnings: tuple[str, ...]
 
 
-def settle(readings: Readings, grid: Grid, occupied: NDArray[Any], model: ModelParameters) -> ModelParameters:
-    """Return `model` after as many updates on one map as it takes until its values stay."""
+def settle(forward: ForwardModel, occupied: NDArray[Any]) -> ModelParameters:
+    """Return the model after as many updates on one map as it takes until its values stay."""
+    model = forward.model
     for _ in range(_UPDATES):
-        before, model = model, learn(readings, grid, occupied, model)
+        before, model = model, learn(forward.at(model), occupied)
         if _change(before, model) < _SETTLED:
             break
     # the updates approach 0 for ever
     return dataclasses.replace(model, p_lost=0.0) if model.p_lost < _NO_LOSS else model
+
+
+def map_and_learn(
+    readings: Readings, parameters: Parameters, rounds: int, watch: Watch = lambda stage, progress: None
+) -> MapSet:
+    """Return the maps after so many rounds of one update of the model each, without any check of what comes out.
+
+    The seconds of a stage are those of all rounds together.
+
+    Raises
+    ------
+    InputError
+        If there are no readings, or they span too large a map.
+    """
+    maps = Mapper(parameters).run(readings, watch)
+    seconds = dict(maps.statistics['seconds'])
+    for _ in range(rounds):
+        watch('learning', None)
+        begun = time.perf_counter()
+        parameters = dataclasses.replace(parameters, model=learn(maps.forward_model(), maps.ml))
+        seconds['learning'] = seconds.get('learning', 0.0) + time.perf_counter() - begun
+        maps = Mapper(parameters).run(readings, watch)
+        for stage, more in maps.statistics['seconds'].items():
+            seconds[stage] += more
+    maps.statistics['seconds'] = seconds
+    return maps
 
 
 def learn_jointly(
@@ -143,16 +172,15 @@ def learn_jointly(
         If there are no readings, or they span too large a map.
     """
     first = last = Mapper(parameters).run(readings, watch)
-    accepted, told = [first], [_round(first, first, math.nan)]
+    accepted, history = [first], [_round(first, first, None)]
     learned_from = first
     converged = False
     for _ in range(rounds):
         watch('learning', None)
-        model = settle(last.readings, last.grid, last.ml, last.parameters.model)
-        before = log_likelihood(last.readings, last.grid, last.ml, model)
+        model = settle(last.forward_model(), last.ml)
         maps = Mapper(dataclasses.replace(parameters, model=model)).run(readings, watch)
-        told.append(_round(first, maps, before))
-        if told[-1].lost and not keep_going:
+        history.append(_round(first, maps, last))
+        if history[-1].lost and not keep_going:
             break
         learned_from = last
         accepted.append(maps)
@@ -162,10 +190,10 @@ def learn_jointly(
             break
     found = {}
     if len(accepted) > 1:
-        found = estimates(learned_from.readings, learned_from.grid, learned_from.ml, last.parameters.model)
+        found = estimates(learned_from.forward_model().at(last.parameters.model), learned_from.ml)
     number = len(accepted) - 1
-    warnings_ = (*_quality_warnings(told, number, converged), *_weak(found, last.parameters.model))
-    return Learned(last.parameters, found, tuple(told), number, converged, last, warnings_)
+    warnings = (*_quality_warnings(history, number, converged), *_weak(found, last.parameters.model))
+    return Learned(last.parameters, found, tuple(history), number, converged, last, warnings)
 
 
 def _change(before: ModelParameters, after: ModelParameters) -> float:
@@ -175,15 +203,20 @@ def _change(before: ModelParameters, after: ModelParameters) -> float:
     return float(max(changes))
 
 
-def _round(first: MapSet, maps: MapSet, before: float) -> Round:
-    e = expectations(maps.readings, maps.grid, maps.ml, maps.parameters.model)
+def _round(first: MapSet, maps: MapSet, before: MapSet | None) -> Round:
+    """Return what is to be known of a round, whose values were learned from the map of `before`."""
+    forward = maps.forward_model()
+    same_values = math.nan
+    if before is not None:
+        # on the new grid, since the normals are those of its cells
+        same_values = forward.log_likelihood(part_of(before.grid, before.ml, maps.grid))
     return Round(
         maps.parameters.model,
         len(maps.readings),
         maps.log_likelihood,
-        before,
+        same_values,
         int(np.count_nonzero(maps.ml == 1)),
-        int(np.count_nonzero(maps.readings.echo & (e.random + e.lost > 0.5))),
+        int(np.count_nonzero(maps.readings.echo & maps.unexplained)),
         tuple(lost_walls(first, maps)) if maps is not first else (),
     )
 
@@ -201,7 +234,7 @@ def _quality_warnings(rounds: list[Round], accepted: int, converged: bool) -> li
         basin = (
             'this is how smooth walls get lost: their silence outweighs their echoes as soon as p_hit is large'
             if rise > 0
-            else 'their echoes are now left to chance'
+            else 'their echoes are now taken for random measurements'
         )
         if accepted:
             kept = f'those of round {accepted} are kept'
@@ -210,7 +243,7 @@ def _quality_warnings(rounds: list[Round], accepted: int, converged: bool) -> li
         told.append(
             f'round {len(rounds) - 1} loses walls: {climbed}{last.lost_length:.1f} m of wall in '
             f'{len(last.lost)} stretches that the first map shows are gone, the longest from ({x0:.1f}, {y0:.1f}) to '
-            f'({x1:.1f}, {y1:.1f}); {echoes} of their echoes count as chance now, and of all echoes '
+            f'({x1:.1f}, {y1:.1f}); {echoes} of their echoes count as random measurements now, and of all echoes '
             f'{last.unexplained} instead of {start.unexplained}; {basin}; '
             + ('they are handed out all the same' if accepted == len(rounds) - 1 else f'its values are refused, {kept}')
         )

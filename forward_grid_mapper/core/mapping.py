@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-import dataclasses
+import functools
 import time
 from collections.abc import Callable
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, Concatenate, ParamSpec, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .common.grid import Grid, part_of
-from .common.parameters import Parameters, SearchParameters
+from .common.parameters import Parameters
 from .common.readings import Readings, in_canonical_order
 from .evidence.evidence import Evidence
-from .learning.model_update import learn
+from .evidence.neighbourhood import patterns
 from .maps.dynamic import dynamic_echoes
 from .maps.log_odds_map import LogOddsMap, map_grid
 from .maps.map_set import MapSet
@@ -24,22 +25,63 @@ from .maps.uncertainty import uncertainty_map
 from .runtime.cancelling import check
 from .runtime.memory import memory_for_pairs
 from .runtime.threads import cores
-from .search.prior import odds_given_neighbours
+from .search.prior import log_prior, odds_given_neighbours
 from .search.search import Progress, Search, SearchResult
+from .sensor.forward_model import ForwardModel
 
 Watch = Callable[[str, Progress | None], None]
-"""Hears the name of each stage as it begins, and of every sweep of the search."""
+"""Receives the name of each stage as it begins, and the progress of every sweep of the search."""
+
+P = ParamSpec('P')
+R = TypeVar('R')
+
+
+def _stage(name: str) -> Callable[[Callable[Concatenate[Mapper, P], R]], Callable[Concatenate[Mapper, P], R]]:
+    """Make a method of `Mapper` a stage of its runs: announced, not begun after `cancel`, and timed."""
+
+    def wrap(step: Callable[Concatenate[Mapper, P], R]) -> Callable[Concatenate[Mapper, P], R]:
+        def timed(self: Mapper, /, *args: P.args, **kwargs: P.kwargs) -> R:
+            self._watch(name, None)
+            check(self._stop)
+            begun = time.perf_counter()
+            out = step(self, *args, **kwargs)
+            self._seconds[name] = time.perf_counter() - begun
+            return out
+
+        return functools.update_wrapper(timed, step)
+
+    return wrap
+
+
+@dataclass(frozen=True)
+class _Given:
+    """What the stages of a run share, made once.
+
+    Attributes
+    ----------
+    readings : Readings
+        In canonical order.
+    grid : Grid
+        Of all maps.
+    traversed : bool, shape `grid.shape`
+        Cells that sensors were moved over, all False where that is not to count.
+    """
+
+    readings: Readings
+    grid: Grid
+    traversed: NDArray[np.bool_]
 
 
 class Mapper:
-    """One run from readings to maps; can be cancelled from another thread."""
+    """Runs from readings to maps; can be cancelled from another thread."""
 
-    def __init__(self, parameters: Parameters, learn_rounds: int = 0) -> None:
-        """Prepare a run; `learn_rounds` > 0 alternates the search with updates of the model (`learning`)."""
-        self._parameters, self._learn_rounds = parameters, learn_rounds
-        self._search: Search | None = None
+    def __init__(self, parameters: Parameters) -> None:
+        """Prepare runs with these parameters."""
+        self._parameters = parameters
+        self._evidence: Evidence | None = None
         self._stop = np.zeros(1, np.uint8)
         self._seconds: dict[str, float] = {}
+        self._watch: Watch = lambda stage, progress: None
 
     def cancel(self) -> None:
         """Make `run` raise `Cancelled` soon; may be called from any thread."""
@@ -47,8 +89,8 @@ class Mapper:
 
     def so_far(self) -> tuple[Grid, NDArray[np.int8]] | None:
         """Return the grid and a copy of the ML map that the search has reached, or None before it; any thread."""
-        search = self._search
-        return None if search is None else (search.evidence.grid, search.evidence.observed())
+        evidence = self._evidence
+        return None if evidence is None else (evidence.grid, evidence.observed())
 
     def run(
         self,
@@ -73,91 +115,87 @@ class Mapper:
         Cancelled
             If `cancel` was called.
         """
-        self._seconds = {}
-        readings = in_canonical_order(readings)
-        parameters = self._parameters
-        evidence, result = self._find(readings, parameters, watch, start)
-        for _ in range(self._learn_rounds):
-            with self._stage('learning', watch):
-                ml = result.occupied.reshape(evidence.grid.shape)
-                parameters = dataclasses.replace(parameters, model=learn(readings, evidence.grid, ml, parameters.model))
-            evidence, result = self._find(readings, parameters, watch)
-        with self._stage('live map', watch):
-            live = LogOddsMap(parameters)
-            live.add(readings)
-            live_map = live.probability(evidence.grid)
-        with self._stage('uncertainty', watch):
-            return self._collect(readings, parameters, evidence, result, live_map)
+        self._watch, self._seconds = watch, {}
+        given = self._prepare(readings)
+        evidence = self._index(given, start)
+        found = self._search(given, evidence)
+        live = self._standard_map(given)
+        ml = self._post_process(given, evidence)
+        return self._judge(given, evidence, found, live, ml)
 
-    def _find(
+    def _prepare(self, readings: Readings) -> _Given:
+        readings, p = in_canonical_order(readings), self._parameters
+        # the grid of the standard map, so that all three maps are of one shape
+        grid = map_grid(readings, p)
+        traversed = traversed_cells(readings, grid) if p.search.driven_cost > 0 else np.zeros(grid.shape, np.bool_)
+        return _Given(readings, grid, traversed)
+
+    @_stage('index')
+    def _index(self, given: _Given, start: tuple[Grid, NDArray[np.int8]] | None) -> Evidence:
+        p = self._parameters
+        memory, threads = memory_for_pairs(p), p.search.threads or cores()
+        occupied = None if start is None else (part_of(*start, given.grid) == 1).astype(np.uint8)
+        evidence = Evidence(given.grid, p.model, memory, threads, self._stop, occupied)
+        evidence.extend(given.readings)
+        return evidence
+
+    @_stage('search')
+    def _search(self, given: _Given, evidence: Evidence) -> SearchResult:
+        self._evidence = evidence
+        search = Search(evidence, self._parameters.search, given.traversed.ravel())
+        return search.run(lambda progress: self._watch('search', progress))
+
+    @_stage('live map')
+    def _standard_map(self, given: _Given) -> NDArray[np.float32]:
+        live = LogOddsMap(self._parameters)
+        live.add(given.readings)
+        return live.probability(given.grid)
+
+    @_stage('post-processing')
+    def _post_process(self, given: _Given, evidence: Evidence) -> NDArray[np.int8]:
+        search = self._parameters.search
+        return post_process(evidence, search.extend, search.least_passed, given.traversed)
+
+    @_stage('uncertainty')
+    def _judge(
         self,
-        readings: Readings,
-        parameters: Parameters,
-        watch: Watch,
-        start: tuple[Grid, NDArray[np.int8]] | None = None,
-    ) -> tuple[Evidence, SearchResult]:
-        # the grid of the live map, so that all three maps are of one shape
-        grid = map_grid(readings, parameters)
-        asked = parameters.search
-        with self._stage('index', watch):
-            memory, threads = memory_for_pairs(parameters), asked.threads or cores()
-            occupied = None if start is None else (part_of(*start, grid) == 1).astype(np.uint8)
-            evidence = Evidence(grid, parameters.model, memory, threads, self._stop, occupied)
-            evidence.extend(readings)
-        with self._stage('search', watch):
-            self._search = Search(evidence, asked, self._traversed(readings, grid, asked).ravel())
-            return evidence, self._search.run(lambda progress: watch('search', progress))
-
-    @staticmethod
-    def _traversed(readings: Readings, grid: Grid, parameters: SearchParameters) -> NDArray[np.bool_]:
-        return traversed_cells(readings, grid) if parameters.driven_cost > 0 else np.zeros(grid.shape, np.bool_)
-
-    def _collect(
-        self, readings: Readings, parameters: Parameters, evidence: Evidence, result: SearchResult, live_map: Any
+        given: _Given,
+        evidence: Evidence,
+        found: SearchResult,
+        live: NDArray[np.float32],
+        ml: NDArray[np.int8],
     ) -> MapSet:
-        search, grid = parameters.search, evidence.grid
-        traversed = self._traversed(readings, grid, search)
-        ml = post_process(evidence, search.extend, search.least_passed, traversed)
-        neighbours = odds_given_neighbours(result.prior, ml == 1)
-        unexplained = parameters.model.p_rand / readings.z_max > 0.5 * evidence.likelihoods
+        """Return the maps with what they say of the readings, and the readings of them."""
+        p, prior, occupied = self._parameters, found.prior, (ml == 1).astype(np.uint8)
+        forward = ForwardModel(given.readings, given.grid, p.model, evidence.state.normals, evidence.cones)
+        e = forward.expectations(ml)
+        log_likelihood = float(e.log_likelihood.sum())
+        unexplained = e.random > 0.5
         return MapSet(
-            grid=grid,
-            live=live_map,
+            grid=given.grid,
+            live=live,
             ml=ml,
-            uncertainty=uncertainty_map(result.evidence, neighbours, ml, search),
-            readings=readings,
+            uncertainty=uncertainty_map(found.evidence, odds_given_neighbours(prior, ml == 1), ml, p.search),
+            readings=given.readings,
             unexplained=unexplained,
-            dynamic=dynamic_echoes(readings, unexplained, grid, ml, parameters.model),
-            log_likelihood=evidence.log_likelihood,
-            objective=evidence.log_likelihood + result.log_prior,
-            parameters=parameters,
-            statistics={
-                'pairs': evidence.pairs,
-                'bytes_per_pair': evidence.nbytes / max(evidence.pairs, 1),
-                'readings_not_stored': evidence.unstored,
-                'occupied': int((ml == 1).sum()),
-                'flips': result.progress.flips,
-                'shifts': result.progress.shifts,
-                'sweeps': result.progress.sweeps,
-                'converged': result.converged,
-                'seconds': self._seconds,
-            },
+            log_likelihood=log_likelihood,
+            objective=log_likelihood + log_prior(prior, occupied.ravel(), patterns(occupied, given.grid.shape)),
+            parameters=p,
+            dynamic=dynamic_echoes(forward, unexplained, ml),
+            normals=forward.normals,
+            statistics=self._statistics(evidence, found) | {'occupied': int(occupied.sum())},
         )
 
-    def _stage(self, name: str, watch: Watch) -> _Stage:
-        watch(name, None)
-        check(self._stop)
-        return _Stage(name, self._seconds)
-
-
-class _Stage:
-    """Adds the time spent inside to a table of seconds by stage."""
-
-    def __init__(self, name: str, seconds: dict[str, float]) -> None:
-        self._name, self._seconds = name, seconds
-
-    def __enter__(self) -> None:
-        self._start = time.perf_counter()
-
-    def __exit__(self, *error: object) -> None:
-        self._seconds[self._name] = self._seconds.get(self._name, 0.0) + time.perf_counter() - self._start
+    def _statistics(self, evidence: Evidence, found: SearchResult) -> dict[str, Any]:
+        return {
+            'pairs': evidence.pairs,
+            'bytes_per_pair': evidence.nbytes / max(evidence.pairs, 1),
+            'readings_not_stored': evidence.unstored,
+            'searched_log_likelihood': evidence.log_likelihood,
+            'searched_objective': evidence.log_likelihood + found.log_prior,
+            'flips': found.progress.flips,
+            'shifts': found.progress.shifts,
+            'sweeps': found.progress.sweeps,
+            'converged': found.converged,
+            'seconds': self._seconds,
+        }

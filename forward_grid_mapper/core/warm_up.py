@@ -24,6 +24,6 @@ def warm_up() -> MapSet:
     # twice the same, then a place so far away that the grid grows
     for moved in (0.0, 0.0, 40.0):
         online.add(dataclasses.replace(readings, x=readings.x + moved))
-    maps = Mapper(Parameters(), learn_rounds=1).run(readings)
+    maps = Mapper(Parameters()).run(readings)
     sensor_health(maps)
     return maps

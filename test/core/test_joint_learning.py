@@ -9,15 +9,17 @@ import numpy as np
 import pytest
 
 from conftest import PLAIN, random_readings
+from forward_grid_mapper.core import joint_learning
 from forward_grid_mapper.core.common.errors import InputError
-from forward_grid_mapper.core.common.grid import Grid
+from forward_grid_mapper.core.common.grid import Grid, part_of
 from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.common.readings import Readings
-from forward_grid_mapper.core.joint_learning import Learned, learn_jointly, settle
+from forward_grid_mapper.core.joint_learning import LIKELIHOOD_DROP, Learned, learn_jointly, settle
 from forward_grid_mapper.core.learning.lost_walls import lost_walls
 from forward_grid_mapper.core.learning.standard_errors import estimates
 from forward_grid_mapper.core.mapping import Mapper
 from forward_grid_mapper.core.maps.map_set import MapSet
+from forward_grid_mapper.core.sensor.forward_model import ForwardModel
 from forward_grid_mapper.simulation.drive import Recording, corridor_drive, door_drive
 from forward_grid_mapper.simulation.score import score_map, visible_surface
 from forward_grid_mapper.simulation.sonar import NoiseModel
@@ -72,8 +74,8 @@ def test_without_smooth_walls_nothing_is_refused_and_the_map_fits_too_well() -> 
     assert not walls_of(learned) and learned.accepted == len(learned.rounds) - 1
     model = learned.parameters.model
     world = recording.world
-    known = settle(readings, world.grid, world.reference, Parameters.from_flat(PLAIN).model)
-    sure = estimates(readings, world.grid, world.reference, known)
+    known = settle(ForwardModel(readings, world.grid, Parameters.from_flat(PLAIN).model), world.reference)
+    sure = estimates(ForwardModel(readings, world.grid, known), world.reference)
     for name, truth in (('p_rand', 0.08), ('p_lost', 0.1)):
         assert sure[name].low < truth < sure[name].high
     # with cells of 10 cm, distances to their centres are a little off
@@ -83,6 +85,35 @@ def test_without_smooth_walls_nothing_is_refused_and_the_map_fits_too_well() -> 
         assert getattr(model, name) < getattr(known, name) - 2 * learned.estimates[name].error
     assert known.p_rand / 3 < model.p_rand and model.p_lost == pytest.approx(0.1, abs=0.05)
     assert learned.rounds[-1].log_likelihood > learned.rounds[0].log_likelihood
+
+
+def test_a_search_that_ends_in_another_basin_is_called_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    runs = []
+
+    class SecondEndsPoorly(Mapper):
+        """Its second search takes an occupied cell to be so unlikely that it ends in a map with few of them."""
+
+        def __init__(self, parameters: Parameters) -> None:
+            runs.append(parameters)
+            poor = dataclasses.replace(parameters, search=dataclasses.replace(parameters.search, prior=0.001))
+            super().__init__(poor if len(runs) == 2 else parameters)
+
+    readings = corridor(0).readings
+    fair = learn_jointly(readings, Parameters(), 1, keep_going=True)
+    assert not any('another basin' in warning for warning in fair.warnings)
+    monkeypatch.setattr(joint_learning, 'Mapper', SecondEndsPoorly)
+    learned = learn_jointly(readings, Parameters(), 1, keep_going=True)
+    last = learned.rounds[1]
+    drop = last.log_likelihood_before - last.log_likelihood
+    assert drop > LIKELIHOOD_DROP * len(readings)
+    (warning,) = (warning for warning in learned.warnings if 'another basin' in warning)
+    assert 'round 1' in warning and f'{drop:.0f} nats' in warning
+    # of both maps the likelihood is that of the forward model with the values and the normals of the new one
+    forward = learned.maps.forward_model()
+    assert last.log_likelihood == pytest.approx(forward.log_likelihood(learned.maps.ml), abs=1e-6)
+    first = Mapper(Parameters()).run(readings)
+    before = forward.log_likelihood(part_of(first.grid, first.ml, forward.grid))
+    assert last.log_likelihood_before == pytest.approx(before, abs=1e-6)
 
 
 def test_weak_values_are_called_so() -> None:

@@ -28,7 +28,7 @@ from forward_grid_mapper.core.search.prior import Prior
 from forward_grid_mapper.core.search.search import LEAST, Search
 from forward_grid_mapper.core.sensor.cone_table import effective_sigma
 from forward_grid_mapper.core.sensor.density import CUT
-from forward_grid_mapper.core.sensor.forward_model import expectations, log_likelihood
+from forward_grid_mapper.core.sensor.forward_model import ForwardModel, expectations, log_likelihood
 from forward_grid_mapper.simulation.drive import corridor_drive, door_drive
 from forward_grid_mapper.simulation.sonar import NOISY
 
@@ -185,7 +185,7 @@ def test_chance_knows_no_distance_whatever_eq_32_prints() -> None:
     assert told.log_likelihood == pytest.approx(math.log(PAPER.p_rand / 1.1))
     # so readings by chance do not widen the sigma that is learned
     readings = along(*[0.5, 0.6] * 20, *[0.15] * 10)
-    assert learn(readings, LINE, line(5), PAPER).sigma == pytest.approx(0.05, abs=1e-3)
+    assert learn(ForwardModel(readings, LINE, PAPER), line(5)).sigma == pytest.approx(0.05, abs=1e-3)
 
 
 @pytest.mark.parametrize('occupied', [line(), line(5), line(2, 5, 6)])

@@ -7,6 +7,7 @@ frame. So grids that grow, shrink or are made from other readings agree cell for
 from __future__ import annotations
 
 import math
+import numbers
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,7 +25,12 @@ class Grid:
     column, row : int
         Lattice indices of the lower left cell.
     width, height : int
-        Number of cells along x and y.
+        Number of cells along x and y, 0 or more.
+
+    Raises
+    ------
+    ValueError
+        If the resolution is not a finite number above 0, or another field not a whole number.
     """
 
     resolution: float
@@ -32,6 +38,16 @@ class Grid:
     row: int
     width: int
     height: int
+
+    def __post_init__(self) -> None:
+        if not (isinstance(self.resolution, numbers.Real) and math.isfinite(self.resolution) and self.resolution > 0):
+            raise ValueError(f'the resolution of a grid must be a finite number of metres above 0: {self.resolution!r}')
+        for name in ('column', 'row', 'width', 'height'):
+            value = getattr(self, name)
+            if isinstance(value, bool) or not isinstance(value, numbers.Integral):
+                raise ValueError(f'{name} of a grid must be a whole number: {value!r}')
+        if self.width < 0 or self.height < 0:
+            raise ValueError(f'a grid has no fewer than 0 cells: width {self.width}, height {self.height}')
 
     @property
     def origin(self) -> tuple[float, float]:
@@ -67,7 +83,14 @@ class Grid:
         return x, y
 
     def union(self, other: Grid) -> Grid:
-        """Return the smallest grid that holds both."""
+        """Return the smallest grid that holds both.
+
+        Raises
+        ------
+        ValueError
+            If they differ in resolution, and so are not of one lattice.
+        """
+        self._check_lattice(other)
         if not self.size or not other.size:
             return self if self.size else other
         column, row = min(self.column, other.column), min(self.row, other.row)
@@ -76,11 +99,25 @@ class Grid:
         return Grid(self.resolution, column, row, right - column, top - row)
 
     def window(self, inner: Grid) -> tuple[slice, slice]:
-        """Return the (rows, columns) of this grid that are `inner`, which must lie inside."""
+        """Return the (rows, columns) of this grid that are `inner`.
+
+        Raises
+        ------
+        ValueError
+            If `inner` is not inside, or differs in resolution.
+        """
+        self._check_lattice(inner)
         row, column = inner.row - self.row, inner.column - self.column
         if row < 0 or column < 0 or row + inner.height > self.height or column + inner.width > self.width:
             raise ValueError('the inner grid is not inside the outer one')
         return slice(row, row + inner.height), slice(column, column + inner.width)
+
+    def _check_lattice(self, other: Grid) -> None:
+        if self.resolution != other.resolution:
+            raise ValueError(
+                f'grids of {self.resolution} m and of {other.resolution} m a cell are not of one lattice; make both '
+                f'maps with the same resolution'
+            )
 
     @classmethod
     def covering(cls, box: tuple[float, float, float, float], resolution: float) -> Grid:
@@ -127,6 +164,11 @@ def part_of(grid: Grid, values: NDArray[np.int8], wanted: Grid) -> NDArray[np.in
     grid : Grid
     values : int8, shape `grid.shape`
     wanted : Grid
+
+    Raises
+    ------
+    ValueError
+        If the grids differ in resolution.
     """
     whole = grid.union(wanted)
     out = np.full(whole.shape, UNKNOWN, np.int8)

@@ -17,7 +17,7 @@ from ..runtime.cancelling import check
 from ..runtime.jit import kernel
 from ..runtime.threads import parts, run_each
 from ..sensor.cone import rows_of, runs_of
-from ..sensor.cone_table import CONE, Floats, cone_of, cone_table
+from ..sensor.cone_table import CONE, Cones, Floats, cone_of, cone_table
 from ..sensor.density import causes_of
 from ..sensor.surface_normals import gather, no_normals, normals_of
 from .fixed_point import QUANTUM
@@ -181,6 +181,11 @@ class Evidence:
         """Log p(Z | m) in nats."""
         reading_states = self.state.reading_states[: self._size]
         return float((reading_states['likelihood'].astype(np.int64) * reading_states['multiplicity']).sum() * QUANTUM)
+
+    @property
+    def cones(self) -> Cones:
+        """The cones of the readings, shape (N,); until readings are added or the grid grows."""
+        return self.state.cones[: self._size]
 
     def of_occupancy(self) -> Floats:
         """Return log p(Z | cell occupied, rest of the map) − log p(Z | cell free, rest of the map) in nats.

@@ -1,7 +1,8 @@
 """Walls that one map shows and another has given up.
 
 Learned together with the map, p_hit can fall into a basin that loses smooth walls: few of the readings that look at
-such a wall bring an echo; a larger p_hit makes the silent ones outweigh them; with the wall gone its echoes are chance,
+such a wall bring an echo; a larger p_hit makes the silent ones outweigh them; with the wall gone its echoes are
+random measurements,
 the obstacles that are left answer more often, and p_hit rises further.
 """
 
@@ -15,7 +16,6 @@ from numpy.typing import NDArray
 from ..common.grid import Grid
 from ..common.readings import Floats, Readings
 from ..maps.map_set import MapSet
-from ..sensor.forward_model import expectations
 
 Mask = NDArray[np.bool_]
 
@@ -25,7 +25,7 @@ LEAST_LENGTH = 0.5
 """Metres of wall in a row that are worth a warning."""
 _JOINED = 2
 """Cells of one stretch are at most so many apart, in rows and columns."""
-_DRIVEN = 0.3
+_TRAVERSED = 0.3
 """Metres around the place of a sensor that cannot be wall: what is gone from there was somebody walking."""
 _CHUNK = 4096
 
@@ -42,7 +42,7 @@ class Stretch:
     start, end : (float, float)
         Corners of the bounding box of its cells' centres, metres in the map frame.
     echoes : int
-        Readings that were its echoes and are now chance or lost ones.
+        Readings that were its echoes and are now random measurements or lost echoes.
     """
 
     cells: int
@@ -69,16 +69,16 @@ def lost_walls(before: MapSet, after: MapSet) -> list[Stretch]:
     old[whole.window(before.grid)] = before.ml == 1
     new[whole.window(after.grid)] = after.ml == 1
     readings = before.readings
-    heard = expectations(readings, before.grid, before.ml, before.parameters.model).hit > 0.5
+    heard = before.forward_model().expectations(before.ml).hit > 0.5
     candidates = old & ~_grown(new, 1)
     rows, columns = whole.cells_of(readings.x, readings.y)
     traversed = np.zeros(whole.shape, bool)
     inside = (rows >= 0) & (rows < whole.height) & (columns >= 0) & (columns < whole.width)
     traversed[rows[inside], columns[inside]] = True
-    candidates &= ~_grown(traversed, round(_DRIVEN / whole.resolution))
+    candidates &= ~_grown(traversed, round(_TRAVERSED / whole.resolution))
     reading, cell = _arcs(readings, np.flatnonzero(heard & readings.echo), whole, candidates)
     lost = candidates & (np.bincount(cell, minlength=whole.size).reshape(whole.shape) >= LEAST_ECHOES)
-    now = expectations(readings, after.grid, after.ml, after.parameters.model)
+    now = after.forward_model().expectations(after.ml)
     turned = now.random + now.lost > 0.5
     x, y = whole.centers()
     found = []

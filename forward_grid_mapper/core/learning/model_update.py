@@ -19,21 +19,27 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..common.grid import Grid
 from ..common.parameters import ModelParameters, find
-from ..common.readings import Readings
-from ..sensor.forward_model import expectations
+from ..sensor.forward_model import ForwardModel
 
 MOST_UNEXPLAINED = 0.9
 """Largest sum of p_rand and p_lost that is learned."""
 
 
-def learn(readings: Readings, grid: Grid, occupied: NDArray[Any], model: ModelParameters) -> ModelParameters:
-    """Return `model` after one update of its probabilities and σ, given a map; values stay in the table's ranges.
+def learn(forward: ForwardModel, occupied: NDArray[Any]) -> ModelParameters:
+    """Return the model after one update of its probabilities and σ, given a map; values stay in the table's ranges.
 
     A value that no reading informs is kept (σ without echoes, p_hit without any obstacle).
+
+    Parameters
+    ----------
+    forward : ForwardModel
+        The readings, and the values so far.
+    occupied : array of shape `forward.grid.shape`
+        1 where occupied.
     """
-    e = expectations(readings, grid, occupied, model)
+    readings, model = forward.readings, forward.model
+    e = forward.expectations(occupied)
     values = {'p_rand': float(e.random.mean())}
     if model.p_lost > 0:
         values['p_lost'] = float(e.lost.mean())
@@ -42,7 +48,7 @@ def learn(readings: Readings, grid: Grid, occupied: NDArray[Any], model: ModelPa
     hits = float(e.hit[unstated].sum())
     if hits > 0:
         values['sigma'] = math.sqrt(float(e.squared_error[unstated].sum()) / hits)
-    # lost echoes and chance say nothing about the obstacles that stood in the way
+    # lost echoes and random measurements say nothing about the obstacles that stood in the way
     chances = float(e.rank.sum() + (e.obstacles * e.no_echo).sum())
     if chances > 0:
         values['p_hit'] = float(e.hit.sum()) / chances

@@ -2,10 +2,10 @@
 
 Shares of a sensor's readings, given the ML map:
 
-    random    chance is the likeliest cause (e_* above one half)
-    no echo   nothing was heard within max range
+    random    a random measurement is the likeliest cause (e_* above one half)
+    no echo   max-range readings
     missed    no echo, though the map has an obstacle within 3/4 of max range in the cone
-    short     an echo by chance, nearer than half the way to the first obstacle of the cone, or to max range if none
+    short     a random echo, nearer than half the way to the first obstacle of the cone, or to max range if none
     same      echoes within the commonest 0.2 m of range, whatever the map
 
 A sensor that hears its own robot repeats itself, and the map may even believe it. So where a sensor repeats a range of
@@ -25,16 +25,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..common.grid import Grid
-from ..common.readings import Floats, Readings
+from ..common.readings import Floats
 from ..maps.log_odds_map import LogOddsMap
 from ..maps.map_set import MapSet
 from ..runtime.jit import kernel
+from ..sensor.cone import make_cone, rows_of, runs_of
+from ..sensor.forward_model import ForwardModel
 
 NEAR = 0.5
-"""A chance echo is short if it is nearer than this part of the way to the first obstacle."""
+"""A random echo is short if it is nearer than this part of the way to the first obstacle."""
 REACH = 0.75
-"""A silence counts as missed if there is an obstacle within this part of max range."""
+"""A max-range reading counts as missed if there is an obstacle within this part of max range."""
 FEW = 30
 """Fewer readings are not judged."""
 FEW_SHARE = 0.1
@@ -46,13 +47,11 @@ RANDOM = 0.5
 SAME, WINDOW = 0.8, 0.2
 """A sensor that repeats itself has at least this share of its readings in a window of so many metres."""
 CLOSE = 0.7
-"""If so large a part of the chance readings is short, but not always the same, somebody walks there."""
+"""If so large a part of the random readings is short, but not always the same, somebody walks there."""
 ABOVE = 0.25
 """A suspect share exceeds the median of the others by at least so much."""
 FREE = 0.35
 """The live map of the others is free below this probability."""
-_RAYS = 9
-_STEP = 0.5
 
 
 @dataclass(frozen=True)
@@ -92,38 +91,40 @@ class SensorHealth:
 
 
 @kernel
-def _first_obstacles(x: Any, y: Any, yaw: Any, half_angle: Any, reach: Any, occupied: Any, out: Any) -> None:
-    """Fill `out` with the distance along the fan of rays to the first occupied cell, infinite without one; in cells."""
+def _first_obstacles(cones: Any, occupied: Any, out: Any) -> None:
+    """Fill `out` with the distance of the nearest occupied cell of each cone up to its reach, inf for none; in cells.
+
+    A cone reaches no farther than the farthest corner of the grid, however large the range of the sensor.
+    """
     height, width = occupied.shape
-    for t in range(len(x)):
+    for t in range(len(cones)):
+        reading = cones[t]
+        across, up = max(reading.x, width - reading.x), max(reading.y, height - reading.y)
+        reach = min(reading.reach, math.hypot(across, up))
+        axis, half = (reading.axis_x, reading.axis_y), (reading.sine, reading.cosine)
+        cone = make_cone(reading.x, reading.y, axis, half, (reach, 0.0))
         nearest = np.inf
-        for ray in range(_RAYS):
-            angle = yaw[t] + half_angle[t] * (2.0 * ray / (_RAYS - 1) - 1.0)
-            dx, dy = math.cos(angle), math.sin(angle)
-            d = 0.0
-            while d < min(nearest, reach[t]):
-                row, column = int(math.floor(y[t] + d * dy)), int(math.floor(x[t] + d * dx))
-                if 0 <= row < height and 0 <= column < width and occupied[row, column]:
-                    nearest = d
-                    break
-                d += _STEP
-        out[t] = nearest
+        for row in range(*rows_of(cone, height)):
+            v = row + 0.5 - cone.y
+            runs = runs_of(cone, row, width)
+            for first, last in ((runs.first, runs.last), (runs.first2, runs.last2)):
+                for column in range(first, last + 1):
+                    if occupied[row, column]:
+                        u = column + 0.5 - cone.x
+                        nearest = min(nearest, u * u + v * v)
+        out[t] = math.sqrt(nearest)
 
 
-def first_obstacles(readings: Readings, grid: Grid, ml: NDArray[np.int8]) -> Floats:
-    """Return the distance to the first occupied cell within max range in each reading's cone, metres; inf for none."""
-    scale = 1.0 / grid.resolution
-    out = np.empty(len(readings))
-    _first_obstacles(
-        readings.x * scale - grid.column,
-        readings.y * scale - grid.row,
-        np.ascontiguousarray(readings.yaw),
-        np.ascontiguousarray(readings.half_angle),
-        readings.z_max * scale,
-        np.ascontiguousarray(ml == 1),
-        out,
-    )
-    return out * grid.resolution
+def first_obstacles(forward: ForwardModel, ml: NDArray[np.int8]) -> Floats:
+    """Return the distance of the nearest occupied cell within max range in each reading's cone, metres; inf for none.
+
+    Every cell of the cone counts, and the distance is that of its surface, as in the forward model.
+    """
+    cones = forward.cones.copy()
+    cones['reach'] = cones['z_max']
+    out = np.empty(len(cones))
+    _first_obstacles(cones, np.ascontiguousarray(ml == 1), out)
+    return (out - forward.model.surface_offset) * forward.grid.resolution
 
 
 def commonest_range(z: Floats) -> tuple[int, float]:
@@ -139,7 +140,7 @@ def commonest_range(z: Floats) -> tuple[int, float]:
 def sensor_health(maps: MapSet) -> dict[str, SensorHealth]:
     """Return the table of all sensors, by name in the order of `Readings.sensor_names`."""
     readings = maps.readings
-    obstacle = first_obstacles(readings, maps.grid, maps.ml)
+    obstacle = first_obstacles(maps.forward_model(), maps.ml)
     echo = readings.echo
     count = len(readings.sensor_names)
     numbers = np.bincount(readings.sensor, minlength=count)[:count]

@@ -25,10 +25,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..common.grid import Grid
 from ..common.parameters import ModelParameters, find
 from ..common.readings import Floats, Readings
-from ..sensor.forward_model import Expectations, expectations
+from ..sensor.forward_model import Expectations, ForwardModel
 
 LEARNED = ('p_hit', 'p_rand', 'p_lost', 'sigma')
 BLOCKS = 30
@@ -66,11 +65,10 @@ class Estimate:
     bound: str = ''
 
 
-def estimating_functions(
-    readings: Readings, grid: Grid, occupied: NDArray[Any], model: ModelParameters
-) -> dict[str, Floats]:
+def estimating_functions(forward: ForwardModel, occupied: NDArray[Any]) -> dict[str, Floats]:
     """Return ψ of every parameter, each of shape (N,); without p_lost if that is zero."""
-    e = expectations(readings, grid, occupied, model)
+    readings, model = forward.readings, forward.model
+    e = forward.expectations(occupied)
     explained = (e.hit + e.no_echo) / (1.0 - model.p_rand - model.p_lost)
     missed = e.rank - e.hit + e.obstacles * e.no_echo
     unstated = readings.echo & (readings.sigma == 0)
@@ -84,22 +82,21 @@ def estimating_functions(
     return made
 
 
-def estimates(readings: Readings, grid: Grid, occupied: NDArray[Any], model: ModelParameters) -> dict[str, Estimate]:
-    """Return each learned value of `model` with its standard error, given the map.
+def estimates(forward: ForwardModel, occupied: NDArray[Any]) -> dict[str, Estimate]:
+    """Return each learned value of the model with its standard error, given the map.
 
     Parameters
     ----------
-    readings : Readings
-    grid : Grid
-    occupied : array of shape `grid.shape`
-        The map that `model` was learned from; 1 is occupied.
-    model : ModelParameters
-        Where the updates ended.
+    forward : ForwardModel
+        The readings, and the values at which the updates ended.
+    occupied : array of shape `forward.grid.shape`
+        The map that they were learned from; 1 is occupied.
     """
-    informed = _informed(readings, expectations(readings, grid, occupied, model))
-    held = {name: _held(name, model, grid.resolution, informed[name]) for name in LEARNED}
+    model = forward.model
+    informed = _informed(forward.readings, forward.expectations(occupied))
+    held = {name: _held(name, model, forward.grid.resolution, informed[name]) for name in LEARNED}
     free = [name for name in LEARNED if not held[name]]
-    errors = dict(zip(free, _errors(readings, grid, occupied, model, free), strict=True))
+    errors = dict(zip(free, _errors(forward, occupied, free), strict=True))
     made = {}
     for name in LEARNED:
         value, error = float(getattr(model, name)), errors.get(name, math.nan)
@@ -134,15 +131,15 @@ def _held(name: str, model: ModelParameters, resolution: float, informed: float)
     return ''
 
 
-def _errors(
-    readings: Readings, grid: Grid, occupied: NDArray[Any], model: ModelParameters, free: list[str]
-) -> list[float]:
+def _errors(forward: ForwardModel, occupied: NDArray[Any], free: list[str]) -> list[float]:
     """Return the standard errors of the parameters `free`, in their order; NaN where they are not determined."""
     if not free:
         return []
 
+    readings, model = forward.readings, forward.model
+
     def psi(at: ModelParameters) -> Floats:
-        made = estimating_functions(readings, grid, occupied, at)
+        made = estimating_functions(forward.at(at), occupied)
         return np.stack([made[name] for name in free])
 
     information = np.empty((len(free), len(free)))

@@ -1,7 +1,7 @@
 """What was taken out of the map: echoes of people and other things that moved on, where other readings went through.
 
-An echo that the map puts down to chance has left no mark in it. Where such echoes end in space that is free, they are
-counted cell by cell: a person who stood about shows as a patch of counts, a stray echo as a thin arc of ones.
+An echo that the map takes for a random measurement has left no mark in it. Where such echoes end in space that is free,
+they are counted cell by cell: a person who stood about shows as a patch of counts, a stray echo as a thin arc of ones.
 """
 
 from __future__ import annotations
@@ -11,11 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..common.grid import Grid
-from ..common.parameters import ModelParameters
-from ..common.readings import Readings
 from ..runtime.jit import allocating_kernel
-from ..sensor.cone_table import Cones, cone_table, walk_resized
+from ..sensor.cone_table import Cones, walk_resized
+from ..sensor.forward_model import ForwardModel
 
 
 @allocating_kernel
@@ -33,22 +31,18 @@ def _count(cones: Cones, unexplained: Any, out: Any) -> None:
                 flat[cells[k]] += 1.0
 
 
-def dynamic_echoes(
-    readings: Readings, unexplained: NDArray[np.bool_], grid: Grid, ml: NDArray[np.int8], model: ModelParameters
-) -> NDArray[np.float32]:
-    """Return how many echoes that the map does not evaluate end in each of its free cells, shape `grid.shape`.
+def dynamic_echoes(forward: ForwardModel, unexplained: NDArray[np.bool_], ml: NDArray[np.int8]) -> NDArray[np.float32]:
+    """Return how many echoes that the map does not explain end in each of its free cells, shape `ml.shape`.
 
     Parameters
     ----------
-    readings : Readings
+    forward : ForwardModel
     unexplained : bool, shape (N,)
-        Readings that the map puts down to chance.
-    grid : Grid
-    ml : int8, shape `grid.shape`
+        Readings that the map takes for random measurements.
+    ml : int8, shape `forward.grid.shape`
         0 where free.
-    model : ModelParameters
     """
-    out = np.zeros(grid.shape, np.float32)
-    _count(cone_table(readings, grid, model), unexplained, out)
+    out = np.zeros(ml.shape, np.float32)
+    _count(forward.cones, unexplained, out)
     out[ml != 0] = 0.0
     return out

@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 from ..common.grid import UNKNOWN, Grid
 from ..common.parameters import Parameters
 from ..common.readings import Readings
+from ..sensor.forward_model import ForwardModel
+from ..sensor.surface_normals import SurfaceNormals, no_normals, on_larger_grid
 
 
 @dataclass(frozen=True)
@@ -29,16 +31,19 @@ class MapSet:
     readings : Readings
         The readings that the maps evaluate.
     unexplained : bool, shape (N,)
-        Readings whose most likely cause, given the ML map, is chance (e_* above one half).
+        Readings whose most likely cause, given `ml`, is a random measurement (e_* above one half).
     log_likelihood : float
-        log p(Z | ml) in nats.
+        log p(Z | ml) in nats: of the map that is handed out, by `forward_model`.
     objective : float
-        The log-likelihood plus the log prior odds of the occupied cells.
+        The log-likelihood of `ml` plus its log prior, up to a constant.
     parameters : Parameters
     dynamic : float32
-        Echoes that the map does not evaluate and that end in free space: people, say (`dynamic`).
+        Echoes that `ml` does not explain and that end in free space: people, say (`dynamic`).
+    normals : SurfaceNormals
+        The surface normals that the maps were made with.
     statistics : dict
-        Plain numbers about the run: pairs, flips, shifts, sweeps, converged, seconds by stage.
+        Plain numbers about the run: pairs, flips, shifts, sweeps, converged, seconds by stage. `searched_objective`
+        and `searched_log_likelihood` are of the map that the search ended with, before post-processing.
     """
 
     grid: Grid
@@ -51,7 +56,12 @@ class MapSet:
     objective: float
     parameters: Parameters
     dynamic: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 0), np.float32))
+    normals: SurfaceNormals = field(default_factory=no_normals)
     statistics: dict[str, Any] = field(default_factory=dict)
+
+    def forward_model(self) -> ForwardModel:
+        """Return the readings with the model and the normals, which give the likelihood of `ml` or of another map."""
+        return ForwardModel(self.readings, self.grid, self.parameters.model, self.normals)
 
     def with_live(self, grid: Grid, live: NDArray[np.float32]) -> MapSet:
         """Return the same maps beside another live map, all on the smallest grid that holds both.
@@ -71,4 +81,5 @@ class MapSet:
         dynamic = np.zeros(whole.shape, np.float32)
         if self.dynamic.size:
             dynamic[whole.window(self.grid)] = self.dynamic
-        return replace(self, grid=whole, live=shown, ml=ml, uncertainty=uncertainty, dynamic=dynamic)
+        normals = on_larger_grid(self.normals, self.grid, whole)
+        return replace(self, grid=whole, live=shown, ml=ml, uncertainty=uncertainty, dynamic=dynamic, normals=normals)

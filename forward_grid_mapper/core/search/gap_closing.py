@@ -53,13 +53,35 @@ def _leaves(pattern: int, dx: int, dy: int) -> bool:
 
 
 @kernel
-def _path(s: State, c: int, dx: int, dy: int, path: Any) -> bool:
-    """Write the cells between c and the cell at (dx, dy) from it; tell whether a bridge may stand on them."""
+def _may_close(s: State, prior: Prior, c: int, dx: int, dy: int) -> bool:
+    """Tell whether cell c and the one at (dx, dy) from it are ends of walls that lead to each other."""
+    occupied, pattern = s.maps.occupied, s.maps.pattern
+    height, width = s.lattice.height, s.lattice.width
+    row, column = c // width + dy, c % width + dx
+    if not (0 <= row < height and 0 <= column < width):
+        return False
+    o, through = row * width + column, prior.shape[255]
+    if not occupied[c] or not occupied[o] or prior.shape[pattern[c]] >= through or prior.shape[pattern[o]] >= through:
+        return False
+    return bool(_leaves(pattern[c], dx, dy) and _leaves(pattern[o], -dx, -dy))
+
+
+@kernel
+def _path(s: State, c: int, dx: int, dy: int, up: bool, path: Any) -> bool:
+    """Write the cells between c and the cell at (dx, dy) from it; tell whether a bridge may stand on them.
+
+    Where the line passes midway between two cells, `up` takes the one of the larger row and column.
+    """
     width = s.lattice.width
     n = max(abs(dx), abs(dy))
     against = 0.0
     for i in range(1, n):
-        o = c + int(math.floor(dy * i / n + 0.5)) * width + int(math.floor(dx * i / n + 0.5))
+        y, x = dy * i / n, dx * i / n
+        if up:
+            row, column = int(math.floor(y + 0.5)), int(math.floor(x + 0.5))
+        else:
+            row, column = int(math.ceil(y - 0.5)), int(math.ceil(x - 0.5))
+        o = c + row * width + column
         data = s.maps.evidence[o] * QUANTUM
         if s.maps.occupied[o] or not s.maps.seen[o] or data < -MOST_AGAINST_CELL:
             return False
@@ -67,6 +89,17 @@ def _path(s: State, c: int, dx: int, dy: int, path: Any) -> bool:
         path[i - 1] = o
     passage = (n - 1) * s.lattice.resolution > PASSAGE
     return against <= (MOST_AGAINST_PASSAGE if passage else MOST_AGAINST_GAP)
+
+
+@kernel
+def _midway(dx: int, dy: int) -> bool:
+    """Tell whether the line to (dx, dy) passes midway between two cells anywhere."""
+    n = max(abs(dx), abs(dy))
+    across = min(abs(dx), abs(dy))
+    halves = 0
+    for i in range(1, n):
+        halves += 2 * across * i % (2 * n) == n
+    return halves > 0
 
 
 @kernel
@@ -84,37 +117,53 @@ def _close(s: State, prior: Prior, least: Least, path: Any, n: int) -> float:
     return 0.0
 
 
+@kernel
+def _list_gaps(
+    s: State, prior: Prior, least: Least, cells: NDArray[np.int64], n: int, path: Any, gaps: Any, gains: Any
+) -> int:
+    """List the gaps of length n that gain if closed, and what they gain; return their number, at most that of `gaps`.
+
+    A row of `gaps` has the cell at one end, the way to the other one, and 1 where cells midway are taken `up`.
+    """
+    m = 0
+    for c in cells:
+        if s.stop[0]:
+            break
+        # each pair once
+        for dy in range(n + 1):
+            for dx in range(-n, n + 1, 1 if dy == n else 2 * n):
+                if (dy == 0 and dx < 0) or not _may_close(s, prior, c, dx, dy):
+                    continue
+                for up in range(0 if _midway(dx, dy) else 1, 2):
+                    if m == len(gaps) or not _path(s, c, dx, dy, up == 1, path):
+                        continue
+                    gain = _close(s, prior, least, path, n - 1)
+                    if gain > 0.0:
+                        for i in range(n - 1):
+                            flip(s, path[i])
+                        gaps[m, 0], gaps[m, 1], gaps[m, 2], gaps[m, 3] = c, dx, dy, up
+                        gains[m] = gain
+                        m += 1
+    return m
+
+
 @allocating_kernel
 def close_gaps(s: State, prior: Prior, least: Least, cells: NDArray[np.int64], longest: int) -> tuple[int, float]:
-    """Build the bridges that gain, the shortest first; return the number of flips and the total gain.
+    """Build the bridges that gain, the shortest first, and of one length the one first that gains most.
 
-    `cells` are the occupied ones to start from.
+    So what is built does not depend on the order of cells, which differs in a mirrored map. Returns the number of
+    flips and the total gain. `cells` are the occupied ones to start from.
     """
-    height, width = s.lattice.height, s.lattice.width
-    occupied, pattern = s.maps.occupied, s.maps.pattern
-    through = prior.shape[255]
     path = np.empty(longest, np.int64)
+    gaps, gains = np.empty((2 * len(cells) + 64, 4), np.int64), np.empty(2 * len(cells) + 64)
     flips, total = 0, 0.0
     for n in range(2, longest + 1):
-        for c in cells:
-            if s.stop[0]:
-                return flips, total
-            row, column = c // width, c % width
-            if not occupied[c] or prior.shape[pattern[c]] >= through:
-                continue
-            for dy in range(n + 1):
-                for dx in range(-n, n + 1, 1 if dy == n else 2 * n):
-                    # each pair once
-                    if (dy == 0 and dx < 0) or row + dy >= height or not 0 <= column + dx < width:
-                        continue
-                    o = c + dy * width + dx
-                    if not occupied[o] or prior.shape[pattern[o]] >= through:
-                        continue
-                    if not _leaves(pattern[c], dx, dy) or not _leaves(pattern[o], -dx, -dy):
-                        continue
-                    if _path(s, c, dx, dy, path):
-                        gain = _close(s, prior, least, path, n - 1)
-                        if gain > 0.0:
-                            flips += n - 1
-                            total += gain
+        m = _list_gaps(s, prior, least, cells, n, path, gaps, gains)
+        for k in np.argsort(-gains[:m], kind='mergesort'):
+            c, dx, dy, up = gaps[k, 0], gaps[k, 1], gaps[k, 2], gaps[k, 3]
+            if _may_close(s, prior, c, dx, dy) and _path(s, c, dx, dy, up == 1, path):
+                gain = _close(s, prior, least, path, n - 1)
+                if gain > 0.0:
+                    flips += n - 1
+                    total += gain
     return flips, total

@@ -1,22 +1,18 @@
-"""The forward sensor model: how likely a reading is, given a whole map, and which cause explains it.
+"""The forward sensor model: how likely readings are, given a whole map, and which causes explain them.
 
-    p(z | m) =  p_rand / z_max                                                        chance (*)
-             +  p_lost · N(z; z_max, σ) if there is no echo, z ≥ z_max                a lost echo
-             +  (1 − p_rand − p_lost) · Σ_k (1 − p_hit)^(k−1) p_hit N(z; d_k, σ)      the k-th obstacle, k = 1 … K
-             +  (1 − p_rand − p_lost) · (1 − p_hit)^K N(z; z_max, σ)                  nothing hit, max range (0)
+The density p(z | m) and its causes are those of `density`. d_k is the distance to the k-th nearest occupied cell of the
+cone, without the surfaces at which the reading exceeds the incidence angle (`surface_normals`).
 
-d_k is the distance to the k-th nearest occupied cell of the cone. With p_lost = 0 this is the model of the paper
-(eq 20-24 summed over its correspondences, eq 26 with eq 28); N is cut off at `cut` σ.
-
-This file evaluates it exactly, in float64 and straight from the cones. The search (`flips`) has it in a form in which
-a flip costs O(1) a reading, and is tested against this one.
+This is the one likelihood of the package. It is evaluated exactly here, in float64 and straight from the cones: for the
+map that is handed out, for learning, for sensor health and for lost walls. The search (`evidence.updates`) has it in a
+form in which a flip costs O(1) a reading, and is tested against this one.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +23,7 @@ from ..common.readings import Readings
 from ..runtime.jit import allocating_kernel
 from .cone_table import Cones, Floats, cone_table, walk_resized
 from .density import Causes, causes_of, density
+from .surface_normals import SurfaceNormals, exceeds_incidence_angle, no_normals
 
 
 @dataclass(frozen=True)
@@ -47,29 +44,46 @@ class Expectations:
     log_likelihood: Floats
 
 
+class _Given(NamedTuple):
+    """What the kernel needs beside the map; `pairing` and `normals` decide which surfaces a reading passes."""
+
+    cones: Cones
+    pairing: Cones
+    normals: SurfaceNormals
+    causes: Causes
+    resolution: float
+
+
 @allocating_kernel
-def _expect(table: Cones, causes: Causes, occupied: Any, resolution: float, out: Any) -> None:
+def _expect(given: _Given, occupied: Any, out: Any) -> None:
     """Fill `out` (8, N) with the rows of `Expectations`, in its order."""
+    cones, causes, normals = given.cones, given.causes, given.normals
     height, width = occupied.shape
     flat = occupied.ravel()
     cells, distances = np.empty(1024, np.int32), np.empty(1024, np.float64)
-    for t in range(len(table)):
-        n, cells, distances = walk_resized(table, t, (height, width), cells, distances)
+    for t in range(len(cones)):
+        n, cells, distances = walk_resized(cones, t, (height, width), cells, distances)
         m = 0
         for k in range(n):
-            if flat[cells[k]] == 1:
-                distances[m] = distances[k]
-                m += 1
+            c = cells[k]
+            if flat[c] != 1:
+                continue
+            if normals.cos2_limit > 0.0:
+                u, v = c % width + 0.5 - cones[t].x, c // width + 0.5 - cones[t].y
+                if exceeds_incidence_angle(normals, given.pairing[t], c, u, v):
+                    continue
+            distances[m] = distances[k]
+            m += 1
         hits = np.sort(distances[:m])
-        sigma = table[t].sigma
+        sigma = cones[t].sigma
         weight = causes.mixture_weight
         hit, rank, squared = 0.0, 0.0, 0.0
         for k in range(m):
-            error = (table[t].z - hits[k]) / sigma
-            term = weight * causes.p_hit * density(error, sigma * resolution)
+            error = (cones[t].z - hits[k]) / sigma
+            term = weight * causes.p_hit * density(error, sigma * given.resolution)
             hit += term
             rank += (k + 1) * term
-            squared += term * (error * sigma * resolution) ** 2
+            squared += term * (error * sigma * given.resolution) ** 2
             weight *= 1.0 - causes.p_hit
         total = causes.random[t] + causes.lost[t] + hit + weight * causes.max_range[t]
         out[0, t] = causes.random[t] / total
@@ -82,25 +96,81 @@ def _expect(table: Cones, causes: Causes, occupied: Any, resolution: float, out:
         out[7, t] = math.log(total)
 
 
-def expectations(readings: Readings, grid: Grid, occupied: NDArray[Any], model: ModelParameters) -> Expectations:
-    """Return the E-step and the log-likelihood of every reading, given a map.
+class ForwardModel:
+    """Readings on a grid, and how likely each of them is given any map of that grid.
 
-    Parameters
+    Attributes
     ----------
     readings : Readings
     grid : Grid
-    occupied : array of shape `grid.shape`
-        Occupied cells are 1; anything else counts as free.
     model : ModelParameters
+    normals : SurfaceNormals
+        Of the cells of `grid`.
+    cones : records of `CONE`, shape (N,)
+        Those of `cone_table`.
     """
-    table = cone_table(readings, grid, model)
-    causes = causes_of(readings, table['sigma'] * grid.resolution, model)
-    out = np.empty((8, len(readings)))
-    filled = np.ascontiguousarray(np.asarray(occupied) == 1).view(np.uint8)
-    _expect(table, causes, filled, grid.resolution, out)
-    return Expectations(*out)
+
+    def __init__(
+        self,
+        readings: Readings,
+        grid: Grid,
+        model: ModelParameters,
+        normals: SurfaceNormals | None = None,
+        cones: Cones | None = None,
+    ) -> None:
+        """Take over `cones` if they are known; without `normals` no reading exceeds the incidence angle."""
+        self.readings, self.grid, self.model = readings, grid, model
+        self.normals = no_normals() if normals is None else normals
+        self.cones = cone_table(readings, grid, model) if cones is None else cones
+        self._pairing = self.cones
+
+    def at(self, model: ModelParameters) -> ForwardModel:
+        """Return the same with other values of the model.
+
+        The normals stay, and so does the choice of the surfaces that each reading passes, which depends on σ: so the
+        likelihood is a smooth function of the values.
+        """
+        other = ForwardModel(self.readings, self.grid, model, self.normals)
+        other._pairing = self._pairing
+        return other
+
+    def expectations(self, occupied: NDArray[Any]) -> Expectations:
+        """Return the E-step and the log-likelihood of every reading, given a map.
+
+        Parameters
+        ----------
+        occupied : array of shape `grid.shape`
+            Occupied cells are 1; anything else counts as free.
+        """
+        resolution, model = self.grid.resolution, self.model
+        causes = causes_of(self.readings, self.cones['sigma'] * resolution, model)
+        given = _Given(self.cones, self._pairing, self.normals, causes, resolution)
+        out = np.empty((8, len(self.readings)))
+        _expect(given, np.ascontiguousarray(np.asarray(occupied) == 1).view(np.uint8), out)
+        return Expectations(*out)
+
+    def log_likelihood(self, occupied: NDArray[Any]) -> float:
+        """Return log p(Z | m) in nats: the sum over the logs of the readings."""
+        return float(self.expectations(occupied).log_likelihood.sum())
 
 
-def log_likelihood(readings: Readings, grid: Grid, occupied: NDArray[Any], model: ModelParameters) -> float:
-    """Return log p(Z | m) in nats (eq 16: the sum is over logs)."""
-    return float(expectations(readings, grid, occupied, model).log_likelihood.sum())
+def expectations(
+    readings: Readings,
+    grid: Grid,
+    occupied: NDArray[Any],
+    model: ModelParameters,
+    normals: SurfaceNormals | None = None,
+) -> Expectations:
+    """Return `ForwardModel.expectations` of one map."""
+    return ForwardModel(readings, grid, model, normals).expectations(occupied)
+
+
+def log_likelihood(
+    readings: Readings,
+    grid: Grid,
+    occupied: NDArray[Any],
+    model: ModelParameters,
+    normals: SurfaceNormals | None = None,
+) -> float:
+    """Return `ForwardModel.log_likelihood` of one map."""
+    return ForwardModel(readings, grid, model, normals).log_likelihood(occupied)

@@ -20,6 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ..common.grid import Grid
 from ..runtime.jit import kernel
 from .cone import rows_of, runs_of
 from .cone_table import Cones, cone_of
@@ -58,6 +59,23 @@ class SurfaceNormals(NamedTuple):
     cos2_limit: float
 
 
+def on_larger_grid(normals: SurfaceNormals, inner: Grid, outer: Grid) -> SurfaceNormals:
+    """Return the normals of `inner` as those of `outer`, which holds it; none is known outside of `inner`."""
+    if not len(normals.known):
+        return normals
+    window = outer.window(inner)
+
+    def wide(values: NDArray[Any]) -> NDArray[Any]:
+        out = np.zeros(outer.shape, values.dtype)
+        out[window] = values.reshape(inner.shape)
+        return out
+
+    known = wide(normals.known)
+    return SurfaceNormals(
+        known.ravel(), wide(normals.x).ravel(), wide(normals.y).ravel(), _before(known), normals.cos2_limit
+    )
+
+
 def no_normals() -> SurfaceNormals:
     """Return that no reading exceeds_incidence_angle."""
     none = np.zeros(0, np.float32)
@@ -93,6 +111,13 @@ def gather(cones: Cones, shape: tuple[int, int], part: tuple[int, int], sums: An
                     sums[2, cell] += int(weight)
 
 
+def _before(known: NDArray[Any]) -> NDArray[np.int32]:
+    """Return the number of known cells in each row before a column, shape (height, width + 1)."""
+    out = np.zeros((known.shape[0], known.shape[1] + 1), np.int32)
+    np.cumsum(known, axis=1, out=out[:, 1:])
+    return out
+
+
 def _box(values: NDArray[np.int64]) -> NDArray[np.float64]:
     """Return the sums over 3 x 3 cells, nothing beyond the edges."""
     wide = np.pad(values, 1)
@@ -107,13 +132,11 @@ def normals_of(sums: NDArray[np.int64], shape: tuple[int, int], angle: float) ->
     agreement = np.hypot(cosine, sine)
     known = (mass >= LEAST_WEIGHT) & (agreement >= LEAST_AGREEMENT * mass)
     normal = np.arctan2(sine, cosine) / 2
-    before = np.zeros((shape[0], shape[1] + 1), np.int32)
-    np.cumsum(known, axis=1, out=before[:, 1:])
     return SurfaceNormals(
         known.ravel().view(np.uint8),
         np.cos(normal).ravel().astype(np.float32),
         np.sin(normal).ravel().astype(np.float32),
-        before,
+        _before(known),
         math.cos(angle) ** 2,
     )
 

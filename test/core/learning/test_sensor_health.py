@@ -7,7 +7,10 @@ import math
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
+import naive
 from forward_grid_mapper.core.common.grid import Grid
 from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.common.readings import Readings
@@ -19,6 +22,7 @@ from forward_grid_mapper.core.learning.sensor_health import (
 )
 from forward_grid_mapper.core.mapping import Mapper
 from forward_grid_mapper.core.maps.map_set import MapSet
+from forward_grid_mapper.core.sensor.forward_model import ForwardModel
 from forward_grid_mapper.simulation.drive import corridor_drive, drive
 from forward_grid_mapper.simulation.sonar import NOISY, front_array, sonar_ring
 from forward_grid_mapper.simulation.world import rooms_world
@@ -112,10 +116,50 @@ def test_first_obstacles() -> None:
         ('a',), x=[0.0, 0.0, 0.0, 9.0], y=0.05, yaw=[0.0, 0.2, 1.0, 0.0], z=[3.0] * 4, z_max=[3.0, 3.0, 3.0, 3.0],
         half_angle=0.25,
     )  # fmt: skip
-    found = first_obstacles(readings, grid, ml)
+    model = Parameters().model
+    found = first_obstacles(ForwardModel(readings, grid, model), ml)
     assert found[:2] == pytest.approx(2.0, abs=0.1)
     assert np.isinf(found[2:]).all()
-    assert np.isinf(first_obstacles(dataclasses.replace(readings, z_max=np.full(4, 1.5)), grid, ml)).all()
+    nearer = dataclasses.replace(readings, z=np.full(4, 1.5), z_max=np.full(4, 1.5))
+    assert np.isinf(first_obstacles(ForwardModel(nearer, grid, model), ml)).all()
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.floats(0.02, 1.5))
+def test_posts_of_one_cell_are_always_found(seed: int, half_angle: float) -> None:
+    rng = np.random.default_rng(seed)
+    grid = Grid(0.1, -30, -20, 60, 50)
+    ml = np.zeros(grid.shape, np.int8)
+    x, y, yaw = rng.uniform(-0.5, 0.5), rng.uniform(-0.5, 0.5), rng.uniform(-4, 4)
+    away, side = rng.uniform(0.3, 1.9), rng.uniform(-0.99, 0.99) * half_angle
+    # the cell that has a point of the cone in it, if its centre is in the cone too
+    rows, columns = grid.cells_of(np.array([x + away * np.cos(yaw + side)]), np.array([y + away * np.sin(yaw + side)]))
+    ml[rows, columns] = 1
+    readings = Readings.from_columns(x=x, y=y, yaw=yaw, z=2.5, z_max=2.5, half_angle=half_angle)
+    model = Parameters().model
+    (found,) = first_obstacles(ForwardModel(readings, grid, model), ml)
+    distances = naive.cells_of(dataclasses.replace(readings, z=readings.z_max), 0, grid, model)
+    assert found == pytest.approx(distances.get(int(rows[0] * grid.width + columns[0]), np.inf), abs=1e-9)
+    xs, ys = grid.centers()
+    u, v = xs[columns[0]] - x, ys[rows[0]] - y
+    if abs(math.remainder(math.atan2(v, u) - yaw, 2 * math.pi)) < half_angle:
+        assert np.isfinite(found)
+
+
+def test_the_largest_number_as_range_ends() -> None:
+    grid = Grid(0.1, -5, -10, 60, 20)
+    ml = np.zeros(grid.shape, np.int8)
+    rows, columns = grid.cells_of(np.array([5.45, 0.55]), np.array([0.05, -0.95]))
+    ml[rows[0], columns[0]] = 1
+    without_end = float(np.finfo(np.float32).max)
+    readings = Readings.from_columns(
+        x=[0.0, 0.0, 50.0, -1e6], y=0.05, yaw=[0.0, 2.0, math.pi, 0.0], z=[1.0] * 4, z_max=without_end, half_angle=0.2
+    )
+    found = first_obstacles(ForwardModel(readings, grid, Parameters().model), ml)
+    assert found[0] == pytest.approx(5.45 - 0.03, abs=1e-6)
+    assert np.isinf(found[1])
+    assert found[2] == pytest.approx(50 - 5.45 - 0.03, abs=1e-6)
+    assert found[3] == pytest.approx(1e6 + 5.45 - 0.03, abs=1e-3)
 
 
 def test_commonest_range() -> None:

@@ -13,13 +13,14 @@ from forward_grid_mapper.core.common.parameters import ModelParameters
 from forward_grid_mapper.core.common.readings import Readings
 from forward_grid_mapper.core.joint_learning import settle
 from forward_grid_mapper.core.learning.standard_errors import LEARNED, Estimate, estimates, estimating_functions
-from forward_grid_mapper.core.sensor.forward_model import expectations
+from forward_grid_mapper.core.sensor.forward_model import ForwardModel, expectations
 
 START = ModelParameters()
 
 
 def learned(readings: Readings, start: ModelParameters = START) -> dict[str, Estimate]:
-    return estimates(readings, LINE, line_map(), settle(readings, LINE, line_map(), start))
+    forward = ForwardModel(readings, LINE, start)
+    return estimates(forward.at(settle(forward, line_map())), line_map())
 
 
 def test_the_truth_lies_within_the_intervals_as_often_as_they_say() -> None:
@@ -51,16 +52,16 @@ def test_estimating_functions_are_derivatives_of_the_log_likelihood(name: str) -
     expected = (high - low) / (2 * step)
     # without an echo, the normal around max range is no evidence of sigma
     counts = readings.echo & (readings.z < 5.5) if name == 'sigma' else np.ones(len(readings), bool)
-    found = estimating_functions(readings, LINE, line_map(), model)[name]
+    found = estimating_functions(ForwardModel(readings, LINE, model), line_map())[name]
     np.testing.assert_allclose(found[counts], expected[counts], rtol=1e-4, atol=1e-4)
 
 
 def test_they_vanish_where_the_updates_end() -> None:
     readings = drawn(np.random.default_rng(5), 2000)
-    model = settle(readings, LINE, line_map(), START)
-    for name, found in estimates(readings, LINE, line_map(), model).items():
-        total = estimating_functions(readings, LINE, line_map(), model)[name].sum()
-        spread = estimating_functions(readings, LINE, line_map(), model)[name].std() * math.sqrt(len(readings))
+    model = settle(ForwardModel(readings, LINE, START), line_map())
+    for name, found in estimates(ForwardModel(readings, LINE, model), line_map()).items():
+        told = estimating_functions(ForwardModel(readings, LINE, model), line_map())[name]
+        total, spread = told.sum(), told.std() * math.sqrt(len(readings))
         assert abs(total) < 0.1 * spread, (name, found)
 
 
@@ -97,7 +98,7 @@ def test_values_that_cannot_move_say_why() -> None:
     assert math.isnan(found['sigma'].error) and math.isfinite(found['p_hit'].error)
     silent = dataclasses.replace(readings, z=readings.z_max.copy())
     free = np.zeros(LINE.shape, np.int8)
-    nothing = estimates(silent, LINE, free, START)
+    nothing = estimates(ForwardModel(silent, LINE, START), free)
     assert nothing['p_hit'].bound == nothing['sigma'].bound == 'no reading informs it'
     stated = dataclasses.replace(readings, sigma=np.full(len(readings), 0.05))
-    assert estimates(stated, LINE, line_map(), START)['sigma'].readings == 0
+    assert estimates(ForwardModel(stated, LINE, START), line_map())['sigma'].readings == 0

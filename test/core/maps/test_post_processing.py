@@ -17,7 +17,7 @@ from forward_grid_mapper.core.evidence.evidence import Evidence
 from forward_grid_mapper.core.evidence.fixed_point import QUANTUM
 from forward_grid_mapper.core.maps.free_space import expected_passes
 from forward_grid_mapper.core.maps.post_processing import post_process
-from forward_grid_mapper.core.maps.wall_extension import MOST_AGAINST, STRAIGHT_RUN, extend
+from forward_grid_mapper.core.maps.wall_extension import MOST_AGAINST, extend
 from forward_grid_mapper.core.runtime import threads
 
 GRID = Grid(0.1, 0, 0, 14, 11)
@@ -85,34 +85,6 @@ def test_neither_threads_nor_what_is_grazed_change_who_passed(monkeypatch: pytes
     assert np.array_equal(expected_passes(two, occupied), one)
 
 
-STEPS = [(1, 0), (1, 1), (0, 1), (-1, 1), (-1, 0), (-1, -1), (0, -1), (1, -1)]
-
-
-def drawn_out(evidence: Evidence, steps: int, barred: np.ndarray) -> np.ndarray:
-    """The twin of `extend`, from its docstring."""
-    maps = evidence.state.maps
-    occupied, told, seen = (a.reshape(GRID.shape) for a in (maps.occupied, maps.evidence, maps.seen))
-    out = np.zeros(GRID.shape, np.uint8)
-
-    def at(x: int, y: int) -> bool:
-        return 0 <= x < GRID.width and 0 <= y < GRID.height and occupied[y, x] == 1
-
-    for y, x in np.argwhere(occupied):
-        for k, (dx, dy) in enumerate(STEPS):
-            ahead = [STEPS[k], STEPS[(k + 1) % 8], STEPS[k - 1]]
-            straight = all(at(x - n * dx, y - n * dy) for n in range(STRAIGHT_RUN))
-            if not straight or any(at(x + u, y + v) for u, v in ahead):
-                continue
-            for n in range(1, steps + 1):
-                u, v = x + n * dx, y + n * dy
-                if not (0 <= u < GRID.width and 0 <= v < GRID.height):
-                    break
-                if barred[v, u] or occupied[v, u] or not seen[v, u] or told[v, u] * QUANTUM < -MOST_AGAINST:
-                    break
-                out[v, u] = 1
-    return out
-
-
 @pytest.mark.parametrize('seed', range(30))
 def test_walls_go_on_where_the_twin_has_it(seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -120,7 +92,7 @@ def test_walls_go_on_where_the_twin_has_it(seed: int) -> None:
     for _ in range(3):
         x, y, k = int(rng.integers(GRID.width)), int(rng.integers(GRID.height)), int(rng.integers(8))
         for n in range(int(rng.integers(3, 7))):
-            u, v = x + n * STEPS[k][0], y + n * STEPS[k][1]
+            u, v = x + n * naive.STEPS[k][0], y + n * naive.STEPS[k][1]
             if 0 <= u < GRID.width and 0 <= v < GRID.height:
                 occupied[v, u] = 1
     evidence = made(random_readings(rng, GRID, 15), plain_model(), occupied)
@@ -129,7 +101,9 @@ def test_walls_go_on_where_the_twin_has_it(seed: int) -> None:
     for steps in (1, 3):
         out = np.zeros(GRID.size, np.uint8)
         extend(evidence.state, steps, barred.ravel(), out)
-        assert np.array_equal(out.reshape(GRID.shape), drawn_out(evidence, steps, barred))
+        told, seen = (a.reshape(GRID.shape) for a in (evidence.state.maps.evidence * QUANTUM, evidence.state.maps.seen))
+        expected = naive.drawn_out(occupied, told, seen, steps, barred)
+        assert np.array_equal(out.reshape(GRID.shape), expected)
 
 
 def wall_at(row: int, first: int, last: int) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import numpy as np
@@ -14,7 +15,9 @@ from forward_grid_mapper.core.common.readings import Readings
 from forward_grid_mapper.core.maps.traversed import (
     LONGEST_PAUSE,
     LONGEST_STEP,
+    MEANWHILE,
     STRIDES,
+    longest_step,
     mark_traversed,
     traversed_cells,
 )
@@ -78,6 +81,62 @@ def test_the_middle_of_a_ring_of_sonars_is_driven_over_before_it_moves(count: in
 def test_gaps_and_jumps_are_not_joined(pause: int, step: float, joined: bool) -> None:
     found = told([0.05, 0.05 + step], [1.05, 1.05], [0, pause * MS])
     assert len(found) == (round(step / 0.1) + 1 if joined else 2)
+
+
+def ring(radius: float, count: int, sweeps: int, drive: float = 0.0, jump: float = 0.0) -> Readings:
+    """Sweeps of a ring of sonars on a robot that drives so far from one to the next, and jumps before the last."""
+    k = np.arange(count * sweeps)
+    yaw = k % count * 2 * math.pi / count
+    x = 1.0 + drive * (k / count) + np.where(k // count == sweeps - 1, jump, 0.0)
+    return Readings.from_columns(
+        tuple(f'sonar_{n}' for n in range(count)),
+        x=x + radius * np.cos(yaw),
+        y=2.0 + radius * np.sin(yaw),
+        yaw=yaw,
+        z=np.ones(len(k)),
+        z_max=2.0,
+        half_angle=0.1,
+        stamp=k * 15 * MS,
+        sensor=k % count,
+    )
+
+
+@pytest.mark.parametrize('radius', [0.25, 0.75, 1.2])
+@pytest.mark.parametrize('drive', [0.0, 0.2])
+def test_the_middle_of_a_large_robot_is_traversed_too(radius: float, drive: float) -> None:
+    readings = ring(radius, 16, 5, drive)
+    found = {(int(r), int(c)) for r, c in np.argwhere(traversed_cells(readings, GRID))}
+    beside = {(row + v, column + u) for row, column in found for u in (-1, 0, 1) for v in (-1, 0, 1)}
+    inside = cells(*((1.0 + u, 2.0 + v) for u in (-0.1, 0.0, 0.1) for v in (-0.1, 0.0, 0.1)))
+    assert inside <= beside
+    assert LONGEST_STEP <= longest_step(readings)
+    assert longest_step(readings) == pytest.approx(max(LONGEST_STEP, 2 * radius + MEANWHILE), abs=0.5 * drive + 1e-9)
+
+
+@pytest.mark.parametrize('radius', [0.25, 0.75])
+@pytest.mark.parametrize('jump', [1.9, 2.4])
+def test_a_robot_that_jumps_draws_no_lines_however_large_it_is(radius: float, jump: float) -> None:
+    wide = Grid(0.1, -10, -10, 80, 60)
+    still, jumped = ring(radius, 16, 6), ring(radius, 16, 6, jump=jump)
+    assert longest_step(jumped) == pytest.approx(longest_step(still))
+    ahead = dataclasses.replace(still, x=still.x + jump)
+    either = traversed_cells(still, wide) | traversed_cells(ahead, wide)
+    found = traversed_cells(jumped, wide)
+    _, columns = np.nonzero(found & ~either)
+    # what lies between the two places, but for pairs of sensors that the jump brought nearer together
+    x, _ = wide.centers()
+    between = (x[columns] > 1.0 + radius + 0.1) & (x[columns] < 1.0 + jump - radius - 0.1)
+    assert not between.any() or jump - 2 * radius < longest_step(still)
+
+
+def test_a_single_pair_of_sensors_tells_nothing_of_the_size() -> None:
+    two = readings_at([0.0, 3.0] * 2, [2.0] * 4, [0, 1, 2, 3])
+    two = dataclasses.replace(two, sensor=np.array([0, 1, 0, 1], np.int32), sensor_names=('a', 'b'))
+    assert longest_step(two) == pytest.approx(3.0 + MEANWHILE)
+    assert longest_step(two.select(slice(0, 3))) == LONGEST_STEP
+    far = dataclasses.replace(two, x=two.x * 2)
+    assert longest_step(far) == LONGEST_STEP, 'sensors of one robot are not so far apart'
+    assert longest_step(two.select(slice(0, 0))) == LONGEST_STEP
 
 
 def test_readings_are_taken_in_the_order_of_their_stamps() -> None:

@@ -14,7 +14,8 @@ from forward_grid_mapper.core.common.grid import Grid
 from forward_grid_mapper.core.common.parameters import ModelParameters
 from forward_grid_mapper.core.learning.model_update import learn
 from forward_grid_mapper.core.sensor.density import CUT
-from forward_grid_mapper.core.sensor.forward_model import expectations, log_likelihood
+from forward_grid_mapper.core.sensor.forward_model import ForwardModel, expectations, log_likelihood
+from forward_grid_mapper.core.sensor.surface_normals import SurfaceNormals
 
 GRID = Grid(0.1, 3, -4, 4, 3)
 
@@ -35,6 +36,60 @@ def test_log_likelihood_is_that_of_all_correspondences(seed: int) -> None:
     occupied = (rng.random(GRID.shape) < rng.uniform(0, 0.8)).astype(np.int8)
     expected = naive.log_likelihood(readings, GRID, occupied, model)
     assert log_likelihood(readings, GRID, occupied, model) == pytest.approx(expected, abs=1e-9)
+
+
+def random_normals(rng: np.random.Generator, grid: Grid, angle: float) -> SurfaceNormals:
+    """Normals of half of the cells, in random directions."""
+    known, turn = rng.random(grid.shape) < 0.5, rng.uniform(0, math.pi, grid.size)
+    before = np.zeros((grid.height, grid.width + 1), np.int32)
+    before[:, 1:] = np.cumsum(known, axis=1)
+    x, y = np.cos(turn).astype(np.float32), np.sin(turn).astype(np.float32)
+    return SurfaceNormals(known.ravel().astype(np.uint8), x, y, before, math.cos(angle) ** 2)
+
+
+@pytest.mark.parametrize('first', range(0, 30, 5))
+def test_with_normals_it_is_that_of_all_correspondences_with_surfaces_that_answer(first: int) -> None:
+    passed = 0
+    for seed in range(first, first + 5):
+        rng = np.random.default_rng(400 + seed)
+        readings, model = (
+            random_readings(rng, GRID, 80),
+            dataclasses.replace(random_model(rng), grazing_angle=0.6, sigma=0.05),
+        )
+        readings.sigma[:] *= 0.3
+        normals = random_normals(rng, GRID, model.grazing_angle)
+        occupied = (rng.random(GRID.shape) < 0.7).astype(np.int8)
+        told = expectations(readings, GRID, occupied, model, normals)
+        for t in range(len(readings)):
+            met = sorted(naive.obstacles(readings, t, GRID, occupied, model, normals))
+            sigma = naive.sigma_of(readings, t, GRID, model)
+            terms = naive.causes(readings.z[t], readings.z_max[t], sigma, met, model)
+            assert told.log_likelihood[t] == pytest.approx(math.log(sum(terms)), abs=1e-8)
+            assert told.random[t] == pytest.approx(terms[0] / sum(terms), abs=1e-8)
+            assert told.obstacles[t] == len(met)
+            passed += len(naive.obstacles(readings, t, GRID, occupied, model)) - len(met)
+        expected = naive.log_likelihood(readings, GRID, occupied, model, normals)
+        assert log_likelihood(readings, GRID, occupied, model, normals) == pytest.approx(expected, abs=1e-6)
+    assert passed > 0
+
+
+def test_other_values_of_the_model_leave_the_choice_of_surfaces_as_it_is() -> None:
+    rng = np.random.default_rng(9)
+    readings = random_readings(rng, GRID, 200)
+    readings.sigma[:] = 0
+    model = ModelParameters(sigma=0.06, grazing_angle=0.6, p_lost=0.0)
+    forward = ForwardModel(readings, GRID, model, random_normals(rng, GRID, 0.6))
+    occupied = (rng.random(GRID.shape) < 0.7).astype(np.int8)
+    wider = dataclasses.replace(model, sigma=0.3)
+    # with every obstacle as far as the reading, the number of obstacles depends on the reach alone
+    plain = ForwardModel(readings, GRID, wider).expectations(occupied).obstacles
+    fresh = ForwardModel(readings, GRID, wider, forward.normals).expectations(occupied).obstacles
+    kept = forward.at(wider).expectations(occupied).obstacles
+    before = ForwardModel(readings, GRID, model).expectations(occupied).obstacles
+    passed = before - forward.expectations(occupied).obstacles
+    assert passed.any() and np.array_equal(plain - kept, passed)
+    assert (plain - fresh <= passed).all() and not np.array_equal(fresh, kept)
+    assert forward.at(model).log_likelihood(occupied) == forward.log_likelihood(occupied)
 
 
 @pytest.mark.parametrize('seed', range(10))
@@ -122,7 +177,7 @@ def test_learning_recovers_the_truth_when_it_knows_the_map() -> None:
     readings = sample(rng, readings, grid, occupied, truth)
     model = ModelParameters(p_hit=0.8, p_rand=0.03, p_lost=0.05, sigma=0.12)
     for _ in range(40):
-        model = learn(readings, grid, occupied, model)
+        model = learn(ForwardModel(readings, grid, model), occupied)
     assert model.p_hit == pytest.approx(truth.p_hit, abs=0.05)
     assert model.p_rand == pytest.approx(truth.p_rand, abs=0.03)
     assert model.p_lost == pytest.approx(truth.p_lost, abs=0.05)
@@ -140,4 +195,4 @@ def test_learning_never_lowers_the_likelihood() -> None:
     for _ in range(10):
         now = log_likelihood(readings, grid, occupied, model)
         assert now >= before - 1e-9
-        before, model = now, learn(readings, grid, occupied, model)
+        before, model = now, learn(ForwardModel(readings, grid, model), occupied)

@@ -22,11 +22,11 @@ from forward_grid_mapper.core.sensor.surface_normals import (
     LEAST_AGREEMENT,
     LEAST_WEIGHT,
     QUANTUM,
-    THROUGH,
     exceeds_incidence_angle,
     gather,
     no_normals,
     normals_of,
+    on_larger_grid,
 )
 
 GRID = Grid(0.1, -7, 12, 25, 20)
@@ -109,22 +109,6 @@ def test_a_straight_angle_leaves_out_nothing() -> None:
     assert normals_of(sums, GRID.shape, math.pi / 2).cos2_limit < 1e-12
 
 
-def left_out(evidence: Evidence, readings: Readings, t: int, model: ModelParameters) -> set[int]:
-    """The cells that reading t exceeds_incidence_angle, by the definition, given the normals."""
-    normals = evidence.state.normals
-    xs, ys = GRID.centers()
-    out = set()
-    for c in naive.cells_of(readings, t, GRID, model):
-        dx, dy = xs[c % GRID.width] - readings.x[t], ys[c // GRID.width] - readings.y[t]
-        d = math.hypot(dx, dy)
-        before = naive.surface(GRID, model)
-        if normals.known[c] and d - before < readings.z[t] - THROUGH * naive.sigma_of(readings, t, GRID, model):
-            cos2_limit = abs(normals.x[c] * dx + normals.y[c] * dy) / d
-            if cos2_limit < math.cos(model.grazing_angle):
-                out.add(c)
-    return out
-
-
 @pytest.mark.parametrize('readings', [along_wall(), random_readings(np.random.default_rng(2), GRID, 120)])
 def test_pairs_are_those_of_the_cone_without_what_is_grazed(readings: Readings) -> None:
     model = MODEL
@@ -135,7 +119,7 @@ def test_pairs_are_those_of_the_cone_without_what_is_grazed(readings: Readings) 
     for t in range(len(readings)):
         free, band, density, _ = naive.pairs_of(s, t)
         whole_free, whole_band, whole_density, _ = naive.pairs_of(plain.state, t)
-        grazed = left_out(evidence, readings, t, model)
+        grazed = naive.left_out(readings, t, GRID, model, s.normals)
         # in the same order
         assert free == [c for c in whole_free if c not in grazed]
         kept = [(c, g) for c, g in zip(whole_band, whole_density, strict=True) if c not in grazed]
@@ -203,6 +187,24 @@ def test_a_grid_that_grew_faces_as_if_it_had_been_larger_from_the_start() -> Non
     grown.grow(large)
     whole.extend(readings)
     assert snapshot(grown) == snapshot(whole)
+
+
+def test_normals_on_a_larger_grid_are_those_of_the_same_places() -> None:
+    normals = made(along_wall()).state.normals
+    large = Grid(0.1, GRID.column - 11, GRID.row - 3, GRID.width + 30, GRID.height + 17)
+    wide = on_larger_grid(normals, GRID, large)
+    xs, ys = large.centers()
+    rows, columns = GRID.cells_of(*np.meshgrid(xs, ys))
+    inside = (rows >= 0) & (rows < GRID.height) & (columns >= 0) & (columns < GRID.width)
+    for name in ('known', 'x', 'y'):
+        told, expected = getattr(wide, name).reshape(large.shape), getattr(normals, name).reshape(GRID.shape)
+        assert np.array_equal(told[inside], expected[rows[inside], columns[inside]])
+        assert not told[~inside].any()
+    known = wide.known.reshape(large.shape)
+    assert known.any()
+    assert all(wide.before[row, k] == known[row, :k].sum() for row, k in np.ndindex(wide.before.shape))
+    assert wide.cos2_limit == normals.cos2_limit
+    assert on_larger_grid(no_normals(), GRID, large).cos2_limit == 0.0
 
 
 def test_what_is_grazed_is_not_contradicted() -> None:

@@ -1,0 +1,150 @@
+"""The default pipeline against plain Python: normals, gains, the end of the search, the maps that are handed out."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+import pytest
+
+import naive
+from forward_grid_mapper.core.common.grid import Grid
+from forward_grid_mapper.core.common.parameters import Parameters
+from forward_grid_mapper.core.common.readings import Readings
+from forward_grid_mapper.core.mapping import Mapper
+from forward_grid_mapper.core.maps.map_set import MapSet
+from forward_grid_mapper.core.maps.traversed import traversed_cells
+from forward_grid_mapper.core.search.prior import Prior, local_prior, shapes
+from forward_grid_mapper.core.search.search import LEAST
+from forward_grid_mapper.core.sensor.surface_normals import LEAST_AGREEMENT, LEAST_WEIGHT
+
+SEEDS = range(3)
+
+
+def corner(seed: int, count: int = 70) -> Readings:
+    """Readings of a robot in the corner of two walls; at a slant they hear nothing, and some are random."""
+    rng = np.random.default_rng(seed)
+    x, y = 0.3 + 0.5 * rng.random(count), 0.3 + 0.5 * rng.random(count)
+    yaw = rng.uniform(-0.6, 2.2, count)
+    z_max = 1.6
+    to_wall = np.stack([(1.4 - x) / np.cos(yaw), (1.3 - y) / np.sin(yaw)])
+    to_wall[~(to_wall > 0)] = np.inf
+    slant = np.where(to_wall[0] < to_wall[1], np.abs(yaw), np.abs(yaw - math.pi / 2))
+    z = np.where(slant < 0.5, to_wall.min(axis=0) + 0.03 * rng.standard_normal(count), z_max)
+    z = np.where(rng.random(count) < 0.1, rng.uniform(0.2, z_max, count), z)
+    return Readings.from_columns(
+        ('front', 'side'),
+        x=x,
+        y=y,
+        yaw=yaw,
+        z=np.clip(z, 0.05, z_max),
+        z_max=z_max,
+        half_angle=rng.choice([0.1, 0.2], count),
+        stamp=np.arange(count) * 50_000_000,
+        sensor=np.arange(count) % 2,
+    )
+
+
+@dataclass(frozen=True)
+class Case:
+    """The default maps of some readings, and the map that the search found."""
+
+    maps: MapSet
+    searched: np.ndarray
+    traversed: np.ndarray
+
+    @property
+    def told(self) -> tuple[Readings, Grid, np.ndarray]:
+        return self.maps.readings, self.maps.grid, self.searched
+
+    @property
+    def prior(self) -> Prior:
+        search = self.maps.parameters.search
+        return Prior(local_prior(search, self.traversed).ravel(), shapes(search))
+
+
+@cache
+def case(seed: int) -> Case:
+    mapper, seen = Mapper(Parameters()), []
+    maps = mapper.run(corner(seed), lambda stage, progress: seen.append(mapper.so_far()) if progress else None)
+    _, searched = seen[-1]
+    return Case(maps, (searched == 1).astype(np.uint8), traversed_cells(maps.readings, maps.grid))
+
+
+@cache
+def evidence(seed: int) -> np.ndarray:
+    """That of every cell, given the map that the search found, from sums over all correspondences."""
+    c = case(seed)
+    return naive.evidence(*c.told, c.maps.parameters.model, c.maps.normals)
+
+
+@pytest.mark.parametrize('seed', SEEDS)
+def test_normals(seed: int) -> None:
+    maps = case(seed).maps
+    sums = naive.normals(maps.readings, maps.grid, maps.parameters.model)
+    cosine, sine, mass = (naive.box_sum(values) for values in sums)
+    length = np.hypot(cosine, sine)
+    clear = (np.abs(mass - LEAST_WEIGHT) > 1e-2) & (np.abs(length - LEAST_AGREEMENT * mass) > 1e-2)
+    known = (mass >= LEAST_WEIGHT) & (length >= LEAST_AGREEMENT * mass)
+    assert np.array_equal(maps.normals.known.reshape(maps.grid.shape)[clear], known[clear])
+    assert known.sum() > 10
+    left_out = [naive.left_out(maps.readings, t, maps.grid, maps.parameters.model, maps.normals) for t in range(70)]
+    assert any(left_out), 'no reading passes a surface'
+
+
+@pytest.mark.parametrize('seed', SEEDS)
+def test_the_likelihood_and_the_objective(seed: int) -> None:
+    c = case(seed)
+    maps, model = c.maps, c.maps.parameters.model
+    likelihood = naive.log_likelihood(maps.readings, maps.grid, maps.ml, model, maps.normals)
+    assert maps.log_likelihood == pytest.approx(likelihood, abs=1e-5)
+    prior = naive.log_prior(c.prior, maps.ml == 1, maps.grid.shape)
+    assert maps.objective == pytest.approx(likelihood + prior, abs=1e-5)
+    # logs are whole numbers of rounded likelihoods
+    searched = naive.log_likelihood(*c.told, model, maps.normals)
+    assert maps.statistics['searched_log_likelihood'] == pytest.approx(searched, abs=1e-4)
+    for t in range(len(maps.readings)):
+        met = naive.obstacles(maps.readings, t, maps.grid, maps.ml, model, maps.normals)
+        sigma = naive.sigma_of(maps.readings, t, maps.grid, model)
+        terms = naive.causes(maps.readings.z[t], maps.readings.z_max[t], sigma, met[:12], model)
+        if len(met) <= 12:
+            assert maps.unexplained[t] == (terms[0] > 0.5 * sum(terms))
+
+
+@pytest.mark.parametrize('seed', SEEDS)
+def test_no_single_flip_gains_where_the_search_ended(seed: int) -> None:
+    c = case(seed)
+    assert c.maps.statistics['converged']
+    told, occupied = evidence(seed), c.searched.ravel()
+    assert occupied.sum() > 10
+    for cell in np.flatnonzero(told):
+        data = -told[cell] if occupied[cell] else told[cell]
+        gain = data + naive.prior_gain(c.prior, occupied, cell, c.maps.grid.shape)
+        assert gain < LEAST[0] + LEAST[1] * len(c.maps.readings) + 1e-4
+
+
+@pytest.mark.parametrize('seed', SEEDS)
+def test_the_map_that_is_handed_out(seed: int) -> None:
+    c = case(seed)
+    search, model = c.maps.parameters.search, c.maps.parameters.model
+    expected = naive.handed_out(*c.told, model, c.maps.normals, c.traversed, search.extend, search.least_passed)
+    assert np.array_equal(c.maps.ml, expected)
+    assert set(np.unique(expected)) == {-1, 0, 1}
+
+
+@pytest.mark.parametrize('seed', SEEDS)
+def test_the_uncertainty_map(seed: int) -> None:
+    c = case(seed)
+    search, grid = c.maps.parameters.search, c.maps.grid
+    base = math.log(search.uncertainty_prior / (1 - search.uncertainty_prior))
+    filled = (c.maps.ml == 1).astype(np.uint8)
+    told = evidence(seed)
+    for cell, q in enumerate(c.maps.uncertainty.ravel()):
+        if np.isnan(q):
+            assert c.maps.ml.ravel()[cell] == -1 and abs(told[cell]) < 0.1 + 1e-4
+            continue
+        neighbours = naive.prior_gain(c.prior, filled, cell, grid.shape) * (-1 if filled.ravel()[cell] else 1)
+        logit = search.alpha * told[cell] + search.neighbour_weight * neighbours + base
+        assert q == pytest.approx(1 / (1 + math.exp(-logit)), abs=1e-4)
