@@ -11,7 +11,7 @@ are wanted, which takes longer and comes to the same.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -110,8 +110,9 @@ def make(
     """
     reading = cones[t]
     cone = cone_of(reading)
-    # with a type of its own from the start, so that what is called is compiled for one type
-    n, m = at, np.int64(0)
+    n = at
+    # of one type from the start, so that what is called is compiled once
+    m: Any = np.int64(0)
     for row in range(*rows_of(cone, lattice.height)):
         runs = runs_of(cone, row, lattice.width)
         v = row + 0.5 - cone.y

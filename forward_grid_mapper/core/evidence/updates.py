@@ -177,7 +177,7 @@ def add_multiplicity(s: State, readings: Any) -> None:
         pairs, at = pairs_with_logs(s, t)
         reading_state = s.reading_states[t]
         reading_state.multiplicity += 1
-        steps = np.int64(reading_state.occupy), np.int64(reading_state.release)
+        steps: Any = np.int64(reading_state.occupy), np.int64(reading_state.release)
         reading_state.changed = s.clock[0]
         _add_to_free_zone(reading_state, pairs, at, maps, steps)
         begin = at + WORDS_PER_RUN * reading_state.runs
@@ -258,7 +258,7 @@ def flip(s: State, c: int) -> None:
     step = 1 if maps.occupied[c] else -1
     s.clock[0] += 1
     for i in range(n):
-        t = np.int64(s.observing[i, 0])
+        t: Any = np.int64(s.observing[i, 0])
         # logs that are not stored are those of the map before the flip
         maps.occupied[c] ^= 1
         pairs, at = pairs_with_logs(s, t)

@@ -52,7 +52,8 @@ def promising(s: State, prior: Prior, least: Least, window: tuple[int, int, int,
                 continue
             data = evidence[c] * QUANTUM
             if occupied[c] or pattern[c]:
-                gain = data + prior_gain(prior, occupied, pattern, np.int64(c), width)
+                cell: Any = np.int64(c)
+                gain = data + prior_gain(prior, occupied, pattern, cell, width)
             else:
                 gain = data + prior.local[c] + prior.shape[0]
             if gain > least[0] + least[1] * seen[c]:

@@ -132,9 +132,10 @@ def try_shifts(s: State, readings: Any, slot: Any, place: Any, joint: Any) -> No
         for k in range(reading_state.bands):
             place[pairs.cell[cells + k]] = k
         for i in range(n):
-            k = np.int64(workspace.bucket[i])
-            c = np.int64(pairs.cell[cells + k])
-            _add_joint(s, reading_state, pairs, at, (c, k), place, joint[slot[c]])
+            k = workspace.bucket[i]
+            c = pairs.cell[cells + k]
+            cell: Any = np.int64(c), np.int64(k)
+            _add_joint(s, reading_state, pairs, at, cell, place, joint[slot[c]])
         if reading_state.blocking:
             for k in range(at, cells, WORDS_PER_RUN):
                 for c in range(pairs.cell[k], pairs.cell[k + 1] + 1):
