@@ -14,6 +14,7 @@ from typing import TextIO
 
 from ..core.common.errors import MapperError
 from ..core.search.search import Progress
+from .signals import Cancelled, Interruptible, cancelled_line
 
 PATIENCE = 1.0
 """Seconds of work before progress is shown."""
@@ -28,7 +29,8 @@ def run(
         sys.stdout.reconfigure(errors='backslashreplace')
     try:
         try:
-            return body(parser.parse_args(arguments))
+            with Interruptible():
+                return body(parser.parse_args(arguments))
         finally:
             # here an error can still be told
             sys.stdout.flush()
@@ -43,9 +45,9 @@ def run(
     except OSError as error:
         # of the work's files the work takes care; what remains is the output itself, or the working directory
         problem = str(error) if _still_printing() else f'standard output: {error}'
-    except KeyboardInterrupt:
-        print(f'{parser.prog}: cancelled; nothing was written', file=sys.stderr)
-        return 130
+    except KeyboardInterrupt as cancelled:
+        print(cancelled_line(parser.prog), file=sys.stderr)
+        return cancelled.code if isinstance(cancelled, Cancelled) else 130
     print(f'{parser.prog}: error: {problem}', file=sys.stderr)
     return 1
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -64,7 +63,8 @@ def through_node(folder: Path, bag: Path, recording: Recording, options: argpars
     """Replay a bag to the node and save its maps as `folder`/maps; return what EM said."""
     from .live_node import LiveNode
 
-    ros = {'range_reliability': 'reliable', 'odom_reliability': 'reliable', 'save_directory': str(folder)}
+    saved = folder / 'saved'
+    ros = {'range_reliability': 'reliable', 'odom_reliability': 'reliable', 'save_directory': str(saved)}
     parameters = Parameters.from_flat(ros, base=chosen_parameters(options)[0])
     with LiveNode(folder, parameters, recording.extrinsics) as node:
         ticker.say('starting the node')
@@ -74,8 +74,11 @@ def through_node(folder: Path, bag: Path, recording: Recording, options: argpars
         ticker.say('running EM')
         told = node.call('run_em')
         ticker.say('saving the maps')
-        saved = Path(node.call('save_maps').split(', ')[0]).parent
-    saved.rename(folder / 'maps')
+        node.call('save_maps')
+    # the only folder in there; the answer's text is for people, and a path may hold whatever separates its parts
+    (made,) = saved.iterdir()
+    made.rename(folder / 'maps')
+    saved.rmdir()
     return told
 
 
@@ -135,7 +138,3 @@ def demo(options: argparse.Namespace) -> int:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; return its exit code."""
     return run(parser(), demo, arguments)
-
-
-if __name__ == '__main__':
-    sys.exit(main())

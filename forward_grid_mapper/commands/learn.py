@@ -83,7 +83,3 @@ def learn(options: argparse.Namespace) -> int:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; return its exit code."""
     return run(parser(), learn, arguments)
-
-
-if __name__ == '__main__':
-    sys.exit(main())

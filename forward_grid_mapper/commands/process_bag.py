@@ -112,7 +112,3 @@ def _write_bag(path: Path, maps: MapSet, drive: Drive) -> None:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; return its exit code."""
     return run(parser(), process, arguments)
-
-
-if __name__ == '__main__':
-    sys.exit(main())

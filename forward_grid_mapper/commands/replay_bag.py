@@ -166,7 +166,3 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; return its exit code."""
     own, ros = split_ros_arguments(sys.argv[1:] if arguments is None else arguments)
     return run(parser(), lambda options: replay(options, ros), own)
-
-
-if __name__ == '__main__':
-    sys.exit(main())

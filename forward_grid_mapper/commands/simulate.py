@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -115,7 +114,3 @@ def simulate(options: argparse.Namespace) -> int:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; return its exit code."""
     return run(parser(), simulate, arguments)
-
-
-if __name__ == '__main__':
-    sys.exit(main())
