@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM at any moment: one line, exit code 128 plus the signal, nothing left behind, no child left alive."""
+"""Ctrl-C and SIGTERM at any moment: one line, exit code 128 plus the signal, nothing and nobody left behind."""
 
 from __future__ import annotations
 
