@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 from rosbags import rosbag1, rosbag2
 
 from ..core.common.errors import BagError
+from ..core.common.shell import quoted
 from . import scan_mcap, scan_rosbag1, scan_sqlite3
 from .bounds import LARGEST_METADATA, Budget, bounded, megabytes, most_unpacked
 from .salvage import Scan
@@ -42,13 +43,13 @@ class _Metadata(NamedTuple):
 def repair_hint(path: Path) -> str:
     """Return how to mend a damaged bag."""
     if path.is_dir():
-        return f'repair it with `ros2 bag reindex {path.name}`'
+        return f'repair it with `ros2 bag reindex {quoted(path)}`'
     try:
         magic = _magic(path)
     except OSError:  # the suffix will do
         magic = b''
     suffix = next((kind[0] for key, kind in _KINDS.items() if magic.startswith(key)), path.suffix)
-    command = _REPAIR.get(suffix, 'ros2 bag reindex {0}').format(path.name)
+    command = _REPAIR.get(suffix, 'ros2 bag reindex {0}').format(quoted(path))
     return f'repair it with `{command}`'
 
 
@@ -100,7 +101,7 @@ def _open_folder(folder: Path) -> tuple[list[Source], str | None]:
             bags = ', '.join(p.name for p in present[:10])
             raise BagError(
                 f'{folder} has no metadata.yaml but several bag files; name one of them ({bags}) '
-                f'or run `ros2 bag reindex {folder.name}`.'
+                f'or run `ros2 bag reindex {quoted(folder)}`.'
             )
         raise BagError(f'{folder} is not a bag: it has neither metadata.yaml nor a .mcap, .db3 or .bag file.')
     listed = _without_repetition(folder / name for name in metadata.files)
@@ -157,7 +158,7 @@ def _open_file(file: Path) -> Source:
         if not magic:
             raise BagError(f'{file} is empty (0 bytes); the recording has nothing to read.')
         if magic.startswith(_ZSTD_MAGIC):
-            raise BagError(f'{file} is compressed; unpack it with `zstd -d {file.name}` or open its bag folder.')
+            raise BagError(f'{file} is compressed; unpack it with `zstd -d {quoted(file)}` or open its bag folder.')
         raise BagError(f'{file} is not a bag: it is neither an MCAP, nor a sqlite3, nor a ROS 1 bag file.')
     reason = ''
     if file.suffix == suffix and suffix != '.db3':

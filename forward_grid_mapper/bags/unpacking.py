@@ -10,6 +10,7 @@ from pathlib import Path
 from backports import zstd
 
 from ..core.common.errors import BagError
+from ..core.common.shell import quoted
 from .bounds import LARGEST_MESSAGE, megabytes, most_unpacked, unpack
 from .source import RawMessage, Source, one_line
 
@@ -95,8 +96,8 @@ def open_unpacked(file: Path, open_file: Callable[[Path], Source]) -> Source:
         # the temporary name means nothing to anybody
         reason = one_line(error).replace(str(unpacked), 'what it holds')
         raise BagError(
-            f'{file} is damaged or cut off ({reason}); unpack it with `zstd -d`, delete metadata.yaml and run '
-            f'`ros2 bag reindex {file.parent.name}`.'
+            f'{file} is damaged or cut off ({reason}); unpack it with `zstd -d {quoted(file)}`, '
+            f'delete metadata.yaml and run `ros2 bag reindex {quoted(file.parent)}`.'
         ) from error
 
 

@@ -65,7 +65,7 @@ def through_node(folder: Path, bag: Path, recording: Recording, options: argpars
 
     saved = folder / 'saved'
     ros = {'range_reliability': 'reliable', 'odom_reliability': 'reliable', 'save_directory': str(saved)}
-    parameters = Parameters.from_flat(ros, base=chosen_parameters(options)[0])
+    parameters = Parameters.from_flat(ros, base=chosen_parameters(options).parameters)
     with LiveNode(folder, parameters, recording.extrinsics) as node:
         ticker.say('starting the node')
         node.call('reset')
@@ -84,8 +84,9 @@ def through_node(folder: Path, bag: Path, recording: Recording, options: argpars
 
 def offline(folder: Path, bag: Path, output: Path, options: argparse.Namespace, ticker: Ticker) -> str:
     """Map a bag without ROS into `folder`/maps, to be known as `output`/maps; return what EM did."""
-    parameters = chosen_parameters(options)[0]
+    parameters, _, ignored = chosen_parameters(options)
     drive = read_drive(bag, parameters, {}, progress=ticker.reading)
+    drive.source['warnings'] += ignored
     drive.source['bag'] = readable(output / bag.name)
     maps = Mapper(parameters).run(drive.associator.readings, ticker.mapping)
     write_results(folder / 'maps', maps, drive.source, drive.path_xy, 'The demo, offline')

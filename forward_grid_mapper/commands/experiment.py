@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import itertools
 import math
+import sys
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -202,7 +203,9 @@ def experiment(options: argparse.Namespace) -> int:
     """Do what the command line asks for."""
     if options.seeds < 1:
         raise ParameterError('--seeds must be a positive number')
-    parameters = chosen_parameters(options)[0]
+    parameters, _, ignored = chosen_parameters(options)
+    for warning in ignored:
+        print(f'{COMMAND}: warning: {warning}', file=sys.stderr)
     output = Path(options.output) if options.output else free_name(Path.cwd(), f'experiment_{options.which}')
     with Ticker() as ticker, output_folder(output) as folder:
         table, rows = (door if options.which == 'door' else corridor)(options, parameters, ticker)
