@@ -11,7 +11,6 @@ import time
 from contextlib import AbstractContextManager
 from pathlib import Path
 
-import numba
 import pytest
 from drive_samples import FILES, tape, write_tape
 from numba.core import event
