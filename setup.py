@@ -6,15 +6,7 @@ from setuptools import find_packages, setup
 
 NAME = 'forward_grid_mapper'
 SHARE = f'share/{NAME}'
-COMMANDS = {
-    'mapper': 'node.main',
-    'process_bag': 'commands.process_bag',
-    'learn': 'commands.learn',
-    'replay_bag': 'commands.replay_bag',
-    'simulate': 'commands.simulate',
-    'experiment': 'commands.experiment',
-    'demo': 'commands.demo',
-}
+COMMANDS = ('mapper', 'process_bag', 'learn', 'replay_bag', 'simulate', 'experiment', 'demo')
 
 
 def shared(folder):
@@ -61,6 +53,6 @@ setup(
         'lint': ['ruff>=0.17,<0.18', 'mypy>=1.15,<3', 'types-PyYAML>=6,<7'],
     },
     entry_points={
-        'console_scripts': [f'{command} = {NAME}.{module}:main' for command, module in COMMANDS.items()],
+        'console_scripts': [f'{command} = {NAME}.__main__:{command}' for command in COMMANDS],
     },
 )

@@ -1,18 +1,16 @@
-"""`python3 -m forward_grid_mapper COMMAND …`, for machines without ros2cli."""
+"""The entry of every command: `python3 -m forward_grid_mapper COMMAND …`, and one script each once it is installed.
+
+Signals get their handlers before the commands' modules are imported, which takes a second.
+"""
 
 from __future__ import annotations
 
-import sys
-
-if sys.argv[1:2] == ['mapper']:
-    # as in `node.main`: Ctrl-C gives no traceback, however early
-    import signal
-
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
-
 import importlib
+import sys
+from collections.abc import Sequence
 
 from . import __version__
+from .commands import signals
 
 COMMANDS = {
     'mapper': ('node.main', 'the ROS 2 node: map while driving'),
@@ -26,11 +24,56 @@ COMMANDS = {
 """Module and help of each command."""
 
 
+def run(command: str, arguments: Sequence[str] | None = None) -> int:
+    """Import a command and run it; return its exit code. `arguments` are those of the process unless given."""
+    signals.leave_at_once(command)
+    signals.end_with_parent()
+    module, _ = COMMANDS[command]
+    try:
+        return int(importlib.import_module(f'.{module}', __package__).main(arguments))
+    finally:
+        signals.leave_silently()
+
+
+def mapper() -> int:
+    """Run `mapper`; return its exit code."""
+    return run('mapper')
+
+
+def process_bag() -> int:
+    """Run `process_bag`; return its exit code."""
+    return run('process_bag')
+
+
+def learn() -> int:
+    """Run `learn`; return its exit code."""
+    return run('learn')
+
+
+def replay_bag() -> int:
+    """Run `replay_bag`; return its exit code."""
+    return run('replay_bag')
+
+
+def simulate() -> int:
+    """Run `simulate`; return its exit code."""
+    return run('simulate')
+
+
+def experiment() -> int:
+    """Run `experiment`; return its exit code."""
+    return run('experiment')
+
+
+def demo() -> int:
+    """Run `demo`; return its exit code."""
+    return run('demo')
+
+
 def main() -> int:
     """Run the command named by the first argument."""
     if len(sys.argv) > 1 and sys.argv[1] in COMMANDS:
-        module, _ = COMMANDS[sys.argv[1]]
-        return int(importlib.import_module(f'.{module}', __package__).main(sys.argv[2:]))
+        return run(sys.argv[1], sys.argv[2:])
     if len(sys.argv) > 1 and sys.argv[1] == '--version':
         print(__version__)
         return 0

@@ -28,7 +28,8 @@ CORE = ('common', 'runtime', 'sensor', 'messages', 'evidence', 'search', 'maps',
 OUTSIDE = {
     'core': {'numpy', 'numba'},
     'files': {'numpy', 'yaml', 'matplotlib'},
-    'bags': {'numpy', 'rosbags'},
+    # rosbags brings the decompressors
+    'bags': {'numpy', 'rosbags', 'lz4', 'backports'},
     'simulation': {'numpy'},
     'recordings': {'numpy'},
 }

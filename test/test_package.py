@@ -101,10 +101,12 @@ def test_every_command_can_be_started(setup: dict[str, Any]) -> None:
     from forward_grid_mapper.__main__ import COMMANDS
 
     scripts = dict(line.split(' = ') for line in setup['entry_points']['console_scripts'])
-    assert scripts == {name: f'{NAME}.{module}:main' for name, (module, _) in COMMANDS.items()}
+    assert scripts == {name: f'{NAME}.__main__:{name}' for name in COMMANDS}
     for target in scripts.values():
         module, function = target.split(':')
         assert callable(getattr(importlib.import_module(module), function))
+    for module, _ in COMMANDS.values():
+        assert callable(importlib.import_module(f'{NAME}.{module}').main)
 
 
 @pytest.mark.parametrize('folder', ['config', 'launch', 'rviz'])

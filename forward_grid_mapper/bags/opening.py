@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path, PurePath
 from typing import Any, NamedTuple
 
 from rosbags import rosbag1, rosbag2
 
 from ..core.common.errors import BagError
+from ..core.common.shell import quoted
 from . import scan_mcap, scan_rosbag1, scan_sqlite3
+from .bounds import LARGEST_METADATA, Budget, bounded, megabytes, most_unpacked
 from .salvage import Scan
-from .scan_sqlite3 import has_log, is_cut
 from .source import RosbagsSource, Source, one_line
+from .unpacking import UnpackedMessages, open_unpacked
 
 _KINDS: dict[bytes, tuple[str, type[Scan]]] = {
     scan_mcap.MAGIC: ('.mcap', scan_mcap.McapScan),
@@ -26,22 +29,27 @@ _REPAIR = {
 }
 _ZSTD_MAGIC = b'\x28\xb5\x2f\xfd'
 
+MOST_FILES = 100_000
+"""Lines in which a list of files is looked for."""
+
 
 class _Metadata(NamedTuple):
+    """What metadata.yaml says: names of the storage files, and how they are compressed: '', 'file' or 'message'."""
+
     files: list[str]
-    compressed: bool
+    compression: str
 
 
 def repair_hint(path: Path) -> str:
     """Return how to repair a damaged bag."""
     if path.is_dir():
-        return f'repair it with `ros2 bag reindex {path.name}`'
+        return f'repair it with `ros2 bag reindex {quoted(path)}`'
     try:
         magic = _magic(path)
     except OSError:  # the suffix will do
         magic = b''
     suffix = next((kind[0] for key, kind in _KINDS.items() if magic.startswith(key)), path.suffix)
-    command = _REPAIR.get(suffix, 'ros2 bag reindex {0}').format(path.name)
+    command = _REPAIR.get(suffix, 'ros2 bag reindex {0}').format(quoted(path))
     return f'repair it with `{command}`'
 
 
@@ -93,71 +101,97 @@ def _open_folder(folder: Path) -> tuple[list[Source], str | None]:
             bags = ', '.join(p.name for p in present[:10])
             raise BagError(
                 f'{folder} has no metadata.yaml but several bag files; name one of them ({bags}) '
-                f'or run `ros2 bag reindex {folder.name}`.'
+                f'or run `ros2 bag reindex {quoted(folder)}`.'
             )
         raise BagError(f'{folder} is not a bag: it has neither metadata.yaml nor a .mcap, .db3 or .bag file.')
-    if metadata.compressed:
-        return [_open_compressed(folder)], None
-    listed = [folder / name for name in metadata.files]
-    sources, problems = _open_each([p for p in listed if p.exists()] or present)
+    listed = _without_repetition(folder / name for name in metadata.files)
+    sources, problems = _open_each([p for p in listed if p.exists()] or present, metadata.compression)
     problems += [f'{p.name} is missing' for p in listed if not p.exists()]
     if not sources:
         raise BagError('; '.join(problems) or f'{folder} is an empty bag: metadata.yaml lists no file.')
     return sources, '; '.join(problems) or None
 
 
-def _open_each(files: list[Path]) -> tuple[list[Source], list[str]]:
+def _without_repetition(files: Iterable[Path]) -> list[Path]:
+    """Return the files in their order, each once, by whatever name: a reading that counts twice is wrong evidence."""
+    found: dict[object, Path] = {}
+    for file in files:
+        try:
+            status = file.stat()
+            found.setdefault((status.st_dev, status.st_ino), file)
+        except OSError:
+            found.setdefault(file, file)
+    return list(found.values())
+
+
+def _open_each(files: list[Path], compression: str) -> tuple[list[Source], list[str]]:
     sources, problems = [], []
     for file in files:
         try:
-            sources.append(_open_file(file))
+            sources.append(_open_listed(file, compression))
         except BagError as error:  # the other files of a split bag are still worth having
             problems.append(str(error).rstrip('.'))
     return sources, problems
 
 
 def _open_single(file: Path) -> Source:
+    # only the folder's metadata tell how its files, or the messages in them, are compressed
     metadata = _read_metadata(file.parent)
-    if metadata and metadata.compressed and file.name in metadata.files:
-        # Only the folder's metadata say how its files, or the messages in them, are compressed.
-        if len(metadata.files) == 1:
-            return _open_compressed(file.parent)
-        raise BagError(f'{file} is one of several compressed files; open the whole folder {file.parent}.')
-    return _open_file(file)
+    listed = metadata is not None and file.name in metadata.files
+    return _open_listed(file, metadata.compression if metadata is not None and listed else '')
+
+
+def _open_listed(file: Path, compression: str) -> Source:
+    if compression == 'file':
+        return open_unpacked(file, _open_file)
+    source = _open_file(file)
+    return UnpackedMessages(source) if compression == 'message' else source
 
 
 def _open_file(file: Path) -> Source:
+    if not file.is_file():
+        # a pipe would be waited for, a device may have no end
+        raise BagError(f'{file} is no regular file; give a bag folder or a .mcap, .db3 or .bag file.')
     magic = _magic(file)
     suffix, scanner = next((kind for key, kind in _KINDS.items() if magic.startswith(key)), ('', None))
     if scanner is None:
         if not magic:
             raise BagError(f'{file} is empty (0 bytes); the recording has nothing to read.')
         if magic.startswith(_ZSTD_MAGIC):
-            raise BagError(f'{file} is compressed; unpack it with `zstd -d {file.name}` or open its bag folder.')
+            raise BagError(f'{file} is compressed; unpack it with `zstd -d {quoted(file)}` or open its bag folder.')
         raise BagError(f'{file} is not a bag: it is neither an MCAP, nor a sqlite3, nor a ROS 1 bag file.')
-    try:
-        if _rosbags_can_read(file, suffix):
-            reader: Any = rosbag1.Reader(file) if suffix == '.bag' else rosbag2.Reader(file)
-            reader.open()
-            if suffix != '.mcap' or _has_full_index(reader):
-                return RosbagsSource(reader, 'ros1' if suffix == '.bag' else 'cdr', lambda: scanner(file))
-            reader.close()
-        reason = ''
-    except PermissionError:
-        raise
-    except Exception as error:  # rosbags lets struct, zstd, sqlite and assertion errors through
-        reason = one_line(error)
+    reason = ''
+    if file.suffix == suffix and suffix != '.db3':
+        try:
+            with bounded(file.stat().st_size):
+                source = _open_by_index(file, suffix, lambda: scanner(file))
+            if source is not None:
+                return source
+        except PermissionError:
+            raise
+        except Exception as error:  # rosbags lets struct, zstd and assertion errors through
+            reason = one_line(error)
     scan = scanner(file)
     if not scan.channels and (scan.damage or reason):
         raise BagError(f'{file} is damaged or cut off ({scan.damage or reason}); {repair_hint(file)}.')
     return scan
 
 
-def _rosbags_can_read(file: Path, suffix: str) -> bool:
-    """Return False where rosbags would be misled: it goes by the suffix, and makes a bare URI of a sqlite3 path."""
-    if file.suffix != suffix:
-        return False
-    return suffix != '.db3' or not (set('?#%') & set(str(file)) or has_log(file) or is_cut(file))
+def _open_by_index(file: Path, suffix: str, scan: Callable[[], Source]) -> Source | None:
+    """Open an MCAP file or a ROS 1 bag with rosbags, which goes by the suffix; None if its index does not do."""
+    size = file.stat().st_size
+    reader: Any = rosbag1.Reader(file) if suffix == '.bag' else rosbag2.Reader(file)
+    reader.open()
+    if suffix == '.bag':
+        budget = Budget(size)
+        reader.chunks = {
+            at: chunk._replace(decompressor=budget.metered(chunk.decompressor)) for at, chunk in reader.chunks.items()
+        }
+        return RosbagsSource(reader, 'ros1', scan)
+    if _has_full_index(reader) and _is_bounded(reader, size):
+        return RosbagsSource(reader, 'cdr', scan)
+    reader.close()
+    return None
 
 
 def _has_full_index(reader: Any) -> bool:
@@ -166,18 +200,11 @@ def _has_full_index(reader: Any) -> bool:
     return bool(chunks) and all(chunk.channel_count for chunk in chunks)
 
 
-def _open_compressed(folder: Path) -> Source:
-    reader = rosbag2.Reader(folder)
-    try:
-        reader.open()
-    except PermissionError:
-        raise
-    except Exception as error:  # as above; scanners cannot read through this compression
-        raise BagError(
-            f'{folder} is damaged or cut off ({one_line(error)}); unpack its files with `zstd -d`, '
-            f'delete metadata.yaml and run `ros2 bag reindex {folder.name}`.'
-        ) from error
-    return RosbagsSource(reader, 'cdr', None)
+def _is_bounded(reader: Any, size: int) -> bool:
+    """Return whether the chunks of an MCAP file's index are different ones, and unpack to no more than is admitted."""
+    chunks = reader.storage.chunks
+    different = len({chunk.chunk_start_offset for chunk in chunks}) == len(chunks)
+    return different and sum(chunk.uncompressed_size for chunk in chunks) <= most_unpacked(size)
 
 
 def _read_metadata(folder: Path) -> _Metadata | None:
@@ -185,16 +212,74 @@ def _read_metadata(folder: Path) -> _Metadata | None:
 
     The file is made by a program, and only two of its keys matter: looked for line by line, they are found in a file
     that is damaged elsewhere too.
+
+    Raises
+    ------
+    BagError
+        If it is absurdly large.
     """
-    try:
-        text = (folder / 'metadata.yaml').read_text('utf-8', errors='replace')
-    except OSError:  # absent or locked; the storage files can do without
+    path = folder / 'metadata.yaml'
+    if not path.is_file():
         return None
-    mode = re.search(r'^\s*compression_mode:\s*["\']?(file|message)\b', text, re.IGNORECASE | re.MULTILINE)
-    listed = re.search(r'^\s*relative_file_paths:[ \t]*(\[[^]]*\]|(?:\s*\n\s*- [^\n]*)+)', text, re.MULTILINE)
-    entries = re.split(r'\n\s*-|,', listed[1].strip('[]')) if listed else []
-    names = [PurePath(entry.strip().strip('"\'')).name for entry in entries]
-    return _Metadata([name for name in names if name], mode is not None)
+    try:
+        with path.open('rb') as file:
+            content = file.read(LARGEST_METADATA + 1)
+    except OSError:  # locked; the storage files can do without
+        return None
+    if len(content) > LARGEST_METADATA:
+        raise BagError(f'{path} has more than {megabytes(LARGEST_METADATA)}; it is not the metadata of a bag.')
+    lines = content.decode('utf-8', errors='replace').split('\n')
+    modes = (re.match(r'[ \t]*compression_mode:[ \t]*["\']?(file|message)\b', line, re.IGNORECASE) for line in lines)
+    mode = next((match[1].lower() for match in modes if match), '')
+    key = re.compile(r'[ \t]*relative_file_paths:(.*)')
+    first, listed = next(((n, match[1]) for n, line in enumerate(lines) if (match := key.match(line))), (0, ''))
+    names = _flow_items(lines, first, listed) if listed.strip().startswith('[') else _block_items(lines[first + 1 :])
+    return _Metadata([PurePath(name).name for name in names if PurePath(name).name], mode)
+
+
+def _block_items(lines: list[str]) -> Iterator[str]:
+    """Yield the items of a YAML list that has each on lines of its own, the first beginning with a dash."""
+    item = ''
+    depth = -1
+    for line in lines:
+        text = line.strip()
+        indent = len(line) - len(line.lstrip())
+        if text.startswith('- ') and indent >= max(depth, 0):
+            if item:
+                yield _unquoted(item)
+            item, depth = text[2:].strip(), indent
+        elif text and item and indent > depth:
+            # a long name is wrapped at a space
+            item = f'{item} {text}'
+        elif text:
+            break
+    if item:
+        yield _unquoted(item)
+
+
+def _flow_items(lines: list[str], first: int, begin: str) -> Iterator[str]:
+    """Yield the items of a YAML list in brackets that begins with `begin` and may go on in the lines after `first`."""
+    text = ' '.join([begin.strip()[1:], *lines[first + 1 : first + 1 + MOST_FILES]])
+    for match in re.finditer(r'("(?:[^"\\]|\\.)*"|\'(?:[^\']|\'\')*\'|[^],"\'][^],]*)|(\])', text):
+        if match[2]:
+            return
+        if match[1].strip():
+            yield _unquoted(match[1].strip())
+
+
+def _unquoted(item: str) -> str:
+    """Return what a YAML scalar says; of escapes only those of a quote, a backslash and a code are known."""
+    if item[:1] == "'" and item[-1:] == "'" and len(item) > 1:
+        return item[1:-1].replace("''", "'")
+    if item[:1] == '"' and item[-1:] == '"' and len(item) > 1:
+        codes = re.compile(r'\\(?:x([0-9a-fA-F]{2})|u([0-9a-fA-F]{4})|U([0-9a-fA-F]{8})|(.))')
+
+        def plain(match: re.Match[str]) -> str:
+            code = match[1] or match[2] or match[3]
+            return chr(min(int(code, 16), 0x10FFFF)) if code else match[4]
+
+        return codes.sub(plain, item[1:-1])
+    return item
 
 
 def _magic(file: Path) -> bytes:

@@ -127,7 +127,7 @@ class Bag:
                 yield converted
         if not decoded and self.truncated:
             raise BagError(
-                f'{self.path} is damaged or cut off and nothing of the chosen topics can be read; '
+                f'{self.path} is damaged or cut off ({self._reasons()}) and nothing of the chosen topics can be read; '
                 f'{repair_hint(self.path)}.'
             )
         if progress:

@@ -2,32 +2,12 @@
 
 from __future__ import annotations
 
-import bz2
 from collections import Counter
 from collections.abc import Collection, Iterator
 from pathlib import Path
 
-from rosbags.rosbag2.storage_mcap import DECOMPRESSORS
-
+from .bounds import Budget
 from .source import Channel, RawMessage
-
-_LARGEST_CHUNK = 1 << 30
-
-
-class Damage(Exception):
-    """A record cannot be understood; the text says why."""
-
-
-def inflate(compression: str, data: bytes, size: int) -> bytes:
-    """Decompress a chunk. One that was cut off gives its beginning, except with zstd and lz4, where it is lost."""
-    if compression in ('', 'none'):
-        return data
-    if compression == 'bz2':
-        # A flipped bit in the declared size must not make us ask for all the memory there is.
-        return bz2.BZ2Decompressor().decompress(data, max_length=min(size, _LARGEST_CHUNK))
-    if compression in DECOMPRESSORS and size <= _LARGEST_CHUNK:
-        return bytes(DECOMPRESSORS[compression](data, size))
-    raise Damage(f'a chunk states the compression {compression!r} and {size} bytes')
 
 
 class Scan:
@@ -39,17 +19,26 @@ class Scan:
 
     def __init__(self, path: Path) -> None:
         self._path = path
+        self._budget = Budget(0)
         self._found: dict[int, Channel] = {}
         self.damage: str | None = None
-        counts = Counter(key for key, _, _ in self._walk())
+        counts = self._count()
         self.channels = [c._replace(total=counts[c.key]) for c in self._found.values()]
 
     def messages(self, keys: Collection[int]) -> Iterator[RawMessage]:
         """Yield the messages of these channels by log time."""
-        yield from sorted((raw for raw in self._walk() if raw[0] in keys), key=lambda raw: raw[1])
+        yield from sorted((raw for raw in self._pass() if raw[0] in keys), key=lambda raw: raw[1])
+
+    def _count(self) -> Counter[int]:
+        """Return the number of messages by channel; the pass over the file notes channels and damage."""
+        return Counter(key for key, _, _ in self._pass())
 
     def close(self) -> None:
         """Nothing is held open between passes."""
+
+    def _pass(self) -> Iterator[RawMessage]:
+        self._budget = Budget(self._path.stat().st_size)
+        return self._walk()
 
     def _walk(self) -> Iterator[RawMessage]:
         """Yield every message that can be read, in the file's order; note channels and damage."""

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from io import BytesIO
 from typing import BinaryIO
 
-from .salvage import Scan, inflate
+from .salvage import Scan
 from .source import Channel, RawMessage, full_type_name, one_line
 
 MAGIC = b'\x89MCAP0\r\n'
@@ -63,7 +63,7 @@ class McapScan(Scan):
     def _chunk(self, content: bytes, *, whole: bool) -> Iterator[RawMessage]:
         _, _, size, crc, name_length = struct.unpack_from('<QQQII', content)
         compression = content[32 : 32 + name_length].decode()
-        raw = inflate(compression, content[40 + name_length :], size)
+        raw = self._budget.unpack(compression, content[40 + name_length :], size)
         if not whole:
             self._note('the file is cut off')
         elif len(raw) != size or (crc and crc32(raw) != crc):

@@ -7,8 +7,8 @@ from collections.abc import Iterator
 from io import BytesIO
 from typing import BinaryIO
 
-from .salvage import Damage, Scan, inflate
-from .source import Channel, RawMessage, full_type_name, one_line
+from .salvage import Scan
+from .source import Channel, Damage, RawMessage, full_type_name, one_line
 
 MAGIC = b'#ROSBAG V2.0\n'
 _MESSAGE, _CHUNK, _CHUNK_INFO, _CONNECTION = 2, 5, 6, 7
@@ -56,7 +56,7 @@ class Rosbag1Scan(Scan):
 
     def _chunk(self, fields: dict[str, bytes], data: bytes, *, whole: bool) -> Iterator[RawMessage]:
         (size,) = struct.unpack('<I', fields['size'])
-        raw = inflate(fields['compression'].decode(), data, size)
+        raw = self._budget.unpack(fields['compression'].decode(), data, size)
         if whole and len(raw) != size:
             raise Damage('a chunk does not have the size it states')
         yield from self._records(BytesIO(raw), len(raw), in_chunk=True)

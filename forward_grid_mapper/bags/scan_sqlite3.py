@@ -1,25 +1,49 @@
-"""Reading a ROS 2 sqlite3 file in the order of its rows, for files whose end or index is damaged."""
+"""Reading a ROS 2 sqlite3 file: sound ones in the order of time, damaged ones up to their first damaged page.
+
+SQL can hide work without end in what looks like a table, so only plain tables are read, and every pass may take only so
+many steps of SQLite's virtual machine as the size of the file justifies.
+"""
 
 from __future__ import annotations
 
 import sqlite3
 import struct
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Collection, Iterator
 from contextlib import closing
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
 from .salvage import Scan
-from .source import Channel, RawMessage, full_type_name, one_line
+from .source import Channel, Damage, RawMessage, full_type_name, one_line
 
 MAGIC = b'SQLite format 3\0'
+
+STEPS, STEPS_A_BYTE = 2_000_000, 2
+"""Steps of SQLite's virtual machine in one pass, and more of them for every byte of the file: a row takes some 40 to be
+sorted and read, and has at least 60 bytes. A small file takes half a second."""
+
+STEPS_A_CALL = 10_000
+"""Steps between two looks at the count."""
+
+LARGEST_MESSAGE = 128 << 20
+"""Bytes of a message; a longer one counts as damaged, and is not loaded."""
+
+MOST_TOPICS = 10_000
+"""Topics of a file; further ones are not read."""
+
+_TABLES = ('messages', 'topics', 'message_definitions')
+_ROW = (
+    f"SELECT topic_id, timestamp, CASE WHEN typeof(data) = 'blob' AND length(data) <= {LARGEST_MESSAGE} THEN data END "
+    f'FROM messages NOT INDEXED'
+)
 
 
 def has_log(file: Path) -> bool:
     """Return whether a write-ahead log with messages lies beside the file."""
     log = file.with_name(file.name + '-wal')
-    return log.exists() and log.stat().st_size > 0
+    return log.is_file() and log.stat().st_size > 0
 
 
 def is_cut(file: Path) -> bool:
@@ -32,25 +56,78 @@ def is_cut(file: Path) -> bool:
 
 
 class Sqlite3Scan(Scan):
-    """Messages of a sqlite3 file up to the first page that is damaged or missing."""
+    """Messages of a sqlite3 file; of a damaged one those up to the first page that is damaged or missing."""
 
-    def _walk(self) -> Iterator[RawMessage]:
-        # A recorder that was killed leaves its last messages in the write-ahead log, which 'immutable' would ignore.
+    def messages(self, keys: Collection[int]) -> Iterator[RawMessage]:
+        """Yield the messages of these channels by log time."""
+        if self.damage is None:
+            try:
+                with closing(self._connect()) as database:
+                    chosen = ', '.join(str(key) for key in sorted(keys))
+                    for row in database.execute(f'{_ROW} WHERE topic_id IN ({chosen}) ORDER BY timestamp, rowid'):
+                        if _is_message(row):
+                            yield row
+                        else:
+                            self._note('a row is damaged')
+                    return
+            except (sqlite3.Error, OverflowError, Damage) as error:
+                # it sorts before it gives the first row, so that nothing was given yet
+                self._note(_reason(error))
+        yield from super().messages(keys)
+
+    def _count(self) -> Counter[int]:
+        """Return the number of messages by channel, without loading what they hold as long as the file is sound."""
         if is_cut(self._path):
             self._note('the file is cut off')
-        options = 'mode=ro' if has_log(self._path) else 'mode=ro&immutable=1'
-        with closing(sqlite3.connect(f'file:{quote(str(self._path.resolve()))}?{options}', uri=True)) as database:
-            # Without this, SQLite refuses a file that is shorter than its header says.
-            database.execute('PRAGMA writable_schema=ON')
+        else:
             try:
+                with closing(self._connect()) as database:
+                    self._topics(database)
+                    query = 'SELECT topic_id, count(*) FROM messages NOT INDEXED GROUP BY topic_id'
+                    return Counter(dict(database.execute(query).fetchall()))
+            except (sqlite3.Error, OverflowError, Damage) as error:
+                self._note(_reason(error))
+        return super()._count()
+
+    def _walk(self) -> Iterator[RawMessage]:
+        try:
+            with closing(self._connect()) as database:
                 self._topics(database)
-                for row in database.execute('SELECT topic_id, timestamp, data FROM messages NOT INDEXED'):
+                for row in database.execute(_ROW):
                     if _is_message(row):
                         yield row
                     else:
                         self._note('a row is damaged')
-            except (sqlite3.Error, OverflowError) as error:
-                self._note(one_line(error))
+        except (sqlite3.Error, OverflowError, Damage) as error:
+            self._note(_reason(error))
+
+    def _connect(self) -> sqlite3.Connection:
+        """Open the file for reading.
+
+        Raises
+        ------
+        Damage
+            If something other than a plain table has the name of one that is read.
+        """
+        # A recorder that was killed leaves its last messages in the write-ahead log, which 'immutable' would ignore.
+        options = 'mode=ro' if has_log(self._path) else 'mode=ro&immutable=1'
+        database = sqlite3.connect(f'file:{quote(str(self._path.resolve()))}?{options}', uri=True)
+        try:
+            # Without this, SQLite refuses a file that is shorter than its header says.
+            database.execute('PRAGMA writable_schema=ON')
+            left = STEPS + STEPS_A_BYTE * self._path.stat().st_size
+
+            def spent() -> bool:
+                nonlocal left
+                left -= STEPS_A_CALL
+                return left < 0
+
+            database.set_progress_handler(spent, STEPS_A_CALL)
+            _refuse_what_is_no_table(database)
+        except BaseException:
+            database.close()
+            raise
+        return database
 
     def _topics(self, database: sqlite3.Connection) -> None:
         try:
@@ -58,10 +135,32 @@ class Sqlite3Scan(Scan):
             definitions = {row[0]: (str(row[1]).removeprefix('ros2'), str(row[2])) for row in rows}
         except sqlite3.Error:  # recorded before Iron, or damaged: there are default definitions
             definitions = {}
-        for row in database.execute('SELECT id, name, type, serialization_format FROM topics'):
+        found = database.execute(f'SELECT id, name, type, serialization_format FROM topics LIMIT {MOST_TOPICS}')
+        for row in found:
             key, topic, msgtype, encoding = int(row[0]), *(str(text) for text in row[1:])
             kind, definition = definitions.get(msgtype, ('none', ''))
             self._found[key] = Channel(key, topic, full_type_name(msgtype), encoding, kind, definition, 0)
+
+
+def _refuse_what_is_no_table(database: sqlite3.Connection) -> None:
+    places = ', '.join('?' * len(_TABLES))
+    found = database.execute(f'SELECT name, type, rootpage FROM sqlite_master WHERE lower(name) IN ({places})', _TABLES)
+    for name, kind, page in found.fetchall():
+        # a virtual table has no page of its own
+        if kind != 'table' or not page:
+            raise Damage(
+                f'{str(name)[:40]!r} is a {str(kind)[:20] if kind != "table" else "virtual table"}, not a table'
+            )
+        quoted = str(name).replace('"', '""')
+        columns = database.execute(f'PRAGMA table_xinfo("{quoted}")').fetchall()
+        if computed := [str(row[1])[:40] for row in columns if row[6]]:
+            raise Damage(f'the column {computed[0]!r} of {name!r} is computed, not stored')
+
+
+def _reason(error: BaseException) -> str:
+    if isinstance(error, sqlite3.OperationalError) and 'interrupted' in str(error):
+        return 'reading it takes more work than a sound file of its size needs'
+    return one_line(error)
 
 
 def _is_message(row: tuple[Any, ...]) -> bool:

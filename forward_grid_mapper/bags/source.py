@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Collection, Iterator
 from typing import Any, NamedTuple, Protocol
 
 RawMessage = tuple[int, int, bytes]
 """Channel key, log time in nanoseconds, serialized message."""
+
+
+class Damage(Exception):
+    """A record cannot be understood; the text says why."""
 
 
 class Channel(NamedTuple):
@@ -56,7 +61,7 @@ def full_type_name(msgtype: str) -> str:
 
 
 class RosbagsSource:
-    """A file, or a compressed bag folder, that rosbags reads by its index.
+    """An MCAP file or a ROS 1 bag that rosbags reads by its index.
 
     Parameters
     ----------
@@ -91,10 +96,15 @@ class RosbagsSource:
         connections = [c for key, c in self._connections.items() if key in keys]
         if not connections:
             return
+        # the messages of the latest time that have been given, since several may have it
         last, seen = -1, 0
+        at_last: list[tuple[int, bytes]] = []
         try:
             for connection, time, data in self._reader.messages(connections):
+                if time != last:
+                    at_last.clear()
                 last, seen = time, seen + 1
+                at_last.append((connection.id, bytes(data)))
                 yield connection.id, time, bytes(data)
         except Exception as error:  # rosbags lets struct, zstd, sqlite and assertion errors through
             self.damage = one_line(error)
@@ -102,18 +112,21 @@ class RosbagsSource:
         if self.damage is None and seen < expected:
             self.damage = f'the index promises {expected} messages, only {seen} were found'
         if self.damage is not None and self._scan is not None:
-            yield from self._rest(keys, last)
+            yield from self._rest(keys, last, Counter(at_last))
 
-    def _rest(self, keys: Collection[int], last: int) -> Iterator[RawMessage]:
+    def _rest(self, keys: Collection[int], last: int, given: Counter[tuple[int, bytes]]) -> Iterator[RawMessage]:
+        """Yield what a scanner finds from the time `last` on, without those of that time that are `given`."""
         assert self._scan is not None
         try:
             scan = self._scan()
         except Exception:  # the damage is known already; the scanner could not get past it
             return
         try:
-            for raw in scan.messages(keys):
-                if raw[1] > last:
-                    yield raw
+            for key, time, data in scan.messages(keys):
+                if time == last and given[key, data]:
+                    given[key, data] -= 1
+                elif time >= last:
+                    yield key, time, data
         finally:
             scan.close()
 

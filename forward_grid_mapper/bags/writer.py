@@ -30,6 +30,21 @@ _METADATA_VERSION: Any = 9
 _INFINITE = QosTime(9223372036, 854775807)
 
 
+def check_bag_path(path: Path, format: str) -> None:
+    """Check that a bag of this format can have this path.
+
+    Raises
+    ------
+    OutputError
+        If it does not suit the format.
+    """
+    if format == 'ros1' and path.suffix != '.bag':
+        raise OutputError(f'{path} must end in .bag for ROS 1.')
+    # rosbags makes an unquoted URI of a sqlite3 file's path, and would write elsewhere.
+    if format == 'sqlite3' and set('?#%') & set(str(path.resolve())):
+        raise OutputError(f'{path}: a sqlite3 bag cannot have ?, # or % in its path; rename it or use mcap.')
+
+
 class BagWriter:
     """A bag being written in a `with` block; it takes its final name when the block ends without an exception.
 
@@ -63,11 +78,7 @@ class BagWriter:
         """
         if self.path.exists() or self.path.is_symlink():
             raise OutputError(f'{self.path} exists already; choose another path or remove it.')
-        if self._ros1 and self.path.suffix != '.bag':
-            raise OutputError(f'{self.path} must end in .bag for ROS 1.')
-        # rosbags makes an unquoted URI of a sqlite3 file's path, and would write elsewhere.
-        if self._format == 'sqlite3' and set('?#%') & set(str(self.path.resolve())):
-            raise OutputError(f'{self.path}: a sqlite3 bag cannot have ?, # or % in its path; rename it or use mcap.')
+        check_bag_path(self.path, self._format)
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
             # The metadata name the file after the folder, so the folder has its final name within a temporary one.

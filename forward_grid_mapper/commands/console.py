@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import argparse
 import io
+import os
+import shutil
 import sys
 import threading
 import time
@@ -13,7 +15,11 @@ from types import TracebackType
 from typing import TextIO
 
 from ..core.common.errors import MapperError
+from ..core.runtime.compiling import compiling
 from ..core.search.search import Progress
+from .signals import Cancelled, Interruptible, cancelled_line
+
+COMPILES = '(compiling kernels, which takes half a minute once)'
 
 PATIENCE = 1.0
 """Seconds of work before progress is shown."""
@@ -28,7 +34,8 @@ def run(
         sys.stdout.reconfigure(errors='backslashreplace')
     try:
         try:
-            return body(parser.parse_args(arguments))
+            with Interruptible():
+                return body(parser.parse_args(arguments))
         finally:
             # here an error can still be reported
             sys.stdout.flush()
@@ -43,9 +50,9 @@ def run(
     except OSError as error:
         # of the work's files the work takes care; what remains is the output itself, or the working directory
         problem = str(error) if _still_printing() else f'standard output: {error}'
-    except KeyboardInterrupt:
-        print(f'{parser.prog}: cancelled; nothing was written', file=sys.stderr)
-        return 130
+    except KeyboardInterrupt as cancelled:
+        print(cancelled_line(parser.prog), file=sys.stderr)
+        return cancelled.code if isinstance(cancelled, Cancelled) else 130
     print(f'{parser.prog}: error: {problem}', file=sys.stderr)
     return 1
 
@@ -71,6 +78,7 @@ class Ticker:
         self._stream = stream or sys.stderr
         self._quiet = quiet
         self._text = ''
+        self._compiles = False
         self._shown = ''
         self._begin = time.monotonic()
         self._done = threading.Event()
@@ -93,7 +101,7 @@ class Ticker:
 
     def say(self, text: str) -> None:
         """Set what is going on."""
-        self._text = text
+        self._text, self._compiles = text, False
 
     def reading(self, done: int, total: int) -> None:
         """Report messages read, for `Bag.messages`."""
@@ -102,7 +110,7 @@ class Ticker:
     def mapping(self, stage: str, progress: Progress | None) -> None:
         """Report a stage of mapping or a sweep of the search, for `Mapper.run`."""
         if progress is None:
-            self.say(f'{stage} (the first run compiles its kernels, which takes half a minute once)')
+            self.say(stage)
         else:
             self.say(f'{stage}: sweep {progress.sweeps}, {progress.flips:,} flips, {progress.gain:,.0f} nats gained')
 
@@ -112,10 +120,27 @@ class Ticker:
             seconds = time.monotonic() - self._begin
             if seconds < PATIENCE or not self._text:
                 continue
+            # what was compiled a moment ago is told until the next stage, so that the line does not flicker
+            self._compiles = self._compiles or compiling()
+            text = f'{self._text} {COMPILES}' if self._compiles else self._text
             if on_screen:
-                self._shown = self._text
-                print(f'\r\033[K{seconds:4.0f} s  {self._text}', end='', file=self._stream, flush=True)
-            elif self._text != self._shown:
+                self._shown = text
+                line = shortened(f'{seconds:4.0f} s  {text}', self._columns() - 1)
+                print(f'\r\033[K{line}', end='', file=self._stream, flush=True)
+            elif text != self._shown:
                 # a log file gets a line a change, at most one a second
-                self._shown = self._text
-                print(f'{seconds:4.0f} s  {self._text}', file=self._stream, flush=True)
+                self._shown = text
+                print(f'{seconds:4.0f} s  {text}', file=self._stream, flush=True)
+
+    def _columns(self) -> int:
+        """Return the width of the terminal, which may change."""
+        try:
+            columns = os.get_terminal_size(self._stream.fileno()).columns
+        except (OSError, ValueError, AttributeError):
+            columns = 0
+        return columns or shutil.get_terminal_size().columns
+
+
+def shortened(line: str, width: int) -> str:
+    """Return a line of at most `width` characters: one that wraps cannot be rewritten."""
+    return line if len(line) <= width else line[: max(width - 3, 0)] + '...'[: max(width, 0)]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -64,8 +63,9 @@ def through_node(folder: Path, bag: Path, recording: Recording, options: argpars
     """Replay a bag to the node and save its maps as `folder`/maps; return what EM said."""
     from .live_node import LiveNode
 
-    ros = {'range_reliability': 'reliable', 'odom_reliability': 'reliable', 'save_directory': str(folder)}
-    parameters = Parameters.from_flat(ros, base=chosen_parameters(options)[0])
+    saved = folder / 'saved'
+    ros = {'range_reliability': 'reliable', 'odom_reliability': 'reliable', 'save_directory': str(saved)}
+    parameters = Parameters.from_flat(ros, base=chosen_parameters(options).parameters)
     with LiveNode(folder, parameters, recording.extrinsics) as node:
         ticker.say('starting the node')
         node.call('reset')
@@ -74,15 +74,19 @@ def through_node(folder: Path, bag: Path, recording: Recording, options: argpars
         ticker.say('running EM')
         answer = node.call('run_em')
         ticker.say('saving the maps')
-        saved = Path(node.call('save_maps').split(', ')[0]).parent
-    saved.rename(folder / 'maps')
+        node.call('save_maps')
+    # the only folder in there; the answer's text is for people, and a path may hold whatever separates its parts
+    (made,) = saved.iterdir()
+    made.rename(folder / 'maps')
+    saved.rmdir()
     return answer
 
 
 def offline(folder: Path, bag: Path, output: Path, options: argparse.Namespace, ticker: Ticker) -> str:
     """Map a bag without ROS into `folder`/maps, to be known as `output`/maps; return what EM did."""
-    parameters = chosen_parameters(options)[0]
+    parameters, _, ignored = chosen_parameters(options)
     drive = read_drive(bag, parameters, {}, progress=ticker.reading)
+    drive.source['warnings'] += ignored
     drive.source['bag'] = readable(output / bag.name)
     maps = Mapper(parameters).run(drive.associator.readings, ticker.mapping)
     write_results(folder / 'maps', maps, drive.source, drive.path_xy, 'The demo, offline')
@@ -135,7 +139,3 @@ def demo(options: argparse.Namespace) -> int:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; return its exit code."""
     return run(parser(), demo, arguments)
-
-
-if __name__ == '__main__':
-    sys.exit(main())

@@ -203,7 +203,9 @@ def experiment(options: argparse.Namespace) -> int:
     """Do what the command line asks for."""
     if options.seeds < 1:
         raise ParameterError('--seeds must be a positive number')
-    parameters = chosen_parameters(options)[0]
+    parameters, _, ignored = chosen_parameters(options)
+    for warning in ignored:
+        print(f'{COMMAND}: warning: {warning}', file=sys.stderr)
     output = Path(options.output) if options.output else free_name(Path.cwd(), f'experiment_{options.which}')
     with Ticker() as ticker, output_folder(output) as folder:
         table, rows = (door if options.which == 'door' else corridor)(options, parameters, ticker)
@@ -222,7 +224,3 @@ def experiment(options: argparse.Namespace) -> int:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; return its exit code."""
     return run(parser(), experiment, arguments)
-
-
-if __name__ == '__main__':
-    sys.exit(main())

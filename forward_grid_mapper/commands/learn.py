@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from ..core.common.errors import OutputError, ParameterError
+from ..core.common.shell import command_line
 from ..core.joint_learning import learn_jointly
 from ..core.learning.sensor_health import health_warning, sensor_health
 from ..files.learned_text import learned_text, parameter_file_text, write_new_file
@@ -17,20 +18,20 @@ from ..files.output_folder import readable
 from ..files.parameter_file import load_parameters, parse_sensor
 from ..recordings.read_drive import read_drive
 from .console import Ticker, run
-from .options import add_bag_options, add_mapping_options, chosen_parameters
+from .options import BagParser, add_bag_options, add_mapping_options, chosen_parameters
 
 COMMAND = 'learn'
 
 
 def parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
-    made = argparse.ArgumentParser(
+    made = BagParser(
         COMMAND,
         description='Learn p_hit, p_rand, p_lost and sigma from a recorded drive, in turn with the map: prints each '
         'value with its standard error, and warns of values that lose smooth walls or rest on few readings. Look at '
         'the maps of process_bag before you drive by them.',
     )
-    made.add_argument('bag', help='ROS 2 bag folder, single .mcap or .db3 file, or ROS 1 .bag')
+    made.add_bag('ROS 2 bag folder, single .mcap or .db3 file, or ROS 1 .bag')
     made.add_argument(
         '-o', '--output', metavar='FILE', help='new parameter YAML, for process_bag --params and for the node'
     )
@@ -48,7 +49,7 @@ def parser() -> argparse.ArgumentParser:
 
 def learn(options: argparse.Namespace) -> int:
     """Do what the command line asks for."""
-    parameters, extrinsics = chosen_parameters(options)
+    parameters, extrinsics, ignored = chosen_parameters(options)
     extrinsics |= dict(parse_sensor(text) for text in options.sensor)
     if options.rounds < 1:
         raise ParameterError('--rounds must be a positive number')
@@ -64,7 +65,7 @@ def learn(options: argparse.Namespace) -> int:
         drive = read_drive(bag, parameters, extrinsics, options.range_topics, options.odom_topic, ticker.reading)
         found = learn_jointly(drive.associator.readings, parameters, options.rounds, options.keep_going, ticker.mapping)
         suspects = health_warning(sensor_health(found.maps))
-    warnings_ = (*drive.source['warnings'], *found.warnings, *filter(None, [suspects]))
+    warnings_ = (*drive.source['warnings'], *ignored, *found.warnings, *filter(None, [suspects]))
     found = dataclasses.replace(found, warnings=warnings_)
     if options.quiet:
         for warning in warnings_:
@@ -76,14 +77,20 @@ def learn(options: argparse.Namespace) -> int:
         write_new_file(output, parameter_file_text(found, extrinsics, ros, readable(bag)))
         if not options.quiet:
             print(f'\nthe parameters are in {output}; compare the maps with and without them:')
-            print(f'  python3 -m forward_grid_mapper process_bag {readable(bag)} --params {output}')
+            print(f'  {_mapping(options, bag, output)}')
     return 0
+
+
+def _mapping(options: argparse.Namespace, bag: Path, parameters: Path) -> str:
+    """Return the command that maps the same readings with the learned parameters."""
+    words: list[Path | str] = [bag, '--params', parameters]
+    if options.odom_topic:
+        words += ['--odom-topic', options.odom_topic]
+    if options.range_topics:
+        words += ['--range-topics', *options.range_topics]
+    return command_line('process_bag', *words)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; return its exit code."""
     return run(parser(), learn, arguments)
-
-
-if __name__ == '__main__':
-    sys.exit(main())

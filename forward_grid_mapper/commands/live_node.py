@@ -7,7 +7,7 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -16,10 +16,41 @@ from ..core.common.errors import MapperError
 from ..core.common.parameters import Parameters
 from ..core.messages.message_types import Pose2
 from ..files.parameter_text import dump_parameters
+from .signals import ENDS_WITH_STDIN
 
 NODE = '/forward_grid_mapper'
 START = 180.0
 """Seconds that a node may take to get ready: its first start compiles."""
+
+ORDERLY = 15.0
+"""Seconds that a child may take to end in order before it is killed; the node ends itself after 5."""
+
+
+def start_child(arguments: Sequence[str], environment: Mapping[str, str], **options: Any) -> subprocess.Popen[bytes]:
+    """Start one of our commands in a process that ends when this one does, even by SIGKILL.
+
+    The child reads its standard input until this process lets go of the other end. It has a session of its own, so
+    that Ctrl-C in the terminal reaches this process alone, which then ends the child in order.
+    """
+    return subprocess.Popen(
+        [sys.executable, '-m', 'forward_grid_mapper', *arguments],
+        env={**environment, ENDS_WITH_STDIN: '1'},
+        stdin=subprocess.PIPE,
+        start_new_session=True,
+        **options,
+    )
+
+
+def end_child(process: subprocess.Popen[bytes]) -> None:
+    """End a child in order if it lives, or else kill it; returns when it has ended."""
+    process.terminate()
+    try:
+        process.wait(ORDERLY)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()
+    if process.stdin is not None:
+        process.stdin.close()
 
 
 class LiveNode:
@@ -42,39 +73,38 @@ class LiveNode:
         self._process: subprocess.Popen[bytes] | None = None
 
     def __enter__(self) -> LiveNode:
+        """Start the node; it is ended again if anything else fails."""
+        try:
+            self._start()
+        except BaseException:
+            self.__exit__(None, None, None)
+            raise
+        return self
+
+    def _start(self) -> None:
+        with self._log.open('wb') as log:
+            arguments = ['mapper', '--ros-args', '--params-file', str(self._folder / 'parameters.yaml')]
+            self._process = start_child(arguments, self.environment, stdout=log, stderr=subprocess.STDOUT)
+        os.environ.update(self.environment)
         import rclpy
         from rclpy.signals import SignalHandlerOptions
 
-        os.environ.update(self.environment)
-        with self._log.open('wb') as log:
-            self._process = self._start(
-                ['mapper', '--ros-args', '--params-file', str(self._folder / 'parameters.yaml')],
-                stdout=log,
-                stderr=subprocess.STDOUT,
-            )
         rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
         self._client = rclpy.create_node('forward_grid_mapper_demo')
-        return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        """End the node."""
         import rclpy
 
-        if self._client is not None:
-            self._client.destroy_node()
+        try:
+            if self._client is not None:
+                self._client.destroy_node()
             rclpy.try_shutdown()
-        if self._process is not None:
-            self._process.terminate()
-            try:
-                self._process.wait(15)
-            except subprocess.TimeoutExpired:
-                self._process.kill()
-
-    def _start(self, arguments: Sequence[str], **options: Any) -> subprocess.Popen[bytes]:
-        return subprocess.Popen(
-            [sys.executable, '-m', 'forward_grid_mapper', *arguments], env=self.environment, **options
-        )
+        finally:
+            if self._process is not None:
+                end_child(self._process)
 
     def run(self, *arguments: str) -> None:
         """Run another of our commands beside the node, and wait for its end.
@@ -84,11 +114,11 @@ class LiveNode:
         MapperError
             If it fails.
         """
-        process = self._start(arguments)
+        process = start_child(arguments, self.environment)
         try:
             code = process.wait()
         finally:
-            process.terminate()
+            end_child(process)
         if code != 0:
             raise MapperError(f'{arguments[0]} failed; {self._last_words()}')
 

@@ -3,18 +3,72 @@
 from __future__ import annotations
 
 import argparse
+import os
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
 from ..core.common.errors import ParameterError
 from ..core.common.parameters import Parameters, find
+from ..core.common.shell import quoted
 from ..core.messages.message_types import Pose2
+from ..files.output_folder import readable
 from ..files.parameter_file import load_parameters, parse_setting
 from ..files.parameter_text import dump_parameters
 
 
+class BagParser(argparse.ArgumentParser):
+    """A parser of commands that read a bag, which may also stand behind an option that takes several words.
+
+    `--range-topics A BAG` would leave nothing for the bag: then the last of such an option's words is the bag.
+    """
+
+    _several: tuple[str, ...] = ('range_topics', 'remap')
+
+    def add_bag(self, help: str) -> None:
+        """Add the argument `bag`."""
+        # required all the same, see below
+        self.add_argument('bag', help=help).required = False
+
+    def parse_args(  # type: ignore[override]
+        self, args: Sequence[str] | None = None, namespace: argparse.Namespace | None = None
+    ) -> argparse.Namespace:
+        """Return the options; leaves with a usage message if they are wrong."""
+        options: argparse.Namespace = super().parse_args(args, namespace)
+        for name in self._several:
+            words = getattr(options, name, None)
+            # what names a file and does not name a topic's new name can only be the bag
+            if options.bag is None and words and ':=' not in words[-1] and os.path.lexists(words[-1]):
+                options.bag = words.pop()
+                if not words:
+                    self.error(f'argument --{name.replace("_", "-")}: expected one word or more before the bag')
+        if options.bag is None:
+            taken = next((name for name in self._several if getattr(options, name, None)), None)
+            hint = ''
+            if taken is not None:
+                option, words = f'--{taken.replace("_", "-")}', ' '.join(map(quoted, getattr(options, taken)))
+                hint = f'; {option} took all of: {words}. Give the bag first: {self.prog} BAG {option} {words}'
+            self.error(f'no bag is given, or it does not exist{hint}')
+        if getattr(options, 'range_topics', None) is not None:
+            # a comma cannot be part of a topic's name
+            options.range_topics = [t for word in options.range_topics for t in word.split(',') if t]
+        return options
+
+
+def add_topic_options(parser: argparse.ArgumentParser) -> None:
+    """Add `--range-topics` and `--odom-topic`."""
+    parser.add_argument(
+        '--range-topics',
+        nargs='+',
+        action='extend',
+        metavar='TOPIC',
+        help='Range topics, parted by spaces or commas; may be repeated (default: all in the bag)',
+    )
+    parser.add_argument('--odom-topic', metavar='TOPIC', help='Odometry topic (needed if the bag has several)')
+
+
 def add_bag_options(parser: argparse.ArgumentParser) -> None:
     """Add `--range-topics`, `--odom-topic` and `--sensor`."""
-    parser.add_argument('--range-topics', nargs='+', metavar='TOPIC', help='Range topics (default: all in the bag)')
-    parser.add_argument('--odom-topic', metavar='TOPIC', help='Odometry topic (needed if the bag has several)')
+    add_topic_options(parser)
     parser.add_argument(
         '--sensor',
         action='append',
@@ -50,7 +104,24 @@ class ListParameters(argparse.Action):
         parser.exit()
 
 
-def chosen_parameters(options: argparse.Namespace) -> tuple[Parameters, dict[str, Pose2]]:
+class Chosen(NamedTuple):
+    """Parameters and sensor poses of `--params` and `--set`, and what to warn of."""
+
+    parameters: Parameters
+    extrinsics: dict[str, Pose2]
+    warnings: list[str]
+
+
+INSTEAD = {
+    'range_topics': 'give --range-topics',
+    'odom_topic': 'give --odom-topic',
+    'map_frame': "the maps are in odometry's frame",
+    'save_directory': 'give --output',
+}
+"""What to do offline in place of a parameter of the node."""
+
+
+def chosen_parameters(options: argparse.Namespace) -> Chosen:
     """Return the parameters and the sensor poses of `--params` and `--set`.
 
     Raises
@@ -63,4 +134,14 @@ def chosen_parameters(options: argparse.Namespace) -> tuple[Parameters, dict[str
     for name in settings:
         if find(name).group == 'node':
             raise ParameterError(f'--set {name}: only the node has this parameter; topics have options of their own')
-    return Parameters.from_flat({**values, **settings}), dict(extrinsics)
+    warnings = [text] if (text := _ignored(values, options.params)) else []
+    return Chosen(Parameters.from_flat({**values, **settings}), dict(extrinsics), warnings)
+
+
+def _ignored(values: Mapping[str, Any], source: str) -> str:
+    """Return what a parameter file sets in vain where the node does not run; empty if nothing."""
+    names = [name for name, value in values.items() if find(name).group == 'node' and value != find(name).default]
+    if not names:
+        return ''
+    told = [f'{name} ({INSTEAD[name]})' if name in INSTEAD else name for name in names]
+    return f'{readable(source)}: of the parameters that only the node has these are ignored: {", ".join(told)}'

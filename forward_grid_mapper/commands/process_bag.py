@@ -19,19 +19,19 @@ from ..files.results import write_results
 from ..recordings.drive import Drive
 from ..recordings.read_drive import read_drive
 from .console import Ticker, run
-from .options import add_bag_options, add_mapping_options, chosen_parameters
+from .options import BagParser, add_bag_options, add_mapping_options, chosen_parameters
 
 COMMAND = 'process_bag'
 
 
 def parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
-    made = argparse.ArgumentParser(
+    made = BagParser(
         COMMAND,
         description='Map a recorded drive: reads sonar Range and Odometry from a ROS 1 or ROS 2 bag and writes the '
         'live log-odds map, the maximum likelihood map and the uncertainty map.',
     )
-    made.add_argument('bag', help='ROS 2 bag folder, single .mcap or .db3 file, ROS 1 .bag, or a journal of the node')
+    made.add_bag('ROS 2 bag folder, single .mcap or .db3 file, ROS 1 .bag, or a journal of the node')
     made.add_argument('-o', '--output', metavar='DIR', help='new folder for the results (default: BAG_maps)')
     add_bag_options(made)
     made.add_argument(
@@ -49,7 +49,7 @@ def parser() -> argparse.ArgumentParser:
 
 def process(options: argparse.Namespace) -> int:
     """Do what the command line asks for."""
-    parameters, extrinsics = chosen_parameters(options)
+    parameters, extrinsics, ignored = chosen_parameters(options)
     extrinsics |= dict(parse_sensor(text) for text in options.sensor)
     if options.learn < 0:
         raise ParameterError('--learn: the number of rounds must not be negative')
@@ -66,6 +66,7 @@ def process(options: argparse.Namespace) -> int:
             options.odom_topic,
             ticker.reading,
         )
+        drive.source['warnings'] += ignored
         read = time.perf_counter() - begin
         maps = map_and_learn(drive.associator.readings, parameters, options.learn, ticker.mapping)
         maps = drive.live.on(maps)
@@ -112,7 +113,3 @@ def _write_bag(path: Path, maps: MapSet, drive: Drive) -> None:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; return its exit code."""
     return run(parser(), process, arguments)
-
-
-if __name__ == '__main__':
-    sys.exit(main())

@@ -19,6 +19,7 @@ from ..replay.publishers import Publishers, renamed
 from ..replay.ros_messages import MISFITS, message_class, static_transforms
 from ..replay.stop_signal import StopSignal
 from .console import Ticker, run
+from .options import BagParser, add_topic_options
 
 COMMAND = 'replay_bag'
 CLOCK_TYPE = 'rosgraph_msgs/msg/Clock'
@@ -26,13 +27,13 @@ CLOCK_TYPE = 'rosgraph_msgs/msg/Clock'
 
 def parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
-    made = argparse.ArgumentParser(
+    made = BagParser(
         COMMAND,
         description="Replay a recorded drive to the mapper: publishes a bag's Range, Odometry and static transforms, "
         'with their own stamps and in their order, once somebody listens to all of them.',
         epilog='--ros-args and what follows it goes to ROS.',
     )
-    made.add_argument('bag', help='ROS 2 bag folder, single .mcap or .db3 file, or ROS 1 .bag')
+    made.add_bag('ROS 2 bag folder, single .mcap or .db3 file, or ROS 1 .bag')
     made.add_argument('--rate', type=_positive, default=1.0, metavar='R', help='times as fast as recorded (default 1)')
     made.add_argument(
         '--loop', nargs='?', type=_times, const=0, default=1, metavar='N', help='play N times; without N until stopped'
@@ -45,8 +46,7 @@ def parser() -> argparse.ArgumentParser:
         metavar='HZ',
         help="publish the bag's time on /clock, between messages too at HZ of wall time (default 40)",
     )
-    made.add_argument('--range-topics', nargs='+', metavar='TOPIC', help='Range topics (default: all in the bag)')
-    made.add_argument('--odom-topic', metavar='TOPIC', help='Odometry topic (needed if the bag has several)')
+    add_topic_options(made)
     made.add_argument(
         '--remap', nargs='+', action='extend', default=[], metavar='OLD:=NEW', help='publish topics under other names'
     )
@@ -166,7 +166,3 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; return its exit code."""
     own, ros = split_ros_arguments(sys.argv[1:] if arguments is None else arguments)
     return run(parser(), lambda options: replay(options, ros), own)
-
-
-if __name__ == '__main__':
-    sys.exit(main())

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
 
+from ..bags.writer import BagWriter, check_bag_path
 from ..core.common.errors import ParameterError
+from ..core.common.shell import command_line
 from ..core.messages.message_types import OdometryMessage, RangeMessage
 from ..files.map_files import write_trinary
 from ..files.output_folder import output_errors, output_folder
@@ -49,8 +50,8 @@ def parser() -> argparse.ArgumentParser:
     return made
 
 
-def record(world: str, seen: int, passes: int, noise_free: bool, seed: int, sonars: SonarArray) -> Recording:
-    """Simulate the drive that the options ask for.
+def check_numbers(seen: int, passes: int, seed: int) -> None:
+    """Check the numbers that `record` takes.
 
     Raises
     ------
@@ -60,6 +61,17 @@ def record(world: str, seen: int, passes: int, noise_free: bool, seed: int, sona
     for name, value in (('--seen', seen), ('--passes', passes), ('--seed', seed + 1)):
         if value < 1:
             raise ParameterError(f'{name} must be a positive number (for --seed, or 0)')
+
+
+def record(world: str, seen: int, passes: int, noise_free: bool, seed: int, sonars: SonarArray) -> Recording:
+    """Simulate the drive that the options ask for.
+
+    Raises
+    ------
+    ParameterError
+        If a number is not positive, or the seed is negative.
+    """
+    check_numbers(seen, passes, seed)
     noise = NOISE_FREE if noise_free else NOISY
     if world == 'door':
         return door_drive(seen, noise, seed, sonars)
@@ -71,8 +83,6 @@ def write_recording(folder: Path, recording: Recording, format: str = 'mcap', ea
 
     Messages are logged by stamp, as a robot would; a Range follows the odometry of its stamp.
     """
-    from ..bags.writer import BagWriter
-
     path = folder / FORMATS[format]
     with BagWriter(path, format) as writer:
         writer.write_static_transforms([(BASE_FRAME, frame, pose) for frame, pose in recording.extrinsics], START)
@@ -93,29 +103,28 @@ def write_recording(folder: Path, recording: Recording, format: str = 'mcap', ea
 def simulate(options: argparse.Namespace) -> int:
     """Do what the command line asks for."""
     with Ticker(options.quiet) as ticker:
-        ticker.say('simulating')
-        recording = record(
-            options.world,
-            options.seen,
-            options.passes,
-            options.noise_free,
-            options.seed,
-            SONARS[options.sonars](),
-        )
-        ticker.say('writing')
+        check_numbers(options.seen, options.passes, options.seed)
+        # the folder first: if it cannot be written, that should be known before the work
         with output_folder(options.output) as folder:
+            check_bag_path(folder / FORMATS[options.format], options.format)
+            ticker.say('simulating')
+            recording = record(
+                options.world,
+                options.seen,
+                options.passes,
+                options.noise_free,
+                options.seed,
+                SONARS[options.sonars](),
+            )
+            ticker.say('writing')
             bag = write_recording(folder, recording, options.format, options.topics == 'each').name
     if not options.quiet:
         print(f'{len(recording.ranges):,} readings and {len(recording.odometry):,} odometry messages')
         print(f'bag, reference.yaml and trajectory.csv are in {options.output}; map it with')
-        print(f'  python3 -m forward_grid_mapper process_bag {Path(options.output) / bag}')
+        print(f'  {command_line("process_bag", Path(options.output) / bag)}')
     return 0
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; return its exit code."""
     return run(parser(), simulate, arguments)
-
-
-if __name__ == '__main__':
-    sys.exit(main())

@@ -13,6 +13,7 @@ from ..core.common.errors import InputError, OutputError
 from ..core.common.grid import Grid
 from .output_folder import output_errors
 from .pgm import read_pgm, write_pgm
+from .small_text import read_text
 
 FREE_PIXEL, OCCUPIED_PIXEL, UNKNOWN_PIXEL = 254, 0, 205
 RAW_UNKNOWN_PIXEL = 255
@@ -113,7 +114,7 @@ def read_map(path: Path | str) -> tuple[Grid, NDArray[np.float32]]:
     """
     path = Path(path)
     try:
-        meta = yaml.safe_load(path.read_text(encoding='utf-8'))
+        meta = yaml.safe_load(read_text(path, InputError))
         image = path.parent / str(meta['image'])
         mode = str(meta.get('mode', 'trinary')).lower()
         resolution = float(meta['resolution'])

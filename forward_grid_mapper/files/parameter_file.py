@@ -13,6 +13,7 @@ import yaml
 from ..core.common.errors import ParameterError
 from ..core.common.parameters import Parameter, find
 from ..core.messages.message_types import Pose2
+from .small_text import read_text
 
 NODE_NAME = 'forward_grid_mapper'
 
@@ -52,13 +53,17 @@ def load_parameters(path: Path | str) -> ParameterFile:
     """
     path = Path(path)
     try:
-        document = yaml.load(path.read_text(encoding='utf-8'), _Loader)
+        text = read_text(path, ParameterError)
+    except OSError as error:
+        raise ParameterError(f'{path} cannot be read: {error.strerror}') from error
+    except UnicodeDecodeError as error:
+        raise ParameterError(f'{path} is not valid YAML: {error}') from error
+    try:
+        document = yaml.load(text, _Loader)
         flat: dict[str, Any] = {}
         for section in _sections({} if document is None else document):
             flat |= dict(_flatten(section))
         return _sort_out(flat)
-    except OSError as error:
-        raise ParameterError(f'{path} cannot be read: {error.strerror}') from error
     except ParameterError as error:
         raise ParameterError(f'{path}: {error}') from error
     except RecursionError as error:

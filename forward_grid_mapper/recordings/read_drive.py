@@ -96,7 +96,9 @@ def read_drive(
     InputError
         If not a single reading got a pose; says why.
     """
-    journal = drive_file(Path(path))
+    # a pipe would be waited for, a device may have no end
+    plain = Path(path).is_dir() or Path(path).is_file()
+    journal = drive_file(Path(path)) if plain else None
     if journal is not None:
         return read_journal(journal, parameters, extrinsics, range_topics, odom_topic)
     with Bag(path) as bag:

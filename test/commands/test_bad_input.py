@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 import random
 import re
 from pathlib import Path
@@ -93,6 +94,17 @@ def test_a_bag_that_was_cut_off_is_mapped_as_far_as_it_goes(
     assert 'what was intact was read' in warning and 'repair it with' in warning
     assert f'process_bag: warning: {warning}' in capsys.readouterr().err
     assert 'WARNINGS' in (tmp_path / 'maps' / 'report.txt').read_text('utf-8')
+
+
+@pytest.mark.parametrize('inside', [False, True])
+def test_a_pipe_is_not_waited_for(tmp_path: Path, capsys: pytest.CaptureFixture[str], inside: bool) -> None:
+    pipe = tmp_path / 'drive.mcap'
+    if inside:
+        pipe = next(write_tape(tmp_path / 'bag', tape()).glob('*.mcap'))
+        pipe.unlink()
+    os.mkfifo(pipe)
+    said = refusal(capsys, tmp_path, pipe.parent if inside else pipe, '-o', tmp_path / 'maps')
+    assert str(pipe) in said and 'ive a bag folder' in said
 
 
 def test_a_bag_of_which_nothing_is_left(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -8,10 +8,12 @@ import re
 import subprocess
 import sys
 import time
+from contextlib import AbstractContextManager
 from pathlib import Path
 
 import pytest
 from drive_samples import FILES, tape, write_tape
+from numba.core import event
 
 from forward_grid_mapper import __version__
 from forward_grid_mapper.__main__ import COMMANDS
@@ -189,13 +191,84 @@ def test_shows_longer_work() -> None:
     assert '\n' not in shown['screen']
 
 
-def test_the_first_run_says_why_it_takes_long(monkeypatch: pytest.MonkeyPatch) -> None:
+def wait_until_shown(stream: io.StringIO, text: str, begin: int = 0) -> None:
+    end = time.monotonic() + 30.0
+    while text not in stream.getvalue()[begin:]:
+        assert time.monotonic() < end, stream.getvalue()
+        time.sleep(0.01)
+
+
+def test_says_that_it_compiles_only_while_it_does(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(console, 'PATIENCE', 0.0)
     stream = Screen()
     with Ticker(stream=stream) as ticker:
         ticker.mapping('live map', None)
-        time.sleep(0.5)
-    assert 'live map (the first run compiles' in stream.getvalue()
+        wait_until_shown(stream, 'live map')
+        assert 'compil' not in stream.getvalue(), 'nothing is compiled'
+        ticker.mapping('search', None)
+        with compiling_begun():
+            wait_until_shown(stream, 'search (compiling kernels')
+        ticker.mapping('uncertainty', None)
+        wait_until_shown(stream, 'uncertainty')
+        assert 'uncertainty (compil' not in stream.getvalue()
+
+
+def compiling_begun() -> AbstractContextManager[None]:
+    """The event that numba triggers around a compilation, and not for what it finds in its cache."""
+    return event.trigger_event('numba:compile')
+
+
+def test_compiling_is_noticed_and_the_cache_is_not(tmp_path: Path) -> None:
+    program = """
+import sys, numba
+from numba.core import event
+from forward_grid_mapper.core.runtime import compiling
+before = compiling.count()
+numba.config.CACHE_DIR = sys.argv[1]
+@numba.njit(cache=True)
+def add(a, b):
+    return a + b
+add(1, 2)
+assert not compiling.compiling()
+print(compiling.count() - before)
+"""
+    file = tmp_path / 'program.py'
+    file.write_text(program)
+    environment = {**os.environ, 'PYTHONPATH': os.pathsep.join(filter(None, map(os.path.abspath, sys.path)))}
+    for expected in ('1\n', '0\n'):
+        done = subprocess.run(
+            [sys.executable, str(file), str(tmp_path)], capture_output=True, text=True, check=False, env=environment
+        )
+        assert (done.stdout, done.returncode) == (expected, 0), done.stderr
+
+
+@pytest.mark.parametrize('columns', [20, 40, 80])
+def test_a_line_never_wraps(monkeypatch: pytest.MonkeyPatch, columns: int) -> None:
+    monkeypatch.setattr(console, 'PATIENCE', 0.0)
+    monkeypatch.setenv('COLUMNS', str(columns))
+    stream = Screen()
+    with Ticker(stream=stream) as ticker:
+        ticker.mapping('x' * 100, None)
+        wait_until_shown(stream, '...')
+    lines = stream.getvalue().split('\r\033[K')
+    assert max(map(len, lines)) == columns - 1
+
+
+def test_shortened() -> None:
+    assert console.shortened('as it is', 8) == 'as it is'
+    assert console.shortened('too long for it', 8) == 'too l...'
+    assert [len(console.shortened('too long', width)) for width in range(-1, 9)] == [0, 0, 1, 2, 3, 4, 5, 6, 7, 8]
+
+
+def test_a_pipe_gets_a_line_a_second_at_most() -> None:
+    stream = io.StringIO()
+    begin = time.monotonic()
+    with Ticker(stream=stream) as ticker:
+        while time.monotonic() < begin + 3.3:
+            ticker.say(f'step {time.monotonic()}')
+            time.sleep(0.01)
+        passed = time.monotonic() - begin
+    assert 1 <= len(stream.getvalue().splitlines()) <= passed
 
 
 def test_ends_at_an_error(monkeypatch: pytest.MonkeyPatch) -> None:

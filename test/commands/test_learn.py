@@ -99,3 +99,16 @@ def test_quiet(bag: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert code_of(learn.main, bag, '-q', '--rounds', 1) == 0
     out, err = capsys.readouterr()
     assert out == '' and all(line.startswith('learn: warning: ') for line in err.splitlines()) and err
+
+
+def test_a_sensor_that_stands_out_is_told_of(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """One that hears its own mount: always the same short range."""
+    broken = tape().extrinsics[3][0]
+    ranges = [m._replace(range=0.25) if m.frame_id == broken else m for m in tape().ranges]
+    bag = write_tape(tmp_path / 'bag', tape()._replace(ranges=ranges))
+    output = tmp_path / 'learned.yaml'
+    text = ' '.join(said(capsys, bag, '--rounds', 1, '-o', output).split())
+    assert f'a sensor stands out from the others: {broken} (always short: 0.25 m)' in text
+    assert f'# WARNING: a sensor stands out from the others: {broken}' in output.read_text()
+    assert code_of(learn.main, bag, '--rounds', 1, '-q') == 0
+    assert f'learn: warning: a sensor stands out from the others: {broken}' in capsys.readouterr().err

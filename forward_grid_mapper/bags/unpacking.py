@@ -1,0 +1,112 @@
+"""Bags that rosbag2 compressed as a whole: file by file, or message by message."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from collections.abc import Callable, Collection, Iterator
+from pathlib import Path
+
+from backports import zstd
+
+from ..core.common.errors import BagError
+from ..core.common.shell import quoted
+from .bounds import LARGEST_MESSAGE, megabytes, most_unpacked, unpack
+from .source import RawMessage, Source, one_line
+
+_PIECE = 1 << 20
+"""Bytes that are unpacked at once."""
+
+
+class UnpackedMessages:
+    """A source whose messages are compressed one by one."""
+
+    def __init__(self, source: Source) -> None:
+        self._source = source
+        self.channels = source.channels
+
+    @property
+    def damage(self) -> str | None:
+        """Why not everything could be read, as far as is known by now."""
+        return self._source.damage
+
+    @damage.setter
+    def damage(self, damage: str | None) -> None:
+        self._source.damage = damage
+
+    def messages(self, keys: Collection[int]) -> Iterator[RawMessage]:
+        """Yield the messages of these channels by log time; one that cannot be unpacked is empty, and fits no type."""
+        for key, time, data in self._source.messages(keys):
+            try:
+                raw = unpack('zstd', data, LARGEST_MESSAGE)
+            except Exception:  # too large, or whatever the library says of damaged bytes
+                raw = b''
+            yield key, time, raw
+
+    def close(self) -> None:
+        """Release the file."""
+        self._source.close()
+
+
+class _InFolder:
+    """A source in a temporary folder, which goes with it."""
+
+    def __init__(self, source: Source, folder: Path) -> None:
+        self._source, self._folder = source, folder
+        self.channels = source.channels
+
+    @property
+    def damage(self) -> str | None:
+        return self._source.damage
+
+    @damage.setter
+    def damage(self, damage: str | None) -> None:
+        self._source.damage = damage
+
+    def messages(self, keys: Collection[int]) -> Iterator[RawMessage]:
+        return self._source.messages(keys)
+
+    def close(self) -> None:
+        self._source.close()
+        shutil.rmtree(self._folder, ignore_errors=True)
+
+
+def open_unpacked(file: Path, open_file: Callable[[Path], Source]) -> Source:
+    """Unpack a storage file, such as bag_0.db3.zstd, into a temporary folder and open it there.
+
+    Raises
+    ------
+    BagError
+        Naming the file, if it is damaged, or unpacks to more than is admitted or the disk holds.
+    """
+    if not file.is_file():
+        raise BagError(f'{file} is no regular file; give a bag folder or a .mcap, .db3 or .bag file.')
+    folder = Path(tempfile.mkdtemp(prefix='forward_grid_mapper_'))
+    try:
+        unpacked = folder / file.stem
+        _unpack(file, unpacked)
+        return _InFolder(open_file(unpacked), folder)
+    except PermissionError:
+        shutil.rmtree(folder, ignore_errors=True)
+        raise
+    except BaseException as error:
+        shutil.rmtree(folder, ignore_errors=True)
+        if not isinstance(error, Exception):
+            raise
+        # the temporary name means nothing to anybody
+        reason = one_line(error).replace(str(unpacked), 'what it holds')
+        raise BagError(
+            f'{file} is damaged or cut off ({reason}); unpack it with `zstd -d {quoted(file)}`, '
+            f'delete metadata.yaml and run `ros2 bag reindex {quoted(file.parent)}`.'
+        ) from error
+
+
+def _unpack(packed: Path, unpacked: Path) -> None:
+    most = min(most_unpacked(packed.stat().st_size), shutil.disk_usage(unpacked.parent).free)
+    done = 0
+    with zstd.open(packed, 'rb') as source, unpacked.open('wb') as target:
+        while piece := source.read(_PIECE):
+            done += len(piece)
+            if done > most:
+                raise BagError(f'it unpacks to more than {megabytes(most)}')
+            target.write(piece)

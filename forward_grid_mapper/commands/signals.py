@@ -1,0 +1,118 @@
+"""Ctrl-C and SIGTERM, from the first import to the last line: one line of text and an exit code, never a traceback.
+
+This module imports little, since it is to be ready before anything that takes long to import.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+import time
+from types import FrameType, TracebackType
+from typing import Any, NoReturn
+
+SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+GRACE = 5.0
+"""Seconds after a first signal in which further ones are ignored, so that nothing interrupts the clean-up: a terminal
+and `ros2 launch` send Ctrl-C more than once."""
+
+ENDS_WITH_STDIN = 'FORWARD_GRID_MAPPER_ENDS_WITH_STDIN'
+"""Environment variable: with the value 1 the process ends when its standard input does, which its parent holds open."""
+
+
+class Cancelled(KeyboardInterrupt):
+    """A signal that ends the work; `code` is the exit code, 128 plus the signal's number as shells have it."""
+
+    def __init__(self, number: int) -> None:
+        super().__init__()
+        self.code = 128 + number
+
+
+def cancelled_line(command: str) -> str:
+    """Return what is told of a command that a signal ended."""
+    return f'{command}: cancelled; nothing was written'
+
+
+def _install(handler: Any) -> dict[signal.Signals, Any]:
+    """Set the handler of the signals that are not ignored; return the handlers before."""
+    before = {number: signal.getsignal(number) for number in SIGNALS}
+    # a shell without job control lets background commands ignore Ctrl-C, and `nohup` does the like
+    replaced = {number: old for number, old in before.items() if old is not signal.SIG_IGN}
+    for number in replaced:
+        signal.signal(number, handler)
+    return replaced
+
+
+def leave_at_once(command: str) -> None:
+    """Let a signal end the process at once, with one line: for imports, while there is nothing to clean up.
+
+    A `KeyboardInterrupt` in an import would be swallowed by some libraries, and told with a traceback by others.
+    """
+
+    def leave(number: int, frame: FrameType | None) -> NoReturn:
+        os.write(2, f'{cancelled_line(command)}\n'.encode())
+        os._exit(128 + number)
+
+    _install(leave)
+
+
+def leave_silently() -> None:
+    """Let a signal end the process without a word: for the interpreter's own end, when all is done and told."""
+    _install(signal.SIG_DFL)
+
+
+class Interruptible:
+    """Lets a signal raise `Cancelled` in a `with` block, once within `GRACE`; for the main thread, elsewhere idle."""
+
+    def __init__(self) -> None:
+        self._before: dict[signal.Signals, Any] = {}
+        self._first = -GRACE
+
+    def __enter__(self) -> Interruptible:
+        """Begin to take signals."""
+        if threading.current_thread() is threading.main_thread():
+            self._before = _install(self._raise)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Leave signals to who had them before."""
+        for number, handler in self._before.items():
+            # what took the signal in the block may have silenced it for good
+            if signal.getsignal(number) is not signal.SIG_IGN:
+                signal.signal(number, handler)
+
+    def _raise(self, number: int, frame: FrameType | None) -> None:
+        now = time.monotonic()
+        if now >= self._first + GRACE:
+            self._first = now
+            raise Cancelled(number)
+
+
+def end_with_parent() -> None:
+    """End this process as by SIGTERM when its parent has ended, if the parent asked for it by `ENDS_WITH_STDIN`.
+
+    The parent holds the other end of standard input. The system closes it whatever ends the parent, SIGKILL included,
+    on every system with pipes.
+    """
+    if os.environ.pop(ENDS_WITH_STDIN, '') != '1':
+        return
+
+    def watch() -> None:
+        try:
+            while os.read(0, 4096):
+                pass
+        except OSError:
+            # no standard input at all: nobody holds the other end
+            pass
+        os.kill(os.getpid(), signal.SIGTERM)
+        time.sleep(GRACE)
+        os._exit(128 + signal.SIGTERM)
+
+    # a thread inherits the mask; signals are for the threads that know what to do
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
+    threading.Thread(target=watch, daemon=True, name='parent').start()
+    signal.pthread_sigmask(signal.SIG_SETMASK, before)

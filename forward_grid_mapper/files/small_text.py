@@ -1,0 +1,29 @@
+"""Reading text files that people write: never more than such a file can have, whatever the path leads to."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from ..core.common.errors import MapperError
+
+MOST = 1_000_000
+"""Bytes of a parameter file or the YAML of a map; ours have 12 000, and YAML takes a second for the bound."""
+
+
+def read_text(path: Path, error: type[MapperError]) -> str:
+    """Return the text of a UTF-8 file.
+
+    Raises
+    ------
+    error
+        Naming the file, if it is larger.
+    OSError
+        If it cannot be read.
+    UnicodeDecodeError
+        If it is no UTF-8.
+    """
+    with path.open('rb') as file:
+        content = file.read(MOST + 1)
+    if len(content) > MOST:
+        raise error(f'{path} has more than {MOST:,} bytes; it is no file of this kind')
+    return content.decode('utf-8')

@@ -1,0 +1,442 @@
+"""Bags made to take time or memory without end: each is read or refused in words, within 20 s of work and 1.5 GB.
+
+Every attempt has a process of its own with a limit on its address space and its processor time, and a time-out.
+"""
+
+from __future__ import annotations
+
+import bz2
+import os
+import socket
+import sqlite3
+import struct
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import lz4.frame
+import pytest
+from backports import zstd
+from bag_samples import COUNT, START, range_of, sample_messages, storage_file, write_many_chunks, write_sample
+from rosbags import rosbag2
+from rosbags.typesys import Stores, get_typestore
+
+import forward_grid_mapper
+from forward_grid_mapper.bags import bounds
+from forward_grid_mapper.bags.choice import Topics
+from forward_grid_mapper.bags.decoder import MOST_FIELDS, Decoder
+from forward_grid_mapper.bags.reader import Bag
+from forward_grid_mapper.core.common.errors import BagError
+from forward_grid_mapper.core.messages.message_types import RangeMessage
+
+SECONDS = 20
+"""Of processor time; a busy machine may take longer."""
+
+PATIENCE = 300
+MEMORY = 3 << 29
+READ = f"""
+import resource, sys
+resource.setrlimit(resource.RLIMIT_AS, ({MEMORY}, {MEMORY}))
+resource.setrlimit(resource.RLIMIT_CPU, ({SECONDS}, {SECONDS}))
+from forward_grid_mapper.bags.choice import Topics
+from forward_grid_mapper.bags.reader import Bag
+from forward_grid_mapper.core.common.errors import BagError
+try:
+    with Bag(sys.argv[1]) as bag:
+        bag.topics()
+        bag.static_transforms()
+        messages = list(bag.messages(Topics(('/sonar',), '/odom')))
+        print(len(messages), bag.truncated or '', sum(bag.undecodable.values()), sep='\\n')
+except BagError as error:
+    print(-1, error, 0, sep='\\n')
+"""
+BOMB = 1 << 30
+"""Bytes that a bomb claims, or unpacks to."""
+
+
+def attempt(path: Path) -> tuple[int, str, int]:
+    """Read a bag; return the number of messages or -1, what was said, and how many messages did not fit."""
+    root = str(Path(forward_grid_mapper.__file__).parents[1])
+    search = os.pathsep.join(filter(None, (root, os.environ.get('PYTHONPATH'))))
+    done = subprocess.run(
+        [sys.executable, '-c', READ, str(path)],
+        # threads of the linear algebra, which is not used, reserve memory
+        env={**os.environ, 'PYTHONPATH': search, 'OPENBLAS_NUM_THREADS': '1'},
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=PATIENCE,
+    )
+    assert done.returncode == 0, done.stderr
+    count, said, unfit = done.stdout.rstrip('\n').split('\n')
+    return int(count), said, int(unfit)
+
+
+def changed(bag: Path, *statements: str) -> Path:
+    """Run SQL on a bag's file; return the file."""
+    file = storage_file(bag)
+    database = sqlite3.connect(file)
+    for statement in statements:
+        database.execute(statement)
+    database.commit()
+    database.close()
+    return file
+
+
+def test_a_sound_bag_fits_into_the_limits(tmp_path: Path) -> None:
+    assert attempt(write_sample(tmp_path, 'mcap')) == (2 * COUNT, '', 0)
+
+
+# ---- sqlite3
+
+
+ENDLESS = 'WITH RECURSIVE r(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM r)'
+
+
+def test_a_view_named_messages(tmp_path: Path) -> None:
+    file = changed(
+        write_sample(tmp_path, 'sqlite3'),
+        'DROP TABLE messages',
+        f"CREATE VIEW messages AS {ENDLESS} SELECT i AS id, 1 AS topic_id, i AS timestamp, x'00' AS data FROM r",
+    )
+    count, said, _ = attempt(file)
+    assert count == -1 and str(file) in said and "'messages' is a view" in said
+
+
+def test_a_view_named_topics(tmp_path: Path) -> None:
+    file = changed(
+        write_sample(tmp_path, 'sqlite3'),
+        'DROP TABLE topics',
+        f"CREATE VIEW topics AS {ENDLESS} SELECT i AS id, '/t' AS name, 'a/msg/B' AS type, "
+        f"'cdr' AS serialization_format, '' AS offered_qos_profiles, '' AS type_description_hash FROM r",
+    )
+    count, said, _ = attempt(file)
+    assert count == -1 and "'topics' is a view" in said
+
+
+def test_a_computed_column(tmp_path: Path) -> None:
+    file = changed(
+        write_sample(tmp_path, 'sqlite3'),
+        'DROP TABLE messages',
+        'CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, timestamp INTEGER, '
+        'data BLOB AS (zeroblob(900000000)))',
+        'INSERT INTO messages(topic_id, timestamp) VALUES (1, 1), (1, 2)',
+    )
+    count, said, _ = attempt(file)
+    assert count == -1 and "column 'data'" in said and 'computed' in said
+
+
+def test_more_rows_than_the_file_can_hold(tmp_path: Path) -> None:
+    """A page of the table's tree that refers to the page above it: rows without end."""
+    file = storage_file(write_sample(tmp_path, 'sqlite3', count=600))
+    database = sqlite3.connect(file)
+    (root,) = database.execute("SELECT rootpage FROM sqlite_master WHERE name = 'messages'").fetchone()
+    (size,) = database.execute('PRAGMA page_size').fetchone()
+    database.close()
+    content = bytearray(file.read_bytes())
+    at = (root - 1) * size
+    assert content[at] == 5, 'the root is an inner page of a table'
+    cells = struct.unpack_from('>H', content, at + 3)[0]
+    pointers = struct.unpack_from(f'>{cells}H', content, at + 12)
+    leaf = struct.unpack_from('>I', content, at + pointers[0])[0]
+    # an inner page in place of a leaf, all of whose cells lead to the second leaf, and so down four levels
+    second = struct.unpack_from('>I', content, at + pointers[1])[0]
+    fourth = [struct.unpack_from('>I', content, at + p)[0] for p in pointers[2:6]]
+    below = second
+    for page in (*fourth, leaf):
+        number = (size - 12) // 8
+        begin = (page - 1) * size
+        content[begin : begin + size] = bytes(size)
+        struct.pack_into('>BHHHBI', content, begin, 5, 0, number, size - 5 * number & 0xFFFF, 0, below)
+        for n in range(number):
+            place = size - 5 * (n + 1)
+            struct.pack_into('>H', content, begin + 12 + 2 * n, place)
+            struct.pack_into('>IB', content, begin + place, below, n % 128)
+        below = page
+    file.write_bytes(content)
+    _, said, _ = attempt(file)
+    assert said
+
+
+def test_a_table_by_another_name_does_not_fool_the_check(tmp_path: Path) -> None:
+    file = changed(
+        write_sample(tmp_path, 'sqlite3'),
+        'CREATE TABLE pragma_table_xinfo(name, hidden)',
+        'CREATE TABLE extra(x)',
+        f'CREATE VIEW others AS {ENDLESS} SELECT i FROM r',
+    )
+    assert attempt(file) == (2 * COUNT, '', 0)
+
+
+# ---- definitions
+
+
+def with_definition(folder: Path, text: str, data: bytes) -> Path:
+    """An MCAP bag of one Range whose definition is `text`."""
+    writer = rosbag2.Writer(folder / 'bag', version=9, storage_plugin=rosbag2.StoragePlugin.MCAP)
+    with writer:
+        connection = writer.add_connection('/sonar', 'sensor_msgs/msg/Range', msgdef=text, rihs01='x')
+        for i in range(3):
+            writer.write(connection, START + i, data)
+    return folder / 'bag'
+
+
+SOUND = 'float32 x\n'
+
+
+@pytest.mark.parametrize(
+    'definition',
+    [
+        'string[300000000] names\n',
+        f'string[{MOST_FIELDS + 1}] names\n',
+        f'Empty[300000000] x\n{"=" * 80}\nMSG: sensor_msgs/Empty\n',
+        f'Empty[] x\n{"=" * 80}\nMSG: sensor_msgs/Empty\n',
+        ''.join(
+            f'{"" if n == 0 else "=" * 80 + chr(10) + f"MSG: sensor_msgs/A{n}" + chr(10)}'
+            + (f'A{n + 1}[100] x\n' if n < 6 else 'float32 x\n')
+            for n in range(7)
+        ),
+        f'A x\n{"=" * 80}\nMSG: sensor_msgs/A\nA x\n',
+        '\n' * 400_000 + 'float32 x\n',
+        '# ' + 'x' * 400_000 + '\nfloat32 x\n',
+    ],
+    ids=['strings', 'just too many', 'nothing', 'no end', 'nested', 'itself', 'blank lines', 'long'],
+)
+def test_definitions_that_explode(tmp_path: Path, definition: str) -> None:
+    assert Decoder('sensor_msgs/msg/Range', 'cdr', 'msg', definition)
+    data = b'\0\1\0\0' + b'\xff' * 400
+    count, said, unfit = attempt(with_definition(tmp_path, definition, data))
+    assert unfit == 3 or (count == -1 and said), (count, said, unfit)
+
+
+def test_40_kb_of_blank_lines_in_a_definition(tmp_path: Path) -> None:
+    store = get_typestore(Stores.ROS2_JAZZY)
+    message = next(m for m in sample_messages() if isinstance(m, RangeMessage))
+    data = bytes(store.serialize_cdr(range_of(store, message), 'sensor_msgs/msg/Range'))
+    text, _ = store.generate_msgdef('sensor_msgs/msg/Range')
+    assert attempt(with_definition(tmp_path, '\n' * 40_000 + text, data)) == (3, '', 0)
+
+
+# ---- metadata
+
+
+@pytest.mark.parametrize('filling', ['\n', ' \n', 'relative_file_paths:\n', '  - x\n', '-\n'])
+def test_40_kb_of_nothing_in_the_metadata(tmp_path: Path, filling: str) -> None:
+    bag = write_sample(tmp_path, 'mcap')
+    metadata = bag / 'metadata.yaml'
+    text = metadata.read_text()
+    for content in (
+        filling * 40_000 + text,
+        text + filling * 40_000,
+        text.replace('_paths:\n', '_paths:\n' + filling * 40_000),
+    ):
+        metadata.write_text(content)
+        count, said, _ = attempt(bag)
+        assert count == 2 * COUNT or said, content[:40]
+
+
+def test_metadata_without_end(tmp_path: Path) -> None:
+    bag = write_sample(tmp_path, 'mcap')
+    with (bag / 'metadata.yaml').open('r+b') as file:
+        file.truncate(1 << 40)
+    count, said, _ = attempt(bag)
+    assert count == -1 and 'metadata.yaml has more than' in said
+
+
+# ---- what unpacks to very much
+
+
+def mcap_with(folder: Path, compression: str, packed: bytes, size: int, times: int = 1, *, index: bool = False) -> Path:
+    """A file of `times` equal chunks of zeros, or of whatever unpacks from `packed`, that state `size`."""
+
+    def text(value: str) -> bytes:
+        return struct.pack('<I', len(value)) + value.encode()
+
+    def record(opcode: int, content: bytes) -> bytes:
+        return struct.pack('<BQ', opcode, len(content)) + content
+
+    path = folder / 'bomb.mcap'
+    with path.open('wb') as file:
+        file.write(b'\x89MCAP0\r\n' + record(1, text('ros2') + text('')))
+        file.write(record(3, struct.pack('<H', 1) + text('sensor_msgs/msg/Range') + text('ros2msg') + text('')))
+        file.write(record(4, struct.pack('<HH', 1, 1) + text('/sonar') + text('cdr') + struct.pack('<I', 0)))
+        chunk = struct.pack('<QQQI', 0, 1, size, 0) + text(compression) + struct.pack('<Q', len(packed)) + packed
+        for _ in range(times):
+            file.write(record(6, chunk))
+        if index:
+            summary = file.tell()
+            begin = summary - times * (9 + len(chunk))
+            file.write(record(3, struct.pack('<H', 1) + text('sensor_msgs/msg/Range') + text('ros2msg') + text('')))
+            file.write(record(4, struct.pack('<HH', 1, 1) + text('/sonar') + text('cdr') + struct.pack('<I', 0)))
+            for n in range(times):
+                at = begin + n * (9 + len(chunk))
+                entry = struct.pack('<QQQQ', 0, 1, at, 9 + len(chunk)) + struct.pack('<IHQ', 10, 1, at + 9 + len(chunk))
+                entry += struct.pack('<Q', 31) + text(compression) + struct.pack('<QQ', len(packed), size)
+                file.write(record(8, entry))
+            file.write(
+                record(
+                    0x0B, struct.pack('<QHIIIIQQI', times, 1, 1, 0, 0, times, 0, 1, 10) + struct.pack('<HQ', 1, times)
+                )
+            )
+            file.write(record(2, struct.pack('<QQI', summary, 0, 0)))
+        else:
+            file.write(record(2, struct.pack('<QQI', 0, 0, 0)))
+        file.write(b'\x89MCAP0\r\n')
+    return path
+
+
+PACKERS: dict[str, Callable[[bytes], bytes]] = {'zstd': zstd.compress, 'lz4': lz4.frame.compress, 'bz2': bz2.compress}
+
+
+@pytest.mark.parametrize('index', [False, True])
+@pytest.mark.parametrize('stated', [100, 1 << 20, BOMB, 1 << 62])
+@pytest.mark.parametrize('compression', ['zstd', 'lz4'])
+def test_one_chunk_of_a_gigabyte(tmp_path: Path, compression: str, stated: int, index: bool) -> None:
+    packed = b''.join(PACKERS[compression](bytes(BOMB // 8)) for _ in range(8))
+    count, said, _ = attempt(mcap_with(tmp_path, compression, packed, stated, index=index))
+    assert count in (-1, 0) and said
+    assert 'bomb.mcap' in said
+
+
+@pytest.mark.parametrize('index', [False, True])
+def test_many_chunks_that_are_admitted_one_by_one(tmp_path: Path, index: bool) -> None:
+    size = 1 << 26
+    # one attachment, which is passed over
+    packed = zstd.compress(struct.pack('<BQ', 9, size - 9) + bytes(size - 9))
+    count, said, _ = attempt(mcap_with(tmp_path, 'zstd', packed, size, 300, index=index))
+    assert count in (-1, 0) and 'unpack to more than' in said
+
+
+@pytest.mark.parametrize('compression', ['bz2', 'lz4'])
+def test_a_ros1_bag_of_a_gigabyte(tmp_path: Path, compression: str) -> None:
+    bag = write_many_chunks(tmp_path, 'ros1', compression)
+    content = bag.read_bytes()
+    packed = PACKERS[compression](bytes(BOMB))
+    mark = {'bz2': b'BZh', 'lz4': b'\x04\x22\x4d\x18'}[compression]
+    at = content.index(mark)
+    (size,) = struct.unpack_from('<I', content, at - 4)
+    bag.write_bytes(content[: at - 4] + struct.pack('<I', len(packed)) + packed + content[at + size :])
+    count, said, _ = attempt(bag)
+    assert bag.name in said and 'damaged' in said
+    assert count > COUNT // 2, 'the other chunks are still worth having'
+
+
+@pytest.mark.parametrize('kind', ['sqlite3', 'mcap'])
+def test_a_compressed_file_of_a_gigabyte(tmp_path: Path, kind: str) -> None:
+    bag = write_sample(tmp_path, kind)
+    file = storage_file(bag)
+    metadata = bag / 'metadata.yaml'
+    packed = bag / f'{file.name}.zstd'
+    packed.write_bytes(zstd.compress(file.read_bytes()))
+    metadata.write_text(
+        metadata.read_text()
+        .replace(file.name, packed.name)
+        .replace("compression_mode: ''", 'compression_mode: FILE')
+        .replace("compression_format: ''", 'compression_format: zstd')
+    )
+    file.unlink()
+    assert 'FILE' in metadata.read_text()
+    assert attempt(bag) == (2 * COUNT, '', 0)
+    packed.write_bytes(b''.join(zstd.compress(bytes(BOMB // 4)) for _ in range(4)))
+    count, said, _ = attempt(bag)
+    assert count == -1 and str(packed) in said and 'unpacks to more than' in said
+
+
+def test_a_compressed_message_of_a_gigabyte(tmp_path: Path) -> None:
+    bag = write_many_chunks(tmp_path, 'mcap', 'message')
+    file = storage_file(bag)
+    assert attempt(bag)[0] == COUNT
+    file.unlink()
+    store = get_typestore(Stores.ROS2_JAZZY)
+    with rosbag2.Writer(tmp_path / 'other', version=9, storage_plugin=rosbag2.StoragePlugin.MCAP) as writer:
+        connection = writer.add_connection('/sonar', 'sensor_msgs/msg/Range', typestore=store)
+        for i in range(3):
+            writer.write(connection, START + i, zstd.compress(bytes(BOMB)))
+    storage_file(tmp_path / 'other').rename(file)
+    _, _, unfit = attempt(bag)
+    assert unfit == 3
+
+
+def test_what_unpack_gives_and_refuses() -> None:
+    data = bytes(range(256)) * 40
+    for name, pack in PACKERS.items():
+        assert bounds.unpack(name, pack(data) + pack(data), 2 * len(data)) == data * 2
+        with pytest.raises(bounds.Damage, match='more than'):
+            bounds.unpack(name, pack(data), len(data) - 1)
+    assert bounds.unpack('', data, 0) == data
+    with pytest.raises(bounds.Damage, match="'zip'"):
+        bounds.unpack('zip', data, 1000)
+
+
+# ---- what is no file
+
+
+def test_pipes_sockets_and_devices(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / 'pipe')
+    with socket.socket(socket.AF_UNIX) as server:
+        here = Path.cwd()
+        try:
+            # the path of a socket must be short
+            os.chdir(tmp_path)
+            server.bind('socket')
+        finally:
+            os.chdir(here)
+        (tmp_path / 'device').symlink_to('/dev/zero')
+        for name in ('pipe', 'socket', 'device'):
+            count, said, _ = attempt(tmp_path / name)
+            assert count == -1 and name in said and 'Give a bag folder' in said
+    for name in ('bag.mcap', 'metadata.yaml'):
+        bag = write_sample(tmp_path, 'mcap', name=f'with a pipe for {name}')
+        file = storage_file(bag) if name != 'metadata.yaml' else bag / name
+        file.unlink()
+        os.mkfifo(file)
+        count, said, _ = attempt(bag)
+        if name == 'metadata.yaml':
+            assert count == 2 * COUNT, 'the only file will do'
+        else:
+            assert count == -1 and str(file) in said and 'no regular file' in said
+
+
+# ---- metadata that say less usual things
+
+
+@pytest.mark.parametrize('kind', ['mcap', 'sqlite3'])
+@pytest.mark.parametrize(
+    'name', ['a, b', "it's", 'say "so"', ' - x', '[one]', 'a: b', '#1', 'with spaces ' * 10, 'ä, ö']
+)
+def test_any_folder_name(tmp_path: Path, kind: str, name: str) -> None:
+    if kind == 'sqlite3' and '#' in name:
+        pytest.skip('rosbags cannot write it')
+    bag = write_sample(tmp_path, kind, name=name)
+    with Bag(bag) as opened:
+        assert list(opened.messages(opened.choose_topics())) == sample_messages()
+        assert opened.truncated is None
+
+
+@pytest.mark.parametrize(
+    'style', ['[{0}]', "['{0}']", '["{0}", ]', '\n    - {0}', '\n  - \'{0}\'\n  - "{0}"', '[{0}, {0}]']
+)
+def test_a_file_that_is_listed_again_counts_once(tmp_path: Path, style: str) -> None:
+    bag = write_sample(tmp_path, 'mcap')
+    (bag / 'link.mcap').symlink_to('bag.mcap')
+    metadata = bag / 'metadata.yaml'
+    before, _, after = metadata.read_text().partition('relative_file_paths:')
+    after = after[after.index('duration:') - 2 :]
+    listed = style.format('bag.mcap')
+    for text in (listed, style.format('./bag.mcap'), '[bag.mcap, link.mcap]'):
+        metadata.write_text(f'{before}relative_file_paths: {text}\n{after}')
+        with Bag(bag) as opened:
+            assert list(opened.messages(opened.choose_topics())) == sample_messages()
+            assert opened.truncated is None
+    metadata.write_text(f'{before}relative_file_paths: [gone.mcap, bag.mcap]\n{after}')
+    with Bag(bag) as opened:
+        assert opened.truncated is not None and 'gone.mcap is missing' in opened.truncated
+
+
+def test_a_file_of_a_compressed_bag_alone(tmp_path: Path) -> None:
+    bag = write_many_chunks(tmp_path, 'mcap', 'file')
+    with pytest.raises(BagError, match='zstd -d'), Bag(storage_file(bag).rename(tmp_path / 'alone.mcap.zstd')):
+        pass
+    with Bag(write_many_chunks(tmp_path, 'mcap', 'message')) as opened:
+        assert len(list(opened.messages(Topics(('/sonar',), '')))) == COUNT

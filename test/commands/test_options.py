@@ -1,0 +1,141 @@
+"""Options that several commands share: topics before and behind the bag, and parameters that only the node has."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from drive_samples import code_of, mapped, tape, write_tape
+
+from forward_grid_mapper.commands import experiment, learn, process_bag, replay_bag
+from forward_grid_mapper.commands.options import chosen_parameters
+from forward_grid_mapper.core.common.errors import ParameterError
+from forward_grid_mapper.core.common.parameters import TABLE
+from forward_grid_mapper.files import drawing
+from forward_grid_mapper.files.parameter_text import dump_parameters
+
+PARSERS = [process_bag.parser, learn.parser, replay_bag.parser]
+
+
+@pytest.fixture
+def bag(tmp_path: Path) -> str:
+    """Something that exists."""
+    (tmp_path / 'bag').mkdir()
+    return str(tmp_path / 'bag')
+
+
+@pytest.mark.parametrize('parser', PARSERS)
+@pytest.mark.parametrize(
+    'form',
+    [
+        'BAG --range-topics A B',
+        'BAG --range-topics A,B',
+        'BAG --range-topics A, B',
+        'BAG --range-topics A --range-topics B',
+        'BAG --range-topics=A,B',
+        '--range-topics=A,B BAG',
+        '--range-topics A B -q BAG',
+        '--range-topics A B -- BAG',
+        '--range-topics A B BAG',
+        '--range-topics A,B BAG',
+        '--range-topics A --range-topics B BAG',
+        '-q --range-topics A B BAG --odom-topic O',
+    ],
+)
+def test_the_bag_is_found_before_and_behind_the_topics(
+    parser: Callable[[], argparse.ArgumentParser], form: str, bag: str
+) -> None:
+    options = parser().parse_args([bag if word == 'BAG' else word for word in form.split()])
+    assert (options.bag, options.range_topics) == (bag, ['A', 'B'])
+
+
+def test_the_bag_is_found_behind_renamings(bag: str) -> None:
+    options = replay_bag.parser().parse_args(['--remap', 'a:=b', 'c:=d', bag])
+    assert (options.bag, options.remap) == (bag, ['a:=b', 'c:=d'])
+    options = replay_bag.parser().parse_args(['--range-topics', 'A', '--remap', 'a:=b', bag])
+    assert (options.bag, options.remap, options.range_topics) == (bag, ['a:=b'], ['A'])
+
+
+@pytest.mark.parametrize('parser', PARSERS)
+@pytest.mark.parametrize(
+    ('form', 'told'),
+    [
+        ('', 'no bag is given'),
+        ('-q', 'no bag is given'),
+        ('--range-topics A absent', 'BAG --range-topics A absent'),
+        ('--range-topics A', 'Give the bag first'),
+        ('--range-topics BAG', '--range-topics: expected one word or more before the bag'),
+    ],
+)
+def test_no_bag(
+    parser: Callable[[], argparse.ArgumentParser],
+    form: str,
+    told: str,
+    bag: str,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    with pytest.raises(SystemExit) as left:
+        parser().parse_args([bag if word == 'BAG' else word for word in form.split()])
+    assert left.value.code == 2
+    assert told in capsys.readouterr().err
+
+
+def test_the_bag_looks_required() -> None:
+    for parser in PARSERS:
+        assert ' bag' in parser().format_usage() and '[bag]' not in parser().format_usage()
+
+
+# ---- parameters
+
+
+NODE = [row for row in TABLE if row.group == 'node']
+
+
+@pytest.mark.parametrize('name', [row.name for row in NODE])
+def test_parameters_of_the_node_cannot_be_set(name: str, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    value = {float: '2.5', bool: 'true', int: '3'}.get(next(row.type for row in NODE if row.name == name), 'reliable')
+    options = process_bag.parser().parse_args(['bag', '--set', f'{name}={value}'])
+    with pytest.raises(ParameterError, match=f'--set {name}: only the node has this parameter'):
+        chosen_parameters(options)
+    assert code_of(process_bag.main, tmp_path / 'absent', '--set', f'{name}={value}', '-o', tmp_path / 'maps') == 1
+    assert f'--set {name}: only the node' in capsys.readouterr().err
+
+
+def test_parameters_that_only_the_node_has_are_told_of(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(drawing, 'draw', lambda path, picture: None)
+    file = tmp_path / 'p.yaml'
+    file.write_text('/**: {ros__parameters: {map_frame: map, publish_rate: 5.0, odom_topic: odom, p_hit: 0.6}}')
+    path = write_tape(tmp_path / 'recorded', tape())
+    report = mapped(path, tmp_path / 'maps', '--params', file, '-q')
+    (warning,) = (w for w in report['warnings'] if 'only the node' in w)
+    assert str(file) in warning and "map_frame (the maps are in odometry's frame)" in warning
+    assert 'publish_rate' in warning and 'odom_topic' not in warning, 'a default changes nothing'
+    assert 'p_hit' not in warning
+    assert warning in capsys.readouterr().err
+    assert 'map_frame' in (tmp_path / 'maps' / 'report.txt').read_text()
+    assert code_of(learn.main, path, '--params', file, '--rounds', 1, '-q') == 0
+    assert f'learn: warning: {warning}' in capsys.readouterr().err
+
+
+def test_every_parameter_of_the_node_is_told_of(tmp_path: Path) -> None:
+    other = {float: 3.25, bool: True, str: 'reliable', tuple: ['x'], int: 3}
+    for row in NODE:
+        file = tmp_path / f'{row.name}.yaml'
+        file.write_text(f'{row.name}: {str(other[row.type]).lower()}')
+        chosen = chosen_parameters(process_bag.parser().parse_args(['bag', '--params', str(file)]))
+        assert len(chosen.warnings) == 1 and row.name in chosen.warnings[0]
+    file = tmp_path / 'defaults.yaml'
+    file.write_text(dump_parameters(chosen.parameters.__class__()))
+    assert chosen_parameters(process_bag.parser().parse_args(['bag', '--params', str(file)])).warnings == []
+
+
+def test_experiment_tells_of_them_too(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / 'p.yaml'
+    file.write_text('map_frame: map')
+    (tmp_path / 'taken').write_text('')
+    assert code_of(experiment.main, 'door', '--params', file, '-o', tmp_path / 'taken') == 1
+    assert 'experiment: warning: ' in capsys.readouterr().err

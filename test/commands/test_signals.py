@@ -1,0 +1,182 @@
+"""Ctrl-C and SIGTERM at any moment: one line, exit code 128 plus the signal, nothing and nobody left behind."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from drive_samples import everything_in, tape, write_tape
+
+import forward_grid_mapper
+from forward_grid_mapper.commands import console, process_bag, signals
+from forward_grid_mapper.commands.live_node import start_child
+
+ROOT = str(Path(forward_grid_mapper.__file__).parents[1])
+AT_IMPORT = """
+import os, sys
+
+module, number, command = sys.argv[1:4]
+
+class Interrupting:
+    # sends the signal when the module is about to be imported
+    def find_spec(self, name, path=None, target=None):
+        if name == module:
+            sys.meta_path.remove(self)
+            os.kill(os.getpid(), int(number))
+        return None
+
+sys.meta_path.insert(0, Interrupting())
+import forward_grid_mapper.__main__ as entry
+sys.argv = [command, *sys.argv[4:]]
+sys.exit(getattr(entry, command)())
+"""
+"""Starts a command as its installed script does, and interrupts it at the import of a module."""
+
+COMMANDS = {
+    'process_bag': ('bag',),
+    'learn': ('bag',),
+    'replay_bag': ('bag',),
+    'simulate': ('door', '-o', 'out'),
+    'experiment': ('door',),
+    'demo': ('--offline',),
+    'mapper': (),
+}
+
+
+def environment(**more: str) -> dict[str, str]:
+    path = os.pathsep.join(filter(None, (ROOT, os.environ.get('PYTHONPATH'))))
+    return {**os.environ, 'PYTHONPATH': path, **more}
+
+
+def interrupted(
+    folder: Path, module: str, number: signal.Signals, command: str, *arguments: object
+) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, '-c', AT_IMPORT, module, str(int(number)), command, *map(str, arguments)],
+        cwd=folder,
+        env=environment(),
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=120,
+    )
+
+
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize('command', sorted(COMMANDS))
+def test_while_the_command_is_imported(tmp_path: Path, command: str, number: signal.Signals) -> None:
+    module = {'mapper': 'forward_grid_mapper.node.main'}.get(command, 'numpy')
+    done = interrupted(tmp_path, module, number, command, *COMMANDS[command])
+    assert (done.returncode, done.stdout) == (128 + number, '')
+    assert done.stderr == f'{command}: cancelled; nothing was written\n'
+    assert everything_in(tmp_path) == []
+
+
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize('module', ['numba', 'yaml', 'rosbags', 'argparse'])
+def test_at_other_imports(tmp_path: Path, module: str, number: signal.Signals) -> None:
+    done = interrupted(tmp_path, module, number, 'process_bag', 'bag')
+    assert (done.returncode, done.stderr) == (128 + number, 'process_bag: cancelled; nothing was written\n')
+
+
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+def test_in_the_middle_of_the_work(tmp_path: Path, number: signal.Signals) -> None:
+    """Matplotlib is imported when the maps have been written into the temporary folder."""
+    bag = write_tape(tmp_path / 'bag', tape())
+    before = everything_in(tmp_path)
+    done = interrupted(tmp_path, 'matplotlib', number, 'process_bag', bag, '-q', '-o', tmp_path / 'new' / 'maps')
+    assert (done.returncode, done.stdout) == (128 + number, '')
+    assert done.stderr == 'process_bag: cancelled; nothing was written\n'
+    assert everything_in(tmp_path) == before
+
+
+def test_a_second_signal_does_not_interrupt_the_clean_up(capsys: pytest.CaptureFixture[str]) -> None:
+    cleaned = []
+
+    def body(options: object) -> int:
+        try:
+            signal.raise_signal(signal.SIGINT)
+        finally:
+            signal.raise_signal(signal.SIGINT)
+            signal.raise_signal(signal.SIGTERM)
+            cleaned.append(True)
+        return 0
+
+    before = [signal.getsignal(number) for number in signals.SIGNALS]
+    assert console.run(process_bag.parser(), body, ['bag']) == 130
+    assert cleaned == [True]
+    assert capsys.readouterr().err == 'process_bag: cancelled; nothing was written\n'
+    assert [signal.getsignal(number) for number in signals.SIGNALS] == before
+
+
+def test_signals_that_are_ignored_stay_ignored(capsys: pytest.CaptureFixture[str]) -> None:
+    """As `nohup` and shells without job control have it for commands in the background."""
+
+    def body(options: object) -> int:
+        signal.raise_signal(signal.SIGINT)
+        return 7
+
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        assert console.run(process_bag.parser(), body, ['bag']) == 7
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert capsys.readouterr().err == ''
+
+
+# ---- children
+
+
+def wait_for(what: Callable[[], object], seconds: float = 90.0) -> None:
+    end = time.monotonic() + seconds
+    while not what():
+        assert time.monotonic() < end, 'it did not happen'
+        time.sleep(0.02)
+
+
+def running(command: str, folder: Path) -> list[int]:
+    """Processes of one of our commands whose command line names a folder."""
+    found = []
+    for process in Path('/proc').glob('[0-9]*'):
+        try:
+            words = (process / 'cmdline').read_bytes().decode(errors='replace').split('\0')
+        except OSError:
+            continue
+        if command in words and any(str(folder) in word for word in words):
+            found.append(int(process.name))
+    return found
+
+
+@pytest.mark.skipif(not Path('/proc/self/cmdline').exists(), reason='there is no /proc')
+@pytest.mark.parametrize('number', [signal.SIGTERM, signal.SIGINT, signal.SIGKILL])
+def test_the_demo_leaves_no_node_behind(tmp_path: Path, number: signal.Signals) -> None:
+    pytest.importorskip('rclpy', reason='rclpy is not installed (the extra ros, or a sourced ROS 2)')
+    folder = tmp_path / 'out'
+    command = [sys.executable, '-m', 'forward_grid_mapper', 'demo', '-o', str(folder)]
+    demo = subprocess.Popen(command, env=environment(), stderr=subprocess.PIPE, text=True)
+    try:
+        wait_for(lambda: running('mapper', tmp_path))
+        demo.send_signal(number)
+        _, err = demo.communicate(timeout=60)
+        wait_for(lambda: not running('mapper', tmp_path), 20)
+    finally:
+        demo.kill()
+    if number == signal.SIGKILL:
+        return
+    assert demo.returncode == 128 + number
+    assert err.splitlines()[-1] == 'demo: cancelled; nothing was written'
+    assert 'Traceback' not in err
+    assert everything_in(tmp_path) == []
+
+
+def test_a_child_ends_with_its_parent() -> None:
+    child = start_child(['mapper', '--help'], environment(), stdout=subprocess.DEVNULL)
+    assert child.wait(60) == 0, 'a command that is done does not wait for its parent'
+    assert child.stdin is not None
+    child.stdin.close()
