@@ -1,11 +1,14 @@
 """Sonar occupancy grid maps with forward sensor models (Thrun 2003), for ROS 2 Jazzy.
 
-Rooms, from the bottom up; each imports only from those above it in this list:
+Layers, from the bottom up; each imports only from those that stand above it in this list:
 
-``core``        parameters, association of readings, cone index, EM, live map: numpy and numba only
-``files``       map, report, picture and parameter files
+``core``        from messages to maps: parameters, pose association, sensor model, search, learning; numpy and numba only
+``files``       map, report, picture, journal and parameter files
 ``bags``        reading and writing of ROS 1 and ROS 2 bags through rosbags
 ``simulation``  worlds with a ground truth, simulated sonars, scores
+``recordings``  recorded drives, from bags and journals, as readings
+``replay``      playing a recorded drive to the node
+``node``        the ROS 2 node
 ``commands``    the command lines
 """
 
