@@ -2,7 +2,7 @@
 
 Layers, from the bottom up; each imports only from those that stand above it in this list:
 
-``core``        from messages to maps: parameters, pose association, sensor model, search, learning; numpy and numba only
+``core``        from messages to maps: pose association, sensor model, search, learning; numpy and numba only
 ``files``       map, report, picture, journal and parameter files
 ``bags``        reading and writing of ROS 1 and ROS 2 bags through rosbags
 ``simulation``  worlds with a ground truth, simulated sonars, scores
