@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
@@ -27,6 +28,9 @@ ALLOWED = {
 }
 """Words in code spans that name nothing in the repository, and why they may stand there."""
 
+PAGE_OR_PROGRAM = r'\b(?:docs|benchmarks|config|scripts)/\w+\.(?:md|py|yaml|xml|png)\b'
+"""A page, program or file of parameters as comments and help texts name it."""
+
 of_each_page = pytest.mark.parametrize('page', PAGES, ids=[str(page.relative_to(ROOT)) for page in PAGES])
 
 
@@ -48,6 +52,16 @@ def test_every_link_leads_somewhere(page: Path) -> None:
 @of_each_page
 def test_defaults_are_those_of_the_table(page: Path) -> None:
     assert wrong_defaults(page.read_text(encoding='utf-8')) == []
+
+
+def test_paths_in_sources_exist() -> None:
+    folders = ('forward_grid_mapper', 'benchmarks', 'test', 'config', 'launch', 'scripts')
+    wrong = []
+    for path in (path for folder in folders for path in sorted((ROOT / folder).rglob('*'))):
+        if path.is_file() and path.suffix in ('.py', '.yaml', '.xml', '') and path.name != 'test_docs.py':
+            found = re.findall(PAGE_OR_PROGRAM, path.read_text(encoding='utf-8'))
+            wrong += [f'{name} in {path.relative_to(ROOT)}' for name in found if not (ROOT / name).exists()]
+    assert wrong == []
 
 
 def test_words_that_name_nothing_are_still_in_use() -> None:
