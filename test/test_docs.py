@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 from doc_names import DEPRECATED, PAGES, ROOT, wrong_commands, wrong_defaults, wrong_links, wrong_names
+from test_layers import BELOW, CORE
 
 ALLOWED = {
     '.venv': 'the folder that the scripts set up',
@@ -62,6 +63,14 @@ def test_paths_in_sources_exist() -> None:
             found = re.findall(PAGE_OR_PROGRAM, path.read_text(encoding='utf-8'))
             wrong += [f'{name} in {path.relative_to(ROOT)}' for name in found if not (ROOT / name).exists()]
     assert wrong == []
+
+
+def test_the_readme_lists_all_packages_and_the_layers_of_the_core_in_their_order() -> None:
+    text = (ROOT / 'README.md').read_text(encoding='utf-8')
+    assert ' ← '.join(CORE) in text
+    listed = dict(re.findall(r'^    (\w+)/ +\S.*?(?:← (.*))?$', text, flags=re.MULTILINE))
+    below = {name: set(filter(None, listed[name].split(', '))) for name in BELOW}
+    assert below == {**BELOW, 'commands': {'all of them'}}
 
 
 def test_words_that_name_nothing_are_still_in_use() -> None:
