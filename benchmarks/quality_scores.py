@@ -139,7 +139,7 @@ class Belief(NamedTuple):
 
     @property
     def base(self) -> float:
-        """That of a map that is everywhere at the reading_state of occupied cells."""
+        """That of a map that is everywhere at the fraction of occupied cells."""
         return Belief(np.full(len(self.p), self.occupied.mean()), self.occupied).loss
 
 

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
 from doc_names import DEPRECATED, PAGES, ROOT, wrong_commands, wrong_defaults, wrong_links, wrong_names
+from test_layers import BELOW, CORE
 
 ALLOWED = {
     '.venv': 'the folder that the scripts set up',
@@ -26,6 +28,9 @@ ALLOWED = {
     'drive_NNNN.journal': 'a file that the node makes',
 }
 """Words in code spans that name nothing in the repository, and why they may stand there."""
+
+PAGE_OR_PROGRAM = r'\b(?:docs|benchmarks|config|scripts)/\w+\.(?:md|py|yaml|xml|png)\b'
+"""A page, program or file of parameters as comments and help texts name it."""
 
 of_each_page = pytest.mark.parametrize('page', PAGES, ids=[str(page.relative_to(ROOT)) for page in PAGES])
 
@@ -48,6 +53,24 @@ def test_every_link_leads_somewhere(page: Path) -> None:
 @of_each_page
 def test_defaults_are_those_of_the_table(page: Path) -> None:
     assert wrong_defaults(page.read_text(encoding='utf-8')) == []
+
+
+def test_paths_in_sources_exist() -> None:
+    folders = ('forward_grid_mapper', 'benchmarks', 'test', 'config', 'launch', 'scripts')
+    wrong = []
+    for path in (path for folder in folders for path in sorted((ROOT / folder).rglob('*'))):
+        if path.is_file() and path.suffix in ('.py', '.yaml', '.xml', '') and path.name != 'test_docs.py':
+            found = re.findall(PAGE_OR_PROGRAM, path.read_text(encoding='utf-8'))
+            wrong += [f'{name} in {path.relative_to(ROOT)}' for name in found if not (ROOT / name).exists()]
+    assert wrong == []
+
+
+def test_the_readme_lists_all_packages_and_the_layers_of_the_core_in_their_order() -> None:
+    text = (ROOT / 'README.md').read_text(encoding='utf-8')
+    assert ' ← '.join(CORE) in text
+    listed = dict(re.findall(r'^    (\w+)/ +\S.*?(?:← (.*))?$', text, flags=re.MULTILINE))
+    below = {name: set(filter(None, listed[name].split(', '))) for name in BELOW}
+    assert below == {**BELOW, 'commands': {'all of them'}}
 
 
 def test_words_that_name_nothing_are_still_in_use() -> None:

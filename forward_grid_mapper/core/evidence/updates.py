@@ -7,7 +7,7 @@ W = (1 − p_rand − p_lost) (1 − p_hit)ⁿ and g = N(z; d, σ). Then flippin
     occupy   T' = A + W p_hit g + (T − A) (1 − p_hit)
     free     T' = A + (T − A − W p_hit g) / (1 − p_hit)
 
-and multiplies p(z_t | m) by (c + T') / (c + T) (ALGORITHM §5; it takes the place of eq 39 and 40 of the paper). The log
+and multiplies p(z_t | m) by (c + T') / (c + T) (it takes the place of (39) and (40) of the paper). The log
 of this ratio is the same for all free cells of the free zone (A = 0, g = 0). For the free cells between two occupied
 ones of the band it is that of a straight line in g.
 

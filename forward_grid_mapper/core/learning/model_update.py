@@ -1,6 +1,6 @@
 """Learning of p_hit, p_rand and σ from the expectations (Thrun's outer EM loop); an opt-in.
 
-Given a map, the updates maximise the expected log-likelihood (ALGORITHM §7):
+Given a map, the updates maximise the expected log-likelihood:
 
     p_rand = mean e_*     p_lost = mean e_lost, if it was not 0
     σ²     = Σ e_k (z − d_k)² / Σ e_k over readings with an echo

@@ -1,7 +1,7 @@
 """The geometry of one cone on the lattice: which cells belong to a reading, and how far away they are.
 
 A cell belongs to a cone if its centre lies within the half angle of the axis and within reach. Near the sensor a thin
-cone has no centre in it at all, so the cells that the axis crosses belong too (ALGORITHM §2). In every row of the
+cone has no centre in it at all, so the cells that the axis crosses belong too. In every row of the
 lattice each of the two kinds forms one run, which is found without testing cells one by one.
 
 All lengths here are in cells, relative to the grid's lower left corner.

@@ -46,7 +46,7 @@ UNIT = 2.0**-32
 
 
 def effective_sigma(readings: Readings, model: ModelParameters, resolution: float) -> Floats:
-    """Return each reading's σ in metres: its own or the model's, but not less than half a cell (ALGORITHM §9)."""
+    """Return each reading's σ in metres: its own or the model's, but not less than half a cell."""
     return np.maximum(np.where(readings.sigma > 0, readings.sigma, model.sigma), resolution / 2)
 
 

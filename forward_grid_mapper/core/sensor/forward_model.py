@@ -30,7 +30,7 @@ from .surface_normals import SurfaceNormals, exceeds_incidence_angle, no_normals
 class Expectations:
     """The E-step: the probability of each cause of each reading, given the map. All float64, shape (N,).
 
-    `random` + `lost` + `no_echo` + `hit` is 1 (eq 33-36). `rank` is Σ k·e_k, `squared_error` Σ e_k·(z − d_k)² in m²,
+    `random` + `lost` + `no_echo` + `hit` is 1 (34)-(38). `rank` is Σ k·e_k, `squared_error` Σ e_k·(z − d_k)² in m²,
     `obstacles` K, the number of occupied cells in the cone up to its reach; `log_likelihood` is log p(z | m) in nats.
     """
 
@@ -150,7 +150,7 @@ class ForwardModel:
         return Expectations(*out)
 
     def log_likelihood(self, occupied: NDArray[Any]) -> float:
-        """Return log p(Z | m) in nats: the sum over the logs of the readings."""
+        """Return log p(Z | m) in nats: over all readings, the sum of the log of (26) × (28), summed over the causes."""
         return float(self.expectations(occupied).log_likelihood.sum())
 
 

@@ -1,4 +1,4 @@
-"""Normals of surfaces, and the pairs that are left out where a reading exceeds_incidence_angle one."""
+"""Normals of surfaces, and the pairs that are left out where a reading exceeds the incidence angle."""
 
 from __future__ import annotations
 
