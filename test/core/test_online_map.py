@@ -76,7 +76,8 @@ def test_the_grid_is_that_of_a_batch() -> None:
     assert in_sweeps(some(), Parameters()).grid == maps.grid
 
 
-def test_a_grid_that_grows_in_the_middle_loses_nothing() -> None:
+def test_a_grid_that_grows_in_the_middle_loses_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(online_map, 'REFINE_LEAST', math.inf)
     near = some()
     away = dataclasses.replace(near, x=near.x + 25.0, y=near.y - 18.0, stamp=near.stamp + 10**12)
     online = in_sweeps(near, Parameters())
@@ -128,8 +129,7 @@ def keys_of(online: OnlineMap, readings: Readings) -> list[tuple[float, ...]]:
     out = []
     for i in range(len(readings)):
         fresh = OnlineMap(online._parameters)
-        fresh._sort_out(readings.select(slice(i, i + 1)))
-        out += fresh._kept
+        out += fresh._keys(readings.select(slice(i, i + 1)))
     return out
 
 
@@ -254,7 +254,8 @@ def test_it_is_searched_anew_from_time_to_time(monkeypatch: pytest.MonkeyPatch) 
     often = in_sweeps(some(), Parameters())
     assert often._count == 150 - 2 * 72
     assert consistent(often)
-    monkeypatch.setattr(online_map, 'REFINE_EVERY', math.inf)
+    for name in ('REFINE_EVERY', 'REFINE_LEAST'):
+        monkeypatch.setattr(online_map, name, math.inf)
     never = in_sweeps(some(), Parameters())
     assert never._count == 150
     heights = [online._evidence.log_likelihood for online in (often, never)]
