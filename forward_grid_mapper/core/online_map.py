@@ -93,6 +93,11 @@ class OnlineMap:
         """Return the number of readings kept."""
         return 0 if self._evidence is None else len(self._evidence)
 
+    @property
+    def waiting(self) -> int:
+        """Number of readings added since the map was refined."""
+        return self._count
+
     def add(self, readings: Readings) -> None:
         """Add placed readings and bring the map up to date.
 

@@ -15,6 +15,7 @@ from ..common.parameters import ModelParameters
 from ..common.readings import Readings
 from ..runtime.cancelling import check
 from ..runtime.jit import kernel
+from ..runtime.memory import THREAD_MEMORY
 from ..runtime.threads import parts, run_each
 from ..sensor.cone import rows_of, runs_of
 from ..sensor.cone_table import CONE, Cones, Floats, cone_of, cone_table
@@ -34,9 +35,6 @@ NO_INCIDENCE_LIMIT = 1.5707
 FREE, BAND, LARGEST, WORDS, UNSTORED, UNUSED = range(6)
 """Of the totals: pairs in free zones and in bands, cells of the largest cone, words given to readings, readings not
 stored, and those of the words that no reading uses any more."""
-
-THREAD_MEMORY = 64_000_000
-"""Bytes that the arrays of all threads but the first may take together; on larger maps fewer threads work."""
 
 MOST_UNUSED = 0.25
 """Part of the words given to readings that may be out of use before all pairs are packed anew."""
@@ -278,8 +276,9 @@ class Evidence:
         self._reserve(end)
         s = self.state
         s.cones[begin:end], s.reading_states[begin:end] = cones, reading_states
-        repeated = s.cones[again]
-        since = united(self._since, box_of(s.cones[begin:end], self.grid), box_of(repeated, self.grid))
+        # what the first ones tell of normals is known before their pairs are made
+        later = s.cones[begin:end] if begin else s.cones[:0], s.cones[again]
+        since = united(self._since, *(box_of(cones, self.grid) for cones in later))
         before = self._index_so_far()
         try:
             if not begin and self.model.grazing_angle < NO_INCIDENCE_LIMIT:
@@ -297,9 +296,8 @@ class Evidence:
             raise
         self._size = end
         if self._sums is not None:
-            # the first ones are in it already
-            for table in (s.cones[begin:end] if begin else s.cones[:0], repeated):
-                self._keep_bearings(table)
+            for cones in later:
+                self._keep_bearings(cones)
             self._since = since
 
     def add_multiplicity(self, readings: NDArray[np.int64]) -> None:
