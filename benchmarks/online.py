@@ -5,7 +5,8 @@ usage: online.py [--only latency quality standing] [--seeds 3]
 
 latency   milliseconds a sweep while the robot drives, with 50 000 and 200 000 readings stored. Readings that say the
           same as one before are merged; once as is, and once with that switched off, so that every reading is stored.
-quality   F1 and log-likelihood of the online map against those of EM on the same readings, with and without merging
+quality   F1 and log-likelihood of the online map against those of EM on the same readings, with and without merging:
+          of simulated drives, and of the recordings under ../shared/data, where they are, fed 8 readings at a time
 standing  a robot stands still for an hour at 20 sweeps a second
 """
 
@@ -15,10 +16,13 @@ import argparse
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import NamedTuple
 
 import numpy as np
 from measuring import in_own_process, machine, memory_in_use
 from numpy.typing import NDArray
+from quality_scores import score
+from quality_worlds import recorded_cases, scoring_tool
 
 from forward_grid_mapper.commands.demo import SURFACE_DEPTH
 from forward_grid_mapper.core import online_map
@@ -37,6 +41,9 @@ SONARS = 24
 MEASURED = 500
 """Sweeps that are timed once the readings are stored."""
 
+RECORDED_SONARS = 8
+"""Readings of the recordings that are fed at a time."""
+
 RATE = 20
 """Sweeps a second of the robot that stands."""
 
@@ -53,25 +60,45 @@ def merging(on: bool) -> Iterator[None]:
         online_map.SAME_PLACE, online_map.SAME_RANGE = before
 
 
-def sweeps(readings: Readings) -> Iterator[Readings]:
+def sweeps(readings: Readings, size: int = SONARS) -> Iterator[Readings]:
     """Return the readings sweep by sweep."""
-    for first in range(0, len(readings), SONARS):
-        yield readings.select(slice(first, first + SONARS))
+    for first in range(0, len(readings), size):
+        yield readings.select(slice(first, first + size))
 
 
-def feed(online: OnlineMap, readings: Readings) -> NDArray[np.float64]:
-    """Add readings sweep by sweep; return the milliseconds that each took."""
-    taken = []
-    for sweep in sweeps(readings):
+class Times(NamedTuple):
+    """Milliseconds that sweeps took, shape (N,), and whether the map was refined then."""
+
+    taken: NDArray[np.float64]
+    refined: NDArray[np.bool_]
+
+    @property
+    def sweep(self) -> str:
+        """Median, 95th and 99th percentile and maximum of all sweeps."""
+        return spread(self.taken)
+
+    @property
+    def refinement(self) -> str:
+        """Median, 95th percentile and maximum of those in which the map was refined."""
+        return spread(self.taken[self.refined], (50, 95, 100))
+
+
+def feed(online: OnlineMap, readings: Readings, size: int = SONARS) -> Times:
+    """Add readings sweep by sweep."""
+    taken, refined = [], []
+    for sweep in sweeps(readings, size):
         begin = time.perf_counter()
         online.add(sweep)
         taken.append(time.perf_counter() - begin)
-    return 1000 * np.array(taken)
+        refined.append(online.waiting == 0)
+    return Times(1000 * np.array(taken), np.array(refined))
 
 
-def spread(milliseconds: NDArray[np.float64]) -> str:
-    """Return median, 95th and 99th percentile and maximum."""
-    return ''.join(f'{np.percentile(milliseconds, part):8.2f}' for part in (50, 95, 99, 100))
+def spread(milliseconds: NDArray[np.float64], shares: tuple[int, ...] = (50, 95, 99, 100)) -> str:
+    """Return percentiles; 100 is the maximum."""
+    if not len(milliseconds):
+        return f'{"-":>8s}' * len(shares)
+    return ''.join(f'{np.percentile(milliseconds, share):8.2f}' for share in shares)
 
 
 def corridor(passes: int) -> Readings:
@@ -93,18 +120,19 @@ def latencies(drive: Callable[[int], Readings], rounds: int, stored: int, merge:
         online = OnlineMap(Parameters())
         feed(online, readings.select(slice(0, before)))
         kept = len(online)
-        taken = feed(online, readings.select(slice(before, before + MEASURED * SONARS)))
+        times = feed(online, readings.select(slice(before, before + MEASURED * SONARS)))
     begin = time.perf_counter()
     online.maps()
-    return before, kept, spread(taken), 1000 * (time.perf_counter() - begin)
+    return before, kept, times.sweep + times.refinement, 1000 * (time.perf_counter() - begin)
 
 
 def latency(seeds: int) -> None:
     """Print times a sweep."""
-    print(f'\nMilliseconds a sweep of {SONARS} sonars, {MEASURED} sweeps; maps: to read out both maps once')
+    print(f'\nMilliseconds a sweep of {SONARS} sonars, {MEASURED} sweeps, and of those in which the map was refined;')
+    print('maps: to read out both maps once')
     print(
-        f'{"":12s}{"merging":>9s}{"given":>9s}{"stored":>9s}{"p50":>8s}{"p95":>8s}{"p99":>8s}{"max":>8s}{"maps":>8s}'
-        f'   p95 should be at most'
+        f'{"":12s}{"merging":>9s}{"given":>9s}{"stored":>9s}{"p50":>8s}{"p95":>8s}{"p99":>8s}{"max":>8s}'
+        f'{"refine":>8s}{"p95":>8s}{"max":>8s}{"maps":>8s}   p95 should be at most'
     )
     for name, drive, rounds in (('corridor', corridor, (6, 18)), ('building', building, (2, 6))):
         for merge in (False, True):
@@ -138,7 +166,7 @@ def quality(seeds: int) -> None:
                 batch = Mapper(parameters).run(readings)
                 with merging(merge):
                     online = OnlineMap(parameters)
-                    taken = feed(online, readings)
+                    times = feed(online, readings)
                 grid, ml, _ = online.maps()
                 rows.append(
                     (
@@ -148,13 +176,32 @@ def quality(seeds: int) -> None:
                         score_map(ml, grid, world, visible).f1,
                         log_likelihood(readings, batch.grid, batch.ml, parameters.model) / len(readings),
                         log_likelihood(readings, grid, ml, parameters.model) / len(readings),
-                        np.percentile(taken, 95),
+                        np.percentile(times.taken, 95),
                     )
                 )
             given, kept, f1, online_f1, j, online_j, p95 = np.mean(rows, axis=0)
             print(
                 f'{name + ("" if merge else ", all"):22s}{given:9.0f}{kept:9.0f}{f1:8.3f}{online_f1:8.3f}'
                 f'{j:9.4f}{online_j:8.4f}{p95:14.2f}',
+                flush=True,
+            )
+    tool = scoring_tool()
+    for case in recorded_cases(tool) if tool else ():
+        batch = Mapper(parameters).run(case.readings)
+        for merge in (True, False):
+            with merging(merge):
+                online = OnlineMap(parameters)
+                times = feed(online, case.readings, RECORDED_SONARS)
+            grid, ml, _ = online.maps()
+            likelihoods = (
+                log_likelihood(case.readings, *found, parameters.model) / len(case.readings)
+                for found in ((batch.grid, batch.ml), (grid, ml))
+            )
+            print(
+                f'{case.group + ("" if merge else ", all"):22s}{len(case.readings):9d}{len(online):9d}'
+                f'{score(batch.ml, batch.grid, case, tool).f1:8.3f}{score(ml, grid, case, tool).f1:8.3f}'
+                + ''.join(f'{value:{width}.4f}' for value, width in zip(likelihoods, (9, 8), strict=True))
+                + f'{np.percentile(times.taken, 95):14.2f}',
                 flush=True,
             )
 
@@ -186,9 +233,9 @@ def standing(seeds: int) -> None:
             half_angle=sonars.field_of_view / 2,
             sensor=np.tile(np.arange(SONARS), len(ranges) // SONARS),
         )
-        taken = feed(online, readings)
+        times = feed(online, readings)
         print(
-            f'{minutes:9d}{60 * RATE * minutes:9d}{len(online):9d}{spread(taken)}{memory_in_use() / 1e6:12.1f}',
+            f'{minutes:9d}{60 * RATE * minutes:9d}{len(online):9d}{times.sweep}{memory_in_use() / 1e6:12.1f}',
             flush=True,
         )
     occupied = int((online.maps()[1] == 1).sum())

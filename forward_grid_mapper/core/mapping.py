@@ -106,7 +106,7 @@ class Mapper:
         watch : callable
             Called from this thread as the work goes on.
         start : Grid and int8, optional
-            A map to start the search from, 1 where occupied; by default the empty one.
+            A map to start the search from, 1 where occupied, as in `MapSet.searched`; by default the empty one.
 
         Raises
         ------
@@ -181,6 +181,7 @@ class Mapper:
             log_likelihood=log_likelihood,
             objective=log_likelihood + log_prior(prior, occupied.ravel(), patterns(occupied, given.grid.shape)),
             parameters=p,
+            searched=evidence.observed(),
             dynamic=dynamic_echoes(forward, unexplained, ml),
             normals=forward.normals,
             statistics=self._statistics(evidence, found) | {'occupied': int(occupied.sum())},

@@ -1,8 +1,9 @@
 """The forward map kept up to date while the robot drives.
 
 New readings change the evidence of the cells of their cones. Only there, and as far around as flips reach, cells are
-flipped until nothing gains any more. From time to time the surroundings are searched in all ways that a batch has, at
-first as if cells were independent: lines would hold on to what few readings seemed to say.
+flipped until nothing gains any more. From time to time the map is refined: surface normals are estimated from all
+readings again, the pairs that this changes are made anew, and the surroundings are searched in all ways that a batch
+has, at first as if cells were independent: lines would hold on to what few readings seemed to say.
 
 Readings that say the same, from the same place, are counted and not kept: the same sensor, its pose within a fraction
 of a cell and of its half angle, and the range within a fraction of σ. So a robot that stands still for hours adds
@@ -11,13 +12,14 @@ weight to what is known, but no memory and no time.
 
 from __future__ import annotations
 
-import dataclasses
 import math
+from collections.abc import Iterable
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .common.grid import Grid, part_of
+from .common.grid import Grid, Window, part_of, united
 from .common.parameters import Parameters
 from .common.readings import Readings
 from .evidence.evidence import Evidence
@@ -29,7 +31,7 @@ from .runtime.memory import memory_for_pairs
 from .runtime.threads import cores
 from .search.flips import flip_in_order, promising
 from .search.prior import Prior, local_prior, odds_given_neighbours, shapes
-from .search.search import LEAST, Search, Window
+from .search.search import LEAST, Search
 from .sensor.cone_table import effective_sigma, grid_of
 
 SAME_PLACE = 0.5
@@ -45,10 +47,26 @@ MOST_SWEEPS = 50
 """Bound on the sweeps after one call; what is left then is done after the next."""
 
 REFINE_EVERY = 1000
-"""Readings after which the surroundings of the robot are searched as a batch would."""
+"""Readings after which the map is refined, at most."""
+
+REFINE_SHARE = 0.05
+"""Of the readings kept, how many may come until the map is refined: while they are few, each tells much of surface
+normals, and it takes little time."""
+
+REFINE_LEAST = 50
+"""Readings below which it is not refined."""
 
 MANY = 5000
 """New readings for which a whole search is faster."""
+
+
+class _Traversed(NamedTuple):
+    """What new readings tell of the cells that the robot drove over: some of the grid, and their prior."""
+
+    near: tuple[slice, slice]
+    cells: NDArray[np.bool_]
+    prior: NDArray[np.float64]
+    last: tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]
 
 
 class OnlineMap:
@@ -63,76 +81,79 @@ class OnlineMap:
         self._evidence: Evidence | None = None
         self._kept: dict[tuple[float, ...], int] = {}
         self._traversed = np.zeros((0, 0), np.bool_)
-        self._since: list[Window] = []
+        self._since: Window | None = None
         self._count = 0
         self._prior = Prior(np.zeros(0), shapes(self._parameters.search))
         self._last = np.zeros(0), np.zeros(0), np.zeros(0, np.int64)
         self.grid = Grid(self._parameters.grid.resolution, 0, 0, 0, 0)
+        self.taken = 0
+        """Readings added, those that were merged with others included."""
 
     def __len__(self) -> int:
         """Return the number of readings kept."""
         return 0 if self._evidence is None else len(self._evidence)
 
+    @property
+    def waiting(self) -> int:
+        """Number of readings added since the map was refined."""
+        return self._count
+
     def add(self, readings: Readings) -> None:
         """Add placed readings and bring the map up to date.
+
+        The readings are taken all or not at all; `taken` tells. In either case the map can go on: what an error leaves
+        undone of the search is done after the next call.
 
         Raises
         ------
         InputError
             If the grid would exceed `max_cells`; nothing is changed.
+        MemoryError
         """
         if not len(readings):
             return
-        p = self._parameters
-        self.grid = map_grid(readings, p, within=self.grid)
-        evidence = self._with_room()
-        if p.search.driven_cost > 0:
-            self._mark_traversed(readings, evidence.grid)
-        new, known = self._sort_out(readings)
-        evidence.extend(readings.select(new))
-        # after the new ones, which may be what others of the same call say too
-        if len(known):
-            evidence.add_multiplicity(known)
-        if len(new) > MANY:
-            Search(evidence, p.search, self._traversed.ravel()).run()
-        else:
-            window = self._around(evidence.grid, readings)
+        grid = map_grid(readings, self._parameters, within=self.grid)
+        evidence = self._with_room(grid)
+        window = self._around(evidence.grid, readings)
+        traversed = self._newly_traversed(readings, evidence.grid)
+        before = len(evidence)
+        self._insert(evidence, readings)
+        self.grid, self.taken, self._count = grid, self.taken + len(readings), self._count + len(readings)
+        self._since = united(self._since, window)
+        if traversed:
+            self._traversed[traversed.near] = traversed.cells
+            self._prior.local.reshape(evidence.grid.shape)[traversed.near] = traversed.prior
+            self._last = traversed.last
+        if len(evidence) - before > MANY:
+            self._search(evidence)
+        elif self._count >= min(REFINE_EVERY, max(REFINE_LEAST, REFINE_SHARE * len(evidence))):
             self._settle(evidence, window)
-            self._since.append(window)
-            self._count += len(readings)
-            if self._count >= REFINE_EVERY:
-                self._refine(evidence)
+            self._refine(evidence)
+        else:
+            self._settle(evidence, window)
 
-    def _refine(self, evidence: Evidence) -> None:
-        """Search around all readings since this was done last, in all ways that a search has."""
-        bottom, top, left, right = zip(*self._since, strict=True)
-        window = min(bottom), max(top), min(left), max(right)
-        Search(evidence, self._parameters.search, self._traversed.ravel(), window).refine()
-        self._since.clear()
-        self._count = 0
+    def _insert(self, evidence: Evidence, readings: Readings) -> None:
+        """Add readings to the evidence, those that say the same as another one as its multiplicity; all or none."""
+        new: list[int] = []
+        known: list[int] = []
+        fresh: dict[tuple[float, ...], int] = {}
+        for i, key in enumerate(self._keys(readings)):
+            kept = self._kept.get(key, fresh.get(key, -1))
+            if kept < 0:
+                fresh[key] = len(self._kept) + len(fresh)
+                new.append(i)
+            else:
+                known.append(kept)
+        try:
+            self._kept.update(fresh)
+            evidence.extend(readings.select(np.array(new, np.int64)), np.array(known, np.int64))
+        except BaseException:
+            for key in fresh:
+                self._kept.pop(key, None)
+            raise
 
-    def adopt(self, grid: Grid, ml: NDArray[np.int8]) -> None:
-        """Go on from another map of the same readings, 1 where occupied; cells that it does not have are free."""
-        if self._evidence is not None:
-            self._evidence.state.maps.occupied[:] = (part_of(grid, ml, self._evidence.grid) == 1).ravel()
-            self._evidence.rebuild()
-
-    def _mark_traversed(self, readings: Readings, grid: Grid) -> None:
-        """Note the cells that sensors were moved over, from the last reading on."""
-        x, y, stamp = (
-            np.r_[old, new] for old, new in zip(self._last, (readings.x, readings.y, readings.stamp), strict=True)
-        )
-        mark_traversed(x, y, stamp, grid, self._traversed)
-        rows, columns = grid.cells_of(x, y)
-        # the last reading may be one of before a jump, off this grid
-        rows, columns = rows.clip(0, grid.height - 1), columns.clip(0, grid.width - 1)
-        near = (slice(rows.min(), rows.max() + 1), slice(columns.min(), columns.max() + 1))
-        self._prior.local.reshape(grid.shape)[near] = local_prior(self._parameters.search, self._traversed[near])
-        n = STRIDES[-1]
-        self._last = x[-n:], y[-n:], stamp[-n:]
-
-    def _sort_out(self, readings: Readings) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return which readings are new, and for the others which kept reading says the same."""
+    def _keys(self, readings: Readings) -> Iterable[tuple[float, ...]]:
+        """Return a key for each reading, which it shares with those that say the same."""
         p = self._parameters
         sigma = effective_sigma(readings, p.model, p.grid.resolution)
         place = SAME_PLACE * p.grid.resolution
@@ -147,39 +168,83 @@ class OnlineMap:
             readings.half_angle,
             sigma,
         )
-        new: list[int] = []
-        known: list[int] = []
-        for i, key in enumerate(zip(*(column.tolist() for column in columns), strict=True)):
-            kept = self._kept.setdefault(key, len(self._kept))
-            if kept == len(self) + len(new):
-                new.append(i)
-            else:
-                known.append(kept)
-        return np.array(new, np.int64), np.array(known, np.int64)
+        return zip(*(column.tolist() for column in columns), strict=True)
 
-    def _with_room(self) -> Evidence:
-        evidence, g = self._evidence, self.grid
+    def _search(self, evidence: Evidence) -> None:
+        """Search the whole map as a batch does."""
+        evidence.renew_normals()
+        Search(evidence, self._parameters.search, self._traversed.ravel()).run()
+        self._since, self._count = None, 0
+
+    def _refine(self, evidence: Evidence) -> None:
+        """Renew the surface normals, and search around what changed since in all ways that a search has."""
+        self._since = united(self._since, evidence.renew_normals())
+        Search(evidence, self._parameters.search, self._traversed.ravel(), self._since).refine()
+        self._since, self._count = None, 0
+
+    def adopt(self, grid: Grid, searched: NDArray[np.int8]) -> None:
+        """Go on from another map of the same readings.
+
+        Parameters
+        ----------
+        grid : Grid
+        searched : int8, shape `grid.shape`
+            1 where occupied, as in `MapSet.searched`; cells that it does not have are free.
+        """
+        if self._evidence is not None:
+            self._evidence.state.maps.occupied[:] = (part_of(grid, searched, self._evidence.grid) == 1).ravel()
+            self._evidence.rebuild()
+
+    def searched(self) -> tuple[Grid, NDArray[np.int8]]:
+        """Return the grid and the map to start another search from, as in `MapSet.searched`."""
+        if self._evidence is None:
+            return self.grid, np.zeros((0, 0), np.int8)
+        return self.grid, self._evidence.observed()[self._evidence.grid.window(self.grid)]
+
+    def _newly_traversed(self, readings: Readings, grid: Grid) -> _Traversed | None:
+        """Return the cells that sensors were moved over, from the last reading on; nothing is changed yet."""
+        p = self._parameters.search
+        if p.driven_cost <= 0:
+            return None
+        x, y, stamp = (
+            np.r_[old, new] for old, new in zip(self._last, (readings.x, readings.y, readings.stamp), strict=True)
+        )
+        rows, columns = grid.cells_of(x, y)
+        # the last reading may be one of before a jump, off this grid
+        rows, columns = rows.clip(0, grid.height - 1), columns.clip(0, grid.width - 1)
+        bottom, left = int(rows.min()), int(columns.min())
+        near = (slice(bottom, int(rows.max()) + 1), slice(left, int(columns.max()) + 1))
+        cells = self._traversed[near].copy()
+        part = Grid(grid.resolution, grid.column + left, grid.row + bottom, cells.shape[1], cells.shape[0])
+        mark_traversed(x, y, stamp, part, cells)
+        n = STRIDES[-1]
+        return _Traversed(near, cells, local_prior(p, cells), (x[-n:], y[-n:], stamp[-n:]))
+
+    def _with_room(self, g: Grid) -> Evidence:
+        """Return the evidence, on a grid that holds `g`."""
+        evidence = self._evidence
         if evidence is not None and evidence.grid.union(g) == evidence.grid:
             return evidence
         margin = MARGIN + max(g.width, g.height) // 4
         larger = Grid(g.resolution, g.column - margin, g.row - margin, g.width + 2 * margin, g.height + 2 * margin)
         p = self._parameters
-        if evidence is None:
-            # surfaces would have to be faced anew as readings come
-            model = dataclasses.replace(p.model, grazing_angle=math.pi / 2)
-            threads = p.search.threads or cores()
-            self._evidence = evidence = Evidence(larger, model, memory_for_pairs(p), threads)
-            self._traversed = np.zeros(larger.shape, np.bool_)
-        else:
+        if evidence is not None:
             larger = larger.union(evidence.grid)
+        traversed = np.zeros(larger.shape, np.bool_)
+        if evidence is not None:
             inner = larger.window(evidence.grid)
-            traversed = np.zeros(larger.shape, np.bool_)
             traversed[inner] = self._traversed
-            self._traversed = traversed
-            up, right = inner[0].start, inner[1].start
-            self._since = [(a + up, b + up, c + right, d + right) for a, b, c, d in self._since]
+        prior = self._prior._replace(local=local_prior(p.search, traversed).ravel())
+        if evidence is None:
+            threads = p.search.threads or cores()
+            evidence = Evidence(larger, p.model, memory_for_pairs(p), threads, renewable=True)
+        else:
             evidence.grow(larger)
-        self._prior = self._prior._replace(local=local_prior(p.search, self._traversed).ravel())
+            if self._since:
+                up, right = inner[0].start, inner[1].start
+                a, b, c, d = self._since
+                self._since = a + up, b + up, c + right, d + right
+        self._evidence, self._traversed, self._prior = evidence, traversed, prior
         return evidence
 
     def _around(self, grid: Grid, readings: Readings) -> Window:

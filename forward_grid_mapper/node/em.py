@@ -19,6 +19,7 @@ from ..core.mapping import Mapper
 from ..core.maps.log_odds_map import map_grid
 from ..core.maps.map_set import MapSet
 from ..core.runtime.memory import shortage
+from ..core.runtime.threads import cores
 from ..core.search.search import Progress
 from ..files.quality_warning import quality_warning
 
@@ -105,7 +106,7 @@ class EmWorker:
 
         try:
             cells = map_grid(run.readings, parameters).size
-            if lack := shortage(cells, len(run.readings)):
+            if lack := shortage(cells, len(run.readings), parameters.search.threads or cores()):
                 raise InputError(lack)
             outcome = Outcome(run.mapper.run(run.readings, watch, run.start), '')
         except Cancelled:

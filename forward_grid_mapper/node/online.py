@@ -59,13 +59,13 @@ class OnlineWorker:
     def adopt(self, maps: MapSet) -> None:
         """Go on from the map that EM found."""
         with self._using:
-            self._map.adopt(maps.grid, maps.ml)
+            self._map.adopt(maps.grid, maps.searched)
 
     def so_far(self) -> tuple[Grid, NDArray[np.int8]] | None:
-        """Return the grid and a copy of the ML map, or None if there is none yet."""
+        """Return the grid and a copy of the map to start EM from, or None if there is none yet."""
         with self._using:
-            grid, ml, _ = self._map.maps()
-        return (grid, ml) if grid.size else None
+            grid, searched = self._map.searched()
+        return (grid, searched) if grid.size else None
 
     @property
     def kept(self) -> int:

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+import importlib.util
 import math
+from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 import pytest
+from failing import Allocations
 
 from conftest import PLAIN, random_readings
 from forward_grid_mapper.core import online_map
@@ -18,6 +22,9 @@ from forward_grid_mapper.core.evidence.evidence import Evidence
 from forward_grid_mapper.core.evidence.neighbourhood import patterns
 from forward_grid_mapper.core.mapping import Mapper
 from forward_grid_mapper.core.online_map import MARGIN, OnlineMap
+from forward_grid_mapper.core.runtime import threads
+from forward_grid_mapper.core.sensor.cone_table import walk
+from forward_grid_mapper.recordings.read_drive import read_drive
 from forward_grid_mapper.simulation.drive import Recording, corridor_drive, door_drive
 from forward_grid_mapper.simulation.score import score_map, visible_surface
 from forward_grid_mapper.simulation.sonar import NOISY
@@ -76,7 +83,8 @@ def test_the_grid_is_that_of_a_batch() -> None:
     assert in_sweeps(some(), Parameters()).grid == maps.grid
 
 
-def test_a_grid_that_grows_in_the_middle_loses_nothing() -> None:
+def test_a_grid_that_grows_in_the_middle_loses_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(online_map, 'REFINE_LEAST', math.inf)
     near = some()
     away = dataclasses.replace(near, x=near.x + 25.0, y=near.y - 18.0, stamp=near.stamp + 10**12)
     online = in_sweeps(near, Parameters())
@@ -128,8 +136,7 @@ def keys_of(online: OnlineMap, readings: Readings) -> list[tuple[float, ...]]:
     out = []
     for i in range(len(readings)):
         fresh = OnlineMap(online._parameters)
-        fresh._sort_out(readings.select(slice(i, i + 1)))
-        out += fresh._kept
+        out += fresh._keys(readings.select(slice(i, i + 1)))
     return out
 
 
@@ -254,7 +261,8 @@ def test_it_is_searched_anew_from_time_to_time(monkeypatch: pytest.MonkeyPatch) 
     often = in_sweeps(some(), Parameters())
     assert often._count == 150 - 2 * 72
     assert consistent(often)
-    monkeypatch.setattr(online_map, 'REFINE_EVERY', math.inf)
+    for name in ('REFINE_EVERY', 'REFINE_LEAST'):
+        monkeypatch.setattr(online_map, name, math.inf)
     never = in_sweeps(some(), Parameters())
     assert never._count == 150
     heights = [online._evidence.log_likelihood for online in (often, never)]
@@ -274,3 +282,167 @@ def test_readings_that_say_the_same_may_come_in_one_call() -> None:
     weights = [state.reading_states['multiplicity'][:kept].tolist() for state in states]
     assert weights[0] == weights[1]
     assert sum(weights[0]) == len(twice)
+
+
+def fed(parts: list[Readings], values: dict[str, float]) -> OnlineMap:
+    online = OnlineMap(Parameters.from_flat(values))
+    for part in parts:
+        online.add(part)
+    return online
+
+
+def kept_of(online: OnlineMap) -> list[object]:
+    """Everything that is kept for readings and cells, cell by cell of the map's grid."""
+    evidence = online._evidence
+    s, n = evidence.state, len(online)
+    window = evidence.grid.window(online.grid)
+    cells = [getattr(s.maps, name).reshape(evidence.grid.shape)[window].tolist() for name in s.maps._fields]
+    columns = [s.reading_states[name][:n].tolist() for name in ('multiplicity', 'occupy', 'release', 'likelihood')]
+    normals = s.normals.known.reshape(evidence.grid.shape)[window].tolist() if len(s.normals.known) else []
+    return [cells, columns, normals, online._traversed[window].tolist(), online._kept, online.taken, online._count]
+
+
+@pytest.mark.parametrize('case', ['first', 'more', 'grown', 'refined', 'many'])
+def test_a_call_that_finds_no_memory_takes_nothing_or_all(monkeypatch: pytest.MonkeyPatch, case: str) -> None:
+    monkeypatch.setattr(online_map, 'REFINE_LEAST', 60)
+    monkeypatch.setattr(online_map, 'MANY', 50 if case == 'many' else 5000)
+    monkeypatch.setattr(threads, 'LEAST_PART', 20)
+    # one in three says what another one said
+    readings = some(3, 100)
+    readings = readings.select(np.r_[0:100, 0:50])
+    parts = [readings.select(slice(k, k + 24)) for k in range(0, 144, 24)]
+    if case == 'grown':
+        parts[2] = dataclasses.replace(parts[2], x=parts[2].x + 25.0, stamp=parts[2].stamp + 10**12)
+    if case == 'many':
+        parts = [parts[0], readings.select(slice(24, 100)), parts[5]]
+    at = {'first': 0, 'more': 1, 'grown': 2, 'refined': 2, 'many': 1}[case]
+    values = {'threads': 3}
+    whole = fed(parts, values)
+    allocations = Allocations(monkeypatch)
+    refused = searched_later = 0
+    for which in range(1, 10_000):
+        online = fed(parts[:at], values)
+        taken = online.taken
+        try:
+            with allocations.failing(which):
+                online.add(parts[at])
+        except MemoryError:
+            pass
+        done = allocations.count < which
+        if online._evidence is not None:
+            assert consistent(online)
+            assert online._evidence.state.reading_states['multiplicity'][: len(online)].sum() == online.taken
+        assert len(online._kept) == len(online)
+        assert online.taken in (taken, taken + len(parts[at]))
+        accepted = online.taken > taken
+        if not accepted:
+            refused += 1
+            online.add(parts[at])
+        searched_later += accepted and not done
+        for part in parts[at + 1 :]:
+            online.add(part)
+        if not accepted or done:
+            assert kept_of(online) == kept_of(whole)
+            assert same(online, whole)
+        assert consistent(online)
+        assert online.taken == whole.taken
+        assert kept_of(online)[4] == kept_of(whole)[4]
+        if done:
+            break
+    assert refused > 15
+    assert searched_later or case == 'first'
+
+
+def test_cells_count_merged_readings_as_often_as_they_came(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(online_map, 'REFINE_LEAST', 60)
+    readings = some(4, 200)
+    online = in_sweeps(readings.select(np.r_[0:200, 0:120, 40:200]), Parameters())
+    assert online._evidence.state.normals.known.any()
+    away = dataclasses.replace(readings.select(slice(0, 24)), x=readings.x[:24] + 30.0)
+    online.add(away)
+    evidence = online._evidence
+    assert 0 < len(online) < online.taken
+    times = evidence.state.reading_states['multiplicity'][: len(online)].astype(np.int64)
+    cones = evidence.state.cones
+    counted = np.zeros(evidence.grid.size, np.int64)
+    cells, distances = np.empty(50_000, np.int32), np.empty(50_000)
+    for t in range(len(online)):
+        n = walk(cones, t, evidence.grid.shape, cells, distances)
+        counted[cells[:n]] += times[t]
+    assert np.array_equal(evidence.state.maps.seen, counted)
+    # so does the guard against rounding
+    assert counted.max() > (times > 0).sum() / 4
+
+
+@pytest.mark.parametrize('drive', ['door', 'corridor'])
+def test_the_map_that_was_searched_can_go_round_for_ever(drive: str) -> None:
+    recording = door_drive(3, NOISY) if drive == 'door' else corridor_drive()
+    readings = recording.readings.select(slice(0, 3000))
+    parameters = Parameters()
+    first = maps = Mapper(parameters).run(readings)
+    assert first.searched.shape == first.grid.shape
+    # walls are drawn out once
+    assert (first.searched == 1).sum() < (first.ml == 1).sum()
+    for _ in range(3):
+        maps = Mapper(parameters).run(readings, start=(maps.grid, maps.searched))
+        assert np.array_equal(maps.ml, first.ml)
+        assert np.array_equal(maps.searched, first.searched)
+        assert maps.objective == first.objective
+    online = in_sweeps(readings, parameters)
+    online.adopt(first.grid, first.searched)
+    counts = set()
+    for _ in range(3):
+        grid, searched = online.searched()
+        online.adopt(grid, searched)
+        counts.add((int((searched == 1).sum()), int((online.maps()[1] == 1).sum())))
+    assert len(counts) == 1
+    assert counts.pop()[0] == (first.searched == 1).sum()
+
+
+def test_normals_follow_the_readings() -> None:
+    readings = door_drive(3, NOISY, seed=0).readings
+    online = in_sweeps(readings, Parameters(), 8)
+    online._refine(online._evidence)
+    evidence = online._evidence
+    # as if all had come at once
+    kept = Evidence(evidence.grid, evidence.model, start=evidence.state.maps.occupied.reshape(evidence.grid.shape))
+    first: dict[int, int] = {}
+    for i, key in enumerate(keys_of(online, readings)):
+        first.setdefault(online._kept[key], i)
+    times = evidence.state.reading_states['multiplicity'][: len(online)]
+    kept.extend(readings.select(np.repeat([first[k] for k in range(len(online))], times)))
+    for name in ('known', 'x', 'y', 'before'):
+        assert np.array_equal(getattr(kept.state.normals, name), getattr(evidence.state.normals, name))
+    for name in ('evidence', 'seen', 'pattern'):
+        assert np.array_equal(getattr(kept.state.maps, name), getattr(evidence.state.maps, name))
+    assert kept.log_likelihood == evidence.log_likelihood
+    assert evidence.state.normals.known.sum() > 100
+
+
+def scoring_tool(shared: Path) -> ModuleType:
+    for needed in ('scipy', 'PIL'):
+        pytest.importorskip(needed)
+    spec = importlib.util.spec_from_file_location('score_map', shared / 'tools' / 'score_map.py')
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.mark.parametrize('name', ['office_a', 'office_b'])
+def test_a_recording_fed_in_sweeps_is_mapped_as_well_as_by_a_batch(shared: Path, name: str) -> None:
+    tool, folder = scoring_tool(shared), shared / 'data' / name
+    truth, origin, resolution = tool.load(folder / 'reference.yaml')
+    path_xy = np.loadtxt(folder / 'trajectory.csv', delimiter=',', ndmin=2)
+    readings = read_drive(folder / 'bag', Parameters(), {}, odom_topic='/odom_corrected').associator.readings
+
+    def f1(grid: Grid, ml: np.ndarray) -> float:
+        values = np.where(ml < 0, np.nan, ml)
+        p = tool.resample(values, np.array(grid.origin), grid.resolution, truth.shape, origin, resolution)
+        path = tool.path_cells(path_xy, origin, resolution, truth.shape)
+        return float(tool.score(p, truth, path, resolution)['f1'])
+
+    batch = Mapper(Parameters()).run(readings)
+    grid, ml, _ = in_sweeps(readings, Parameters(), 8).maps()
+    assert f1(grid, ml) > f1(batch.grid, batch.ml) - 0.02

@@ -52,5 +52,5 @@ def test_a_run_that_fails_says_why_and_the_next_begins(
 
 def test_a_run_that_cannot_fit_does_not_begin(monkeypatch: pytest.MonkeyPatch) -> None:
     worker = EmWorker(lambda run: None, print)
-    monkeypatch.setattr(em, 'shortage', lambda cells, readings: 'there is no space')
+    monkeypatch.setattr(em, 'shortage', lambda cells, readings, threads: 'there is no space')
     assert outcome_of(worker) == Outcome(None, 'there is no space')

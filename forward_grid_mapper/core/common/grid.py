@@ -155,6 +155,18 @@ def cone_boxes(
 
 UNKNOWN = -1
 
+Window = tuple[int, int, int, int]
+"""Some cells of a grid: first row, last one plus one, first column, last one plus one."""
+
+
+def united(*windows: Window | None) -> Window | None:
+    """Return the smallest window that holds all of `windows`; None stands for no cell."""
+    bounds = [window for window in windows if window]
+    if not bounds:
+        return None
+    bottom, top, left, right = zip(*bounds, strict=True)
+    return min(bottom), max(top), min(left), max(right)
+
 
 def part_of(grid: Grid, values: NDArray[np.int8], wanted: Grid) -> NDArray[np.int8]:
     """Return a map on another grid of its lattice; cells that it does not have are unknown.

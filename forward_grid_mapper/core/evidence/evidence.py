@@ -5,33 +5,50 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..common.grid import UNKNOWN, Grid
+from ..common.grid import UNKNOWN, Grid, Window, united
 from ..common.parameters import ModelParameters
 from ..common.readings import Readings
 from ..runtime.cancelling import check
 from ..runtime.jit import kernel
+from ..runtime.memory import THREAD_MEMORY
 from ..runtime.threads import parts, run_each
 from ..sensor.cone import rows_of, runs_of
 from ..sensor.cone_table import CONE, Cones, Floats, cone_of, cone_table
 from ..sensor.density import causes_of
-from ..sensor.surface_normals import gather, no_normals, normals_of
+from ..sensor.surface_normals import SurfaceNormals, gather, no_normals, normals_of, on_larger_grid, renewed
 from .fixed_point import QUANTUM
-from .neighbourhood import patterns
+from .neighbourhood import set_patterns
 from .pairs import WORD, WORDS_PER_BAND_PAIR, WORDS_PER_RUN, Lattice, empty_pairs, workspace_for
+from .renewal import box_of, find_changed, renew
 from .state import READING_STATE, Maps, Model, State
 from .tile_index import SHIFT, insert, more_chunks, no_tiles
-from .updates import add_multiplicity, evaluate_all
+from .updates import add_multiplicity, evaluate_all, forget
 
 NO_INCIDENCE_LIMIT = 1.5707
 """Radians off the normal from where on no reading exceeds_incidence_angle."""
 
-FREE, BAND, LARGEST, WORDS, UNSTORED = range(5)
-"""Of the totals: pairs in free zones and in bands, cells of the largest cone, words stored, readings not stored."""
+FREE, BAND, LARGEST, WORDS, UNSTORED, UNUSED = range(6)
+"""Of the totals: pairs in free zones and in bands, cells of the largest cone, words given to readings, readings not
+stored, and those of the words that no reading uses any more."""
+
+MOST_UNUSED = 0.25
+"""Part of the words given to readings that may be out of use before all pairs are packed anew."""
+
+BYTES_A_CONE_CELL = 64
+"""Of a workspace, for each cell of the largest cone."""
+
+NOBODY = np.zeros(0, np.int64)
+
+NEVER = np.zeros(1, np.uint8)
+"""A `stop` that nobody sets."""
+
+Work = Callable[[State, int, int, NDArray[np.int64]], None]
+"""Takes the readings from one to another, and adds to an array."""
 
 
 @kernel
@@ -42,13 +59,13 @@ def _index(s: State, limits: tuple[int, int, int], totals: Any) -> int:
     ----------
     limits
         The first reading, the last one plus one, and the words that stored pairs may take.
-    totals : int64, shape (5,)
+    totals : int64, shape (6,)
         Added to.
     """
     begin, end, words = limits
     cones, lattice, tiles, seen, before = s.cones, s.lattice, s.tiles, s.maps.seen, s.normals.before
     for t in range(begin, end):
-        reading = cones[t]
+        reading, times = cones[t], s.reading_states[t].multiplicity
         cone = cone_of(reading)
         bottom, end_row = rows_of(cone, lattice.height)
         across = min(2 * int(cone.reach) + 3, lattice.width)
@@ -69,12 +86,13 @@ def _index(s: State, limits: tuple[int, int, int], totals: Any) -> int:
                     # a cell that is left out may cut a run in two
                     count += before[row, outer + 1] - before[row, inner]
                 for c in range(np.uint64(row * lattice.width + left), np.uint64(row * lattice.width + right + 1)):
-                    seen[c] += 1
+                    seen[c] += times
                 free += inside
                 band += right - left + 1 - inside
         reading_state = s.reading_states[t]
         size = WORDS_PER_RUN * count + WORDS_PER_BAND_PAIR * band
         reading_state.at = totals[WORDS]
+        reading_state.room = size
         reading_state.stored = totals[WORDS] + size <= words
         if reading_state.stored:
             totals[WORDS] += size
@@ -96,15 +114,29 @@ def reading_state_table(readings: Readings, sigma: Floats, model: ModelParameter
     return reading_states
 
 
+class _Index(NamedTuple):
+    """What is kept for readings by cells, and must be put back if readings are not taken after all."""
+
+    head: NDArray[np.int32]
+    fill: NDArray[np.int32]
+    latest: NDArray[np.int32]
+    used: int
+    totals: NDArray[np.int64]
+    normals: SurfaceNormals
+
+
 def _maps(grid: Grid, occupied: NDArray[np.uint8]) -> Maps:
     """Return what is kept for the cells of a grid, without readings, on the map `occupied`, shape `grid.shape`."""
     seen, evidence = np.zeros(grid.size, np.int32), np.zeros(grid.size, np.int64)
-    occupied = occupied.reshape(grid.shape)
-    return Maps(occupied.ravel(), evidence, seen, patterns(occupied, grid.shape))
+    pattern = np.zeros(grid.size, np.uint8)
+    set_patterns(occupied.ravel(), grid.shape, pattern)
+    return Maps(occupied.ravel(), evidence, seen, pattern)
 
 
 class Evidence:
     """Readings, a map, and what flipping each of its cells would gain.
+
+    Whatever fails (no memory, or `stop` was set), the evidence is that of the map and of the readings which it has.
 
     Attributes
     ----------
@@ -122,6 +154,7 @@ class Evidence:
         threads: int = 1,
         stop: NDArray[np.uint8] | None = None,
         start: NDArray[np.uint8] | None = None,
+        renewable: bool = False,
     ) -> None:
         """Begin without readings, on an empty map or on the map `start` (1 occupied, shape `grid.shape`).
 
@@ -136,11 +169,17 @@ class Evidence:
             Threads to use where it pays; the result does not depend on it.
         stop : uint8, shape (1,), optional
             Set to 1 from any thread to cancel.
+        renewable : bool
+            Keep what it takes to renew the surface normals as readings come, 24 bytes a cell. Otherwise the first
+            readings added decide about the normals.
         """
         self.grid, self.model, self._threads = grid, model, threads
         self._words = int(min(memory / WORD, 2.0**60))
-        self._totals = np.zeros(5, np.int64)
-        self._size = 0
+        self._totals = np.zeros(6, np.int64)
+        self._size = self._indexed = 0
+        learns = model.grazing_angle < NO_INCIDENCE_LIMIT
+        self._sums = np.zeros((3, grid.size), np.int64) if learns and renewable else None
+        self._since: Window | None = None
         self.state = State(
             normals=no_normals(),
             lattice=Lattice(grid.height, grid.width, grid.resolution),
@@ -214,108 +253,257 @@ class Evidence:
         maps = self.state.maps
         return np.where(maps.seen > 0, maps.occupied.astype(np.int8), np.int8(UNKNOWN)).reshape(self.grid.shape)
 
-    def extend(self, readings: Readings) -> None:
-        """Add readings.
+    def extend(self, readings: Readings, again: NDArray[np.int64] = NOBODY) -> None:
+        """Add readings, all of them or, if that fails, none.
+
+        Parameters
+        ----------
+        readings : Readings
+        again : int64, shape (M,)
+            Indices of readings, those that are added now among them, each of which stands for one more reading that
+            says the same.
+
+        Raises
+        ------
+        Cancelled
+            If `stop` was set.
+        MemoryError
+        """
+        begin, end = self._size, self._size + len(readings)
+        self._check_indices(again, end)
+        cones = cone_table(readings, self.grid, self.model)
+        reading_states = reading_state_table(readings, cones['sigma'] * self.grid.resolution, self.model)
+        self._reserve(end)
+        s = self.state
+        s.cones[begin:end], s.reading_states[begin:end] = cones, reading_states
+        # what the first ones tell of normals is known before their pairs are made
+        later = s.cones[begin:end] if begin else s.cones[:0], s.cones[again]
+        since = united(self._since, *(box_of(cones, self.grid) for cones in later))
+        before = self._index_so_far()
+        try:
+            if not begin and self.model.grazing_angle < NO_INCIDENCE_LIMIT:
+                self._first_normals(end)
+            self._insert(begin, end)
+            try:
+                self._evaluate_and_add(begin, end, new=True)
+                if len(again):
+                    add_multiplicity(self.state, again)
+            except BaseException:
+                self._evaluate_again(begin)
+                raise
+        except BaseException:
+            self._take_out(begin, before)
+            raise
+        self._size = end
+        if self._sums is not None:
+            for cones in later:
+                self._keep_bearings(cones)
+            self._since = since
+
+    def add_multiplicity(self, readings: NDArray[np.int64]) -> None:
+        """Let each of `readings` (indices, shape (N,)) stand for one more reading that says the same."""
+        self._check_indices(readings, self._size)
+        repeated = self.state.cones[readings]
+        since = united(self._since, box_of(repeated, self.grid))
+        add_multiplicity(self.state, readings)
+        if self._sums is not None:
+            self._keep_bearings(repeated)
+            self._since = since
+
+    @staticmethod
+    def _check_indices(readings: NDArray[np.int64], size: int) -> None:
+        if len(readings) and not 0 <= readings.min() <= readings.max() < size:
+            raise ValueError(f'readings {readings.min()} to {readings.max()} are asked for, and there are {size}')
+
+    def grow(self, grid: Grid) -> None:
+        """Go on with a larger grid, whose new cells are free; nothing is changed if that fails.
+
+        Parameters
+        ----------
+        grid : Grid
+            Holds the old one. Where normals are renewable they stay as they are, and the old grid must hold all cones.
+
+        Raises
+        ------
+        Cancelled
+            If `stop` was set.
+        MemoryError
+        """
+        old, s, totals, sums = self.grid, self.state, self._totals, self._sums
+        window = grid.window(old)
+        occupied = np.zeros(grid.shape, np.uint8)
+        occupied[window] = s.maps.occupied.reshape(old.shape)
+        cones = s.cones.copy()
+        cones['x'][: self._size] += window[1].start
+        cones['y'][: self._size] += window[0].start
+        grown = s._replace(
+            lattice=s.lattice._replace(height=grid.height, width=grid.width),
+            normals=on_larger_grid(s.normals, old, grid),
+            cones=cones,
+            reading_states=s.reading_states.copy(),
+            tiles=no_tiles(grid.height, grid.width),
+            maps=_maps(grid, occupied),
+        )
+        larger = None
+        if sums is not None:
+            larger = np.zeros((3, grid.size), np.int64)
+            larger.reshape(3, *grid.shape)[(slice(None), *window)] = sums.reshape(3, *old.shape)
+        evaluating = False
+        self.grid, self.state, self._totals, self._sums = grid, grown, np.zeros(6, np.int64), larger
+        try:
+            if sums is None and len(s.normals.known):
+                self._first_normals(self._size)
+            self._insert(0, self._size)
+            evaluating = True
+            self._evaluate_and_add(0, self._size, new=True)
+        except BaseException:
+            self.grid, self.state, self._totals, self._sums = old, s, totals, sums
+            if evaluating:
+                # pairs of the larger grid stand where those of the old one were
+                self._evaluate_again(self._size, new=True)
+            raise
+        if self._since:
+            up, right = window[0].start, window[1].start
+            bottom, top, left, end = self._since
+            self._since = bottom + up, top + up, left + right, end + right
+
+    def rebuild(self) -> None:
+        """Evaluate all readings anew, after the map was changed in many places."""
+        maps = self.state.maps
+        set_patterns(maps.occupied, self.grid.shape, maps.pattern)
+        maps.evidence[:] = 0
+        try:
+            self._evaluate_and_add(0, self._size, new=False)
+        except BaseException:
+            self._evaluate_again(self._size)
+            raise
+
+    def renew_normals(self) -> Window | None:
+        """Estimate the surface normals from all readings so far; make anew the pairs of the readings that this changes.
+
+        Afterwards all is as if the readings had come at once. Needs `renewable`.
+
+        Returns
+        -------
+        window : first row, last one plus one, and columns likewise, or None
+            Where the evidence changed.
+        """
+        if self._sums is None or self._since is None:
+            return None
+        s, shape = self.state, self.grid.shape
+        normals = renewed(s.normals, self._sums, shape, self._since)
+        differ = np.zeros(shape, np.uint8)
+        sees = np.zeros(self._size, np.uint8)
+        find_changed(s, normals, self._since, differ, sees)
+        readings = np.flatnonzero(sees)
+        window = box_of(s.cones[readings], self.grid)
+        # nothing fails from here on: where there is no memory for pairs they are not stored
+        done, words = 0, self._words
+        while True:
+            done = renew(self.state, normals, readings, (done, words), self._totals)
+            if done == len(readings):
+                break
+            try:
+                self._make_room(int(self._totals[WORDS]) + WORDS_PER_BAND_PAIR * int(self._totals[LARGEST]))
+            except MemoryError:
+                words = len(self.state.pairs.cell)
+        self.state = self.state._replace(normals=normals)
+        self._since = None
+        if self._totals[UNUSED] > MOST_UNUSED * self._totals[WORDS]:
+            self.grow(self.grid)
+        return window
+
+    def summed(self, begin: int, end: int, work: Work, total: NDArray[np.int64], beside: int = 0) -> None:
+        """Have several threads go over parts of the readings `begin` to `end`, and sum up what they find.
+
+        Each has a workspace and an array of its own. Sums of whole numbers do not depend on how many there are.
+
+        Parameters
+        ----------
+        begin, end : int
+        work : callable
+        total : int64
+            Added to.
+        beside : int
+            Bytes that each thread takes for itself.
 
         Raises
         ------
         Cancelled
             If `stop` was set.
         """
-        begin, end = self._size, self._size + len(readings)
-        cones = cone_table(readings, self.grid, self.model)
-        reading_states = reading_state_table(readings, cones['sigma'] * self.grid.resolution, self.model)
-        self._reserve(end)
-        s = self.state
-        s.cones[begin:end], s.reading_states[begin:end] = cones, reading_states
-        self._take_in(begin, end)
-
-    def add_multiplicity(self, readings: NDArray[np.int64]) -> None:
-        """Let each of `readings` (indices, shape (N,)) stand for one more reading that says the same."""
-        add_multiplicity(self.state, readings)
-
-    def grow(self, grid: Grid) -> None:
-        """Go on with a larger grid, whose new cells are free; all readings are taken in anew.
-
-        Parameters
-        ----------
-        grid : Grid
-            Holds the old one.
-        """
-        old, maps, size = self.grid, self.state.maps, self._size
-        window = grid.window(old)
-        occupied = np.zeros(grid.shape, np.uint8)
-        occupied[window] = maps.occupied.reshape(old.shape)
-        self.state.cones['x'][:size] += window[1].start
-        self.state.cones['y'][:size] += window[0].start
-        self.grid = grid
-        self.state = self.state._replace(
-            lattice=self.state.lattice._replace(height=grid.height, width=grid.width),
-            tiles=no_tiles(grid.height, grid.width),
-            maps=_maps(grid, occupied),
-        )
-        self._totals[:] = 0
-        self._take_in(0, size)
-
-    def rebuild(self) -> None:
-        """Explain all readings anew, after the map was changed in many places."""
-        maps = self.state.maps
-        maps.evidence[:] = 0
-        maps.pattern[:] = patterns(maps.occupied, self.grid.shape)
-        self._evaluate_and_add(0, self._size, new=False)
-
-    def each(self, begin: int, end: int, work: Callable[[State, int, int], None]) -> None:
-        """Have several threads work on parts of the readings `begin` to `end`, each with room of its own."""
         largest = int(self._totals[LARGEST])
-        jobs: list[Callable[[], None]] = []
-        for k, (first, last) in enumerate(parts(begin, end, self._threads)):
-            s = self.state
-            if k:
-                s = s._replace(workspace=workspace_for(largest))
-            jobs.append(partial(work, s, first, last))
-        run_each(jobs)
+        own = [(self.state, total)]
+        each = total.nbytes + beside + BYTES_A_CONE_CELL * largest
+        most = len(parts(begin, end, min(self._threads, 1 + THREAD_MEMORY // max(each, 1))))
+        try:
+            while len(own) < most:
+                s = self.state._replace(workspace=workspace_for(largest))
+                own.append((s, np.zeros_like(total)))
+        except MemoryError:
+            # fewer threads come to the same
+            pass
+        shares = zip(own, parts(begin, end, len(own)), strict=True)
+        run_each([partial(work, s, first, last, array) for (s, array), (first, last) in shares])
         check(self.state.stop)
+        for _, array in own[1:]:
+            np.add(total, array, out=total)
 
     def _evaluate_and_add(self, begin: int, end: int, new: bool) -> None:
-        maps = self.state.maps
-        own: list[Maps] = []
+        def work(s: State, first: int, last: int, evidence: NDArray[np.int64]) -> None:
+            evaluate_all(s._replace(maps=s.maps._replace(evidence=evidence)), first, last, new)
 
-        def work(s: State, first: int, last: int) -> None:
-            if first > begin:
-                s = s._replace(maps=maps._replace(evidence=np.zeros_like(maps.evidence)))
-                own.append(s.maps)
-            evaluate_all(s, first, last, new)
+        self.summed(begin, end, work, self.state.maps.evidence)
 
-        self.each(begin, end, work)
-        for other in own:
-            np.add(maps.evidence, other.evidence, out=maps.evidence)
+    def _evaluate_again(self, end: int, new: bool = False) -> None:
+        """Do so for the readings up to `end` in a way that cannot fail: on one thread, heedless of `stop`."""
+        self.state.maps.evidence[:] = 0
+        evaluate_all(self.state._replace(stop=NEVER), 0, end, new)
 
-    def _take_in(self, begin: int, end: int) -> None:
-        """Index readings whose cones are in place, and add what they say to the evidence."""
-        if not begin and self.model.grazing_angle < NO_INCIDENCE_LIMIT:
-            self._face(end)
-        done = begin
-        while done < end:
+    def _index_so_far(self) -> _Index:
+        s = self.state
+        tiles = s.tiles
+        lists = tiles.head.copy(), tiles.fill.copy(), tiles.latest.copy()
+        return _Index(*lists, int(tiles.used[0]), self._totals.copy(), s.normals)
+
+    def _insert(self, begin: int, end: int) -> None:
+        """Index readings whose cones are in place, and make room for their pairs."""
+        self._indexed = begin
+        while self._indexed < end:
             s = self.state
-            done = _index(s, (done, end, self._words), self._totals)
+            self._indexed = _index(s, (self._indexed, end, self._words), self._totals)
             check(s.stop)
-            if done < end:
+            if self._indexed < end:
                 self.state = s._replace(tiles=more_chunks(s.tiles))
-        self._size = end
-        self._make_room()
-        self._evaluate_and_add(begin, end, new=True)
+        self._make_room(int(self._totals[WORDS]))
 
-    def _face(self, end: int) -> None:
+    def _take_out(self, begin: int, before: _Index) -> None:
+        """Undo what was indexed from reading `begin` on."""
+        s = self.state
+        forget(s, begin, self._indexed)
+        s.tiles.head[:], s.tiles.fill[:], s.tiles.latest[:] = before.head, before.fill, before.latest
+        s.tiles.used[0] = before.used
+        self._indexed = begin
+        self._totals[:] = before.totals
+        self.state = s._replace(normals=before.normals)
+        if not begin and self._sums is not None:
+            self._sums[:] = 0
+
+    def _first_normals(self, end: int) -> None:
         """Learn from the first readings which way surfaces face."""
-        sums: list[NDArray[np.int64]] = []
+        self._indexed = 0
+        sums = np.zeros((3, self.grid.size), np.int64) if self._sums is None else self._sums
 
-        def work(s: State, first: int, last: int) -> None:
-            sums.append(np.zeros((3, self.grid.size), np.int64))
-            gather(s.cones, self.grid.shape, (first, last), sums[-1], s.stop)
+        def work(s: State, first: int, last: int, into: NDArray[np.int64]) -> None:
+            gather(s.cones, self.grid.shape, (first, last), into, s.stop)
 
-        self.each(0, end, work)
-        normals = normals_of(np.sum(sums, axis=0), self.grid.shape, self.model.grazing_angle)
+        self.summed(0, end, work, sums)
+        normals = normals_of(sums, self.grid.shape, self.model.grazing_angle)
         self.state = self.state._replace(normals=normals)
+
+    def _keep_bearings(self, cones: NDArray[np.void]) -> None:
+        """Add what readings tell of surface normals, in a way that cannot fail: on one thread, heedless of `stop`."""
+        gather(cones, self.grid.shape, (0, len(cones)), self._sums, NEVER)
 
     def _reserve(self, size: int) -> None:
         """Make room for `size` readings; more than that where they come in small numbers."""
@@ -327,10 +515,10 @@ class Evidence:
         cones[: self._size], reading_states[: self._size] = s.cones[: self._size], s.reading_states[: self._size]
         self.state = s._replace(cones=cones, reading_states=reading_states, observing=np.empty((room, 2), np.int32))
 
-    def _make_room(self) -> None:
-        """Make room for the pairs that were counted."""
+    def _make_room(self, words: int) -> None:
+        """Make room for so many words of pairs, and to work on the largest cone."""
         s = self.state
-        words, largest = int(self._totals[WORDS]), int(self._totals[LARGEST])
+        largest, words = int(self._totals[LARGEST]), min(words, self._words)
         if words > len(s.pairs.cell):
             kept = len(s.pairs.cell)
             pairs = empty_pairs(words if not kept else max(words, min(words * 3 // 2, self._words)))

@@ -50,10 +50,17 @@ def note_flip(pattern: NDArray[np.uint8], c: int, height: int, width: int) -> No
             pattern[o] ^= 1 << opposite(k)
 
 
+@kernel
+def set_patterns(occupied: NDArray[np.uint8], shape: tuple[int, int], out: NDArray[np.uint8]) -> None:
+    """Write the pattern of occupied neighbours of every cell into `out`, shape (cells,); takes no memory."""
+    out[:] = 0
+    for c in range(len(occupied)):
+        if occupied[c]:
+            note_flip(out, c, shape[0], shape[1])
+
+
 def patterns(occupied: NDArray[np.uint8], shape: tuple[int, int]) -> NDArray[np.uint8]:
     """Return the pattern of occupied neighbours of every cell, shape (cells,)."""
-    wide = np.pad(occupied.reshape(shape), 1)
-    out = np.zeros(shape, np.uint8)
-    for k, (dx, dy) in enumerate(zip(DX, DY, strict=True)):
-        out |= (wide[1 + dy : 1 + dy + shape[0], 1 + dx : 1 + dx + shape[1]] << k).astype(np.uint8)
-    return out.ravel()
+    out = np.zeros(shape[0] * shape[1], np.uint8)
+    set_patterns(occupied.ravel(), shape, out)
+    return out

@@ -20,6 +20,7 @@ READING_STATE = np.dtype(
         ('at', np.int64),
         ('changed', np.int64),
         ('stored', np.int32),
+        ('room', np.int32),
         ('runs', np.int32),
         ('bands', np.int32),
         ('blocking', np.int32),
@@ -38,8 +39,9 @@ floor, max_range
 blocking, through
     Occupied cells in the free zone, and the mixture weight that they leave to the band,
     (1 − p_rand − p_lost) (1 − p_hit)^blocking.
-stored, at, runs, bands
-    Whether its pairs are stored, where in `Pairs`, and how many runs and band pairs there are.
+stored, at, room, runs, bands
+    Whether its pairs are stored, where in `Pairs`, how many words they may take there, and how many runs and band pairs
+    there are.
 multiplicity
     How many equal readings this one stands for.
 occupy, release
@@ -68,7 +70,8 @@ class Maps(NamedTuple):
     evidence : int64
         Log-likelihood gain of flipping the cell, in units of `fixed_point.QUANTUM`.
     seen : int32
-        Number of readings in whose cone the cell is.
+        Number of readings in whose cone the cell is. Merged ones count as often as they came; those that exceed the
+        incidence angle there count as well.
     pattern : uint8
         Which of its neighbours are occupied (`neighbourhood`).
     """

@@ -142,31 +142,70 @@ def _add_difference(reading_state: Any, pairs: Pairs, at: int, maps: Maps, new: 
 
 
 @kernel
+def evaluate_and_add(s: State, t: int, pairs: Pairs, at: int) -> None:
+    """Evaluate reading t on the map, and add all that it says to the evidence; `pairs` are its own, from `at`."""
+    maps = s.maps
+    reading_state = s.reading_states[t]
+    log = at + WORDS_PER_RUN * reading_state.runs + 2 * reading_state.bands
+    pairs.log[log : log + reading_state.bands] = 0
+    reading_state.occupy, reading_state.release = 0, 0
+    blocking = 0
+    for k in range(np.uint64(at), np.uint64(at + WORDS_PER_RUN * reading_state.runs), np.uint64(WORDS_PER_RUN)):
+        for c in range(np.uint64(pairs.cell[k]), np.uint64(pairs.cell[k + np.uint64(1)]) + np.uint64(1)):
+            blocking += maps.occupied[c]
+    reading_state.blocking = blocking
+    reading_state.through = s.model.mixture_weight * (1.0 - s.model.p_hit) ** blocking
+    evaluate(s.model, reading_state, maps.occupied, pairs, at, s.workspace)
+    _add_difference(reading_state, pairs, at, maps, s.workspace.new)
+    reading_state.changed = s.clock[0]
+
+
+@kernel
+def take_off(s: State, t: int) -> None:
+    """Take what reading t says off the evidence."""
+    maps = s.maps
+    pairs, at = pairs_with_logs(s, t)
+    reading_state = s.reading_states[t]
+    times = -reading_state.multiplicity
+    _add_to_free_zone(reading_state, pairs, at, maps, (times * reading_state.occupy, times * reading_state.release))
+    cell = at + WORDS_PER_RUN * reading_state.runs
+    log = cell + 2 * reading_state.bands
+    for k in range(reading_state.bands):
+        maps.evidence[pairs.cell[cell + k]] += times * pairs.log[log + k]
+
+
+@kernel
 def evaluate_all(s: State, begin: int, end: int, new: bool) -> None:
     """Evaluate the readings `begin` to `end` on the map, and add all that they say to the evidence.
 
     The pairs of `new` ones are made first.
     """
-    maps = s.maps
     for t in range(begin, end):
         if s.stop[0]:
             break
-        reading_state = s.reading_states[t]
-        if new and reading_state.stored:
+        if new and s.reading_states[t].stored:
             _make_pairs(s, t)
         pairs, at = pairs_of(s, t)
-        log = at + WORDS_PER_RUN * reading_state.runs + 2 * reading_state.bands
-        pairs.log[log : log + reading_state.bands] = 0
-        reading_state.occupy, reading_state.release = 0, 0
-        blocking = 0
-        for k in range(np.uint64(at), np.uint64(at + WORDS_PER_RUN * reading_state.runs), np.uint64(WORDS_PER_RUN)):
-            for c in range(np.uint64(pairs.cell[k]), np.uint64(pairs.cell[k + np.uint64(1)]) + np.uint64(1)):
-                blocking += maps.occupied[c]
-        reading_state.blocking = blocking
-        reading_state.through = s.model.mixture_weight * (1.0 - s.model.p_hit) ** blocking
-        evaluate(s.model, reading_state, maps.occupied, pairs, at, s.workspace)
-        _add_difference(reading_state, pairs, at, maps, s.workspace.new)
-        reading_state.changed = s.clock[0]
+        evaluate_and_add(s, t, pairs, at)
+
+
+@kernel
+def _add_seen(s: State, t: int, times: int) -> None:
+    """Count reading t so many times more, or fewer, at every cell of its cone."""
+    cone = cone_of(s.cones[t])
+    for row in range(*rows_of(cone, s.lattice.height)):
+        runs = runs_of(cone, row, s.lattice.width)
+        start = row * s.lattice.width
+        for first, last in ((runs.first, runs.last), (runs.first2, runs.last2)):
+            for c in range(start + first, start + last + 1):
+                s.maps.seen[c] += times
+
+
+@kernel
+def forget(s: State, begin: int, end: int) -> None:
+    """Uncount the readings `begin` to `end` at every cell."""
+    for t in range(begin, end):
+        _add_seen(s, t, -s.reading_states[t].multiplicity)
 
 
 @kernel
@@ -184,10 +223,7 @@ def add_multiplicity(s: State, readings: Any) -> None:
         log = begin + 2 * reading_state.bands
         for k in range(reading_state.bands):
             maps.evidence[pairs.cell[begin + k]] += pairs.log[log + k]
-            maps.seen[pairs.cell[begin + k]] += 1
-        for k in range(at, begin, WORDS_PER_RUN):
-            for c in range(np.uint64(pairs.cell[k]), np.uint64(pairs.cell[k + 1]) + np.uint64(1)):
-                maps.seen[c] += 1
+        _add_seen(s, t, 1)
 
 
 @kernel

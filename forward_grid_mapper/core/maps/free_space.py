@@ -105,12 +105,11 @@ def expected_passes(evidence: Evidence, occupied: NDArray[np.uint8]) -> Floats:
     random = model.p_rand / evidence.z_max
     # of an echo from almost as far as z_max too, so that it frees little more than a reading without any
     lost = model.p_lost * evidence.state.reading_states['max_range'][: len(evidence)]
-    sums: list[NDArray[np.int64]] = []
+    passed = np.zeros(evidence.grid.size, np.int64)
 
-    def work(s: State, begin: int, end: int) -> None:
-        sums.append(np.zeros(evidence.grid.size, np.int64))
-        add_passes(s, begin, end, random, lost, occupied, sums[-1])
+    def work(s: State, begin: int, end: int, own: NDArray[np.int64]) -> None:
+        add_passes(s, begin, end, random, lost, occupied, own)
 
-    evidence.each(0, len(evidence), work)
-    total: Floats = np.sum(sums, axis=0) * UNIT
-    return total
+    evidence.summed(0, len(evidence), work, passed)
+    out: Floats = np.multiply(passed, UNIT, dtype=np.float64)
+    return out

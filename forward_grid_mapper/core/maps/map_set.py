@@ -37,6 +37,9 @@ class MapSet:
     objective : float
         The log-likelihood of `ml` plus its log prior, up to a constant.
     parameters : Parameters
+    searched : int8
+        The map that the search found, with the values of `ml`: what another search may start from. `ml` is made of it,
+        with walls drawn out and with free cells where readings passed.
     dynamic : float32
         Echoes that `ml` does not explain and that end in free space: people, say (`dynamic`).
     normals : SurfaceNormals
@@ -55,6 +58,7 @@ class MapSet:
     log_likelihood: float
     objective: float
     parameters: Parameters
+    searched: NDArray[np.int8] = field(default_factory=lambda: np.zeros((0, 0), np.int8))
     dynamic: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 0), np.float32))
     normals: SurfaceNormals = field(default_factory=no_normals)
     statistics: dict[str, Any] = field(default_factory=dict)
@@ -73,8 +77,10 @@ class MapSet:
         live : float32, shape `grid.shape`
         """
         whole = self.grid.union(grid)
-        ml = np.full(whole.shape, UNKNOWN, np.int8)
+        ml, searched = (np.full(whole.shape, UNKNOWN, np.int8) for _ in range(2))
         ml[whole.window(self.grid)] = self.ml
+        if self.searched.size:
+            searched[whole.window(self.grid)] = self.searched
         uncertainty, shown = (np.full(whole.shape, np.nan, np.float32) for _ in range(2))
         uncertainty[whole.window(self.grid)] = self.uncertainty
         shown[whole.window(grid)] = live
@@ -82,4 +88,5 @@ class MapSet:
         if self.dynamic.size:
             dynamic[whole.window(self.grid)] = self.dynamic
         normals = on_larger_grid(self.normals, self.grid, whole)
-        return replace(self, grid=whole, live=shown, ml=ml, uncertainty=uncertainty, dynamic=dynamic, normals=normals)
+        own = replace(self, searched=searched, dynamic=dynamic, normals=normals)
+        return replace(own, grid=whole, live=shown, ml=ml, uncertainty=uncertainty)

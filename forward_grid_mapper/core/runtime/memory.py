@@ -1,4 +1,4 @@
-"""How much memory a run of EM takes at the least, and how much there is.
+"""How much memory a run of EM takes without its pairs, and how much there is.
 
 Linux grants more memory than it has and ends the process that uses it. A run that cannot fit must therefore not begin,
 or it takes the readings and the live map with it.
@@ -14,14 +14,24 @@ from ..common.parameters import Parameters
 BYTES_A_READING = 400
 """What the search keeps for a reading without its pairs, twice over where arrays are sorted or grow."""
 
-BYTES_A_CELL = 60
+BYTES_A_CELL = 100
+"""What a run on one thread takes for a cell at its peak, when the maps are collected: three maps, the evidence, the
+prior, and the sums that surface normals or passed readings are counted in."""
+
+BYTES_A_CELL_AND_THREAD = 24
+"""What another thread takes for a cell at its peak: the three sums of surface normals."""
+
+THREAD_MEMORY = 64_000_000
+"""Bytes that all threads but the first may take together. Where an array for each of them would be more, on maps of
+some hundred thousand cells and more, fewer threads work; the maps are the same."""
 
 CGROUP = Path('/sys/fs/cgroup')
 
 
-def least_memory(cells: int, readings: int) -> int:
-    """Return the bytes that EM of so many readings on so many cells takes at the least, without memory for pairs."""
-    return cells * BYTES_A_CELL + readings * BYTES_A_READING
+def least_memory(cells: int, readings: int, threads: int) -> int:
+    """Return the bytes that EM of so many readings on so many cells takes at its peak, without memory for pairs."""
+    of_threads = min((threads - 1) * cells * BYTES_A_CELL_AND_THREAD, THREAD_MEMORY)
+    return cells * BYTES_A_CELL + readings * BYTES_A_READING + of_threads
 
 
 def memory_for_pairs(parameters: Parameters) -> float:
@@ -41,9 +51,9 @@ def free_memory() -> int | None:
     return max(min(known), 0) if known else None
 
 
-def shortage(cells: int, readings: int) -> str:
+def shortage(cells: int, readings: int, threads: int) -> str:
     """Return why EM of so many readings on so many cells cannot fit the memory; empty if it may."""
-    free, needed = free_memory(), least_memory(cells, readings)
+    free, needed = free_memory(), least_memory(cells, readings, threads)
     if free is None or needed <= free:
         return ''
     return (

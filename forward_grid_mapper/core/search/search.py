@@ -26,6 +26,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ..common.grid import Window
 from ..common.parameters import SearchParameters
 from ..evidence.evidence import Evidence
 from ..evidence.neighbourhood import NEIGHBOURS
@@ -91,7 +92,6 @@ class SearchResult:
     converged: bool
 
 
-Window = tuple[int, int, int, int]
 Watch = Callable[[Progress], None]
 
 
@@ -141,13 +141,22 @@ class Search:
         return self.evidence.log_likelihood + log_prior(self._prior, maps.occupied, maps.pattern)
 
     def run(self, watch: Watch = lambda progress: None) -> SearchResult:
-        """Search until no flip and no move gains; `watch` hears of every sweep.
+        """Search until no flip and no move gains; `watch` is called after every sweep.
+
+        A start map that no flip and no move improves is the result: the rounds would lead from one maximum to another.
 
         Raises
         ------
         Cancelled
             If `stop` was set.
         """
+        if self.evidence.state.maps.occupied.any():
+            independent, self._prior = self._prior, self._whole
+            converged = self._climb(watch)
+            if converged and not self.progress.flips and not self.progress.shifts:
+                return self._result(converged)
+            self._prior = independent
+            self._settled[:] = 0
         while self._more() and self._round(watch):
             pass
         return self.refine(watch)
@@ -159,6 +168,9 @@ class Search:
             self._prior = self._whole
             self._settled[:] = 0
             converged = self._climb(watch)
+        return self._result(converged)
+
+    def _result(self, converged: bool) -> SearchResult:
         maps = self.evidence.state.maps
         return SearchResult(
             maps.occupied,
@@ -235,15 +247,12 @@ class Search:
             sees[:] = 0
             see_any(s, cells, sees)
         readings = np.flatnonzero(sees)
-        joints = []
+        joint = np.zeros((len(cells), NEIGHBOURS), np.int64)
 
-        def work(s: State, begin: int, end: int) -> None:
-            place, joint = np.full(len(slot), -1, np.int32), np.zeros((len(cells), NEIGHBOURS), np.int64)
-            joints.append(joint)
-            try_shifts(s, readings[begin:end], slot, place, joint)
+        def work(s: State, begin: int, end: int, own: NDArray[np.int64]) -> None:
+            try_shifts(s, readings[begin:end], slot, np.full(len(slot), -1, np.int32), own)
 
-        evidence.each(0, len(readings), work)
-        joint = np.sum(joints, axis=0)
+        evidence.summed(0, len(readings), work, joint, beside=slot.nbytes)
         targets, gains = best_shifts(s, self._prior, LEAST, cells, joint)
         order = np.argsort(-gains, kind='stable')[: int((targets >= 0).sum())]
         shifts, gain = shift_in_order(s, self._prior, LEAST, cells[order], targets[order])

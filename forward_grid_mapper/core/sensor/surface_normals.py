@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..common.grid import Grid
+from ..common.grid import Grid, Window
 from ..runtime.jit import kernel
 from .cone import rows_of, runs_of
 from .cone_table import Cones, cone_of
@@ -34,6 +34,9 @@ LEAST_AGREEMENT = 0.5
 THROUGH = 2.0
 """A reading that exceeds_incidence_angle a cell does not contradict it if its range is this many σ beyond."""
 
+BLOCK = 2**16
+"""Cells whose normals are estimated at once, which bounds the memory that it takes."""
+
 QUANTUM = 2.0**-20
 """Unit of the sums, which as whole numbers do not depend on their order."""
 
@@ -45,7 +48,7 @@ class SurfaceNormals(NamedTuple):
     ----------
     known : uint8, shape (cells,)
     x, y : float32, shape (cells,)
-        Unit vector along the normal, either way.
+        Unit vector along the normal, either way; 0 where it is not known.
     before : int32, shape (height, width + 1)
         Number of known cells in each row before a column.
     cos2_limit : float
@@ -118,27 +121,72 @@ def _before(known: NDArray[Any]) -> NDArray[np.int32]:
     return out
 
 
-def _box(values: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Return the sums over 3 x 3 cells, nothing beyond the edges."""
-    wide = np.pad(values, 1)
+def _box(values: NDArray[np.int64], window: Window) -> NDArray[np.float64]:
+    """Return the sums over the 3 x 3 cells around each cell of a window, nothing beyond the edges of the grid."""
+    bottom, top, left, right = window
+    height, width = values.shape
+    inside = values[max(bottom - 1, 0) : top + 1, max(left - 1, 0) : right + 1]
+    missing = (int(bottom == 0), int(top == height)), (int(left == 0), int(right == width))
+    wide = np.pad(inside, missing)
     rows = wide[:-2] + wide[1:-1] + wide[2:]
     out: NDArray[np.float64] = (rows[:, :-2] + rows[:, 1:-1] + rows[:, 2:]) * QUANTUM
     return out
 
 
+def _estimate(normals: SurfaceNormals, sums: NDArray[np.int64], shape: tuple[int, int], window: Window) -> None:
+    """Write the normals of the cells of a window."""
+    bottom, top, left, right = window
+    known, x, y = (array.reshape(shape) for array in (normals.known, normals.x, normals.y))
+    step = max(BLOCK // (right - left), 1)
+    for first in range(bottom, top, step):
+        part = first, min(first + step, top), left, right
+        cells = slice(*part[:2]), slice(*part[2:])
+        cosine, sine, mass = (_box(values.reshape(shape), part) for values in sums)
+        told = (mass >= LEAST_WEIGHT) & (np.hypot(cosine, sine) >= LEAST_AGREEMENT * mass)
+        angle = np.arctan2(sine, cosine) / 2
+        known[cells], x[cells], y[cells] = told, np.where(told, np.cos(angle), 0.0), np.where(told, np.sin(angle), 0.0)
+    np.cumsum(known[bottom:top], axis=1, dtype=np.int32, out=normals.before[bottom:top, 1:])
+
+
 def normals_of(sums: NDArray[np.int64], shape: tuple[int, int], angle: float) -> SurfaceNormals:
-    """Return the normals that the sums of `gather` give; readings graze more than `angle` (radians) off them."""
-    cosine, sine, mass = (_box(values.reshape(shape)) for values in sums)
-    agreement = np.hypot(cosine, sine)
-    known = (mass >= LEAST_WEIGHT) & (agreement >= LEAST_AGREEMENT * mass)
-    normal = np.arctan2(sine, cosine) / 2
-    return SurfaceNormals(
-        known.ravel().view(np.uint8),
-        np.cos(normal).ravel().astype(np.float32),
-        np.sin(normal).ravel().astype(np.float32),
-        _before(known),
-        math.cos(angle) ** 2,
+    """Return the normals that the sums of `gather` give.
+
+    Parameters
+    ----------
+    sums : int64, shape (3, cells)
+    shape : (height, width)
+    angle : float
+        Radians off the normal beyond which a surface returns no echo.
+    """
+    normals = _unknown(shape, math.cos(angle) ** 2)
+    _estimate(normals, sums, shape, (0, shape[0], 0, shape[1]))
+    return normals
+
+
+def _unknown(shape: tuple[int, int], cos2_limit: float) -> SurfaceNormals:
+    x, y = (np.zeros(shape[0] * shape[1], np.float32) for _ in range(2))
+    known, before = np.zeros(len(x), np.uint8), np.zeros((shape[0], shape[1] + 1), np.int32)
+    return SurfaceNormals(known, x, y, before, cos2_limit)
+
+
+def renewed(normals: SurfaceNormals, sums: NDArray[np.int64], shape: tuple[int, int], window: Window) -> SurfaceNormals:
+    """Return the normals after the sums changed in a window; those given stay as they are.
+
+    Parameters
+    ----------
+    normals : SurfaceNormals
+    sums : int64, shape (3, cells)
+    shape : (height, width)
+    window
+        Where the sums changed: first row, last one plus one, and columns likewise.
+    """
+    new = normals._replace(
+        known=normals.known.copy(), x=normals.x.copy(), y=normals.y.copy(), before=normals.before.copy()
     )
+    bottom, top, left, right = window
+    around = max(bottom - 1, 0), min(top + 1, shape[0]), max(left - 1, 0), min(right + 1, shape[1])
+    _estimate(new, sums, shape, around)
+    return new
 
 
 @kernel

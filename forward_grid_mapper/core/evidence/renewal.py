@@ -1,0 +1,159 @@
+"""Renewal of surface normals: the readings whose pairs it changes, and their pairs made anew.
+
+A pair is left out where the reading exceeds the incidence angle of the cell. When more readings tell more of the
+normals, some pairs come and some go. What a reading said so far is taken off the evidence, exactly, since all of it is
+whole numbers; then its pairs are made with the new normals, and what it says now is added.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..common.grid import Grid, Window
+from ..runtime.jit import kernel
+from ..sensor.cone import rows_of, runs_of
+from ..sensor.cone_table import cone_of
+from ..sensor.surface_normals import SurfaceNormals, exceeds_incidence_angle
+from .pairs import WORDS_PER_BAND_PAIR, WORDS_PER_RUN, make
+from .state import State
+from .tile_index import CHUNK, SHIFT
+from .updates import evaluate_and_add, take_off
+
+# places in `Evidence._totals`
+WORDS, UNSTORED, UNUSED = 3, 4, 5
+
+
+def box_of(cones: NDArray[np.void], grid: Grid) -> Window | None:
+    """Return a window that holds all cells of cones, None if there is no cone."""
+    if not len(cones):
+        return None
+    far = float(cones['reach'].max()) + 1.0
+    bottom, top = float(cones['y'].min()) - far, float(cones['y'].max()) + far
+    left, right = float(cones['x'].min()) - far, float(cones['x'].max()) + far
+    window = (
+        max(math.floor(bottom), 0),
+        min(math.floor(top) + 1, grid.height),
+        max(math.floor(left), 0),
+        min(math.floor(right) + 1, grid.width),
+    )
+    return window if window[0] < window[1] and window[2] < window[3] else None
+
+
+@kernel
+def _mark_cells(old: SurfaceNormals, new: SurfaceNormals, window: Window, width: int, differ: Any) -> None:
+    """Mark the cells of a window whose normals differ in `differ`, uint8, shape (height, width)."""
+    for row in range(window[0], window[1]):
+        for column in range(window[2], window[3]):
+            c = row * width + column
+            turned = new.x[c] != old.x[c] or new.y[c] != old.y[c]
+            if new.known[c] != old.known[c] or (new.known[c] and turned):
+                differ[row, column] = 1
+
+
+@kernel
+def _changes(s: State, new: SurfaceNormals, t: int, window: Window, differ: Any) -> bool:
+    """Tell whether reading t exceeds the incidence angle at other cells than before; it looks at those of `differ`."""
+    reading = s.cones[t]
+    cone = cone_of(reading)
+    bottom, top = rows_of(cone, s.lattice.height)
+    for row in range(max(bottom, window[0]), min(top, window[1])):
+        runs = runs_of(cone, row, s.lattice.width)
+        v = row + 0.5 - cone.y
+        for first, last in ((runs.first, runs.last), (runs.first2, runs.last2)):
+            for column in range(max(first, window[2]), min(last + 1, window[3])):
+                if differ[row, column]:
+                    u, cell = column + 0.5 - cone.x, row * s.lattice.width + column
+                    if exceeds_incidence_angle(s.normals, reading, cell, u, v) != exceeds_incidence_angle(
+                        new, reading, cell, u, v
+                    ):
+                        return True
+    return False
+
+
+@kernel
+def find_changed(s: State, new: SurfaceNormals, window: Window, differ: Any, sees: Any) -> None:
+    """Set `sees` (uint8, shape (N,), all 0) of the readings whose pairs are others with the normals `new`.
+
+    Parameters
+    ----------
+    window
+        Where the normals may differ: first row, last one plus one, and columns likewise.
+    differ : uint8, shape (height, width)
+        Room to work in, all 0.
+    """
+    height, width = s.lattice.height, s.lattice.width
+    around = max(window[0] - 1, 0), min(window[1] + 1, height), max(window[2] - 1, 0), min(window[3] + 1, width)
+    _mark_cells(s.normals, new, around, width, differ)
+    tiles = s.tiles
+    for up in range(around[0] >> SHIFT, ((around[1] - 1) >> SHIFT) + 1):
+        for across in range(around[2] >> SHIFT, ((around[3] - 1) >> SHIFT) + 1):
+            some = False
+            for row in range(up << SHIFT, min((up + 1) << SHIFT, height)):
+                for column in range(across << SHIFT, min((across + 1) << SHIFT, width)):
+                    some = some or differ[row, column] != 0
+            if not some:
+                continue
+            tile = up * tiles.across + across
+            chunk, end = tiles.head[tile], tiles.fill[tile]
+            while chunk >= 0:
+                for k in range(end):
+                    t = tiles.chunks[chunk, k]
+                    if sees[t] == 0:
+                        sees[t] = 1 if _changes(s, new, t, around, differ) else 2
+                chunk, end = tiles.chunks[chunk, CHUNK], CHUNK
+    for t in range(len(sees)):
+        sees[t] &= 1
+
+
+@kernel
+def _move(reading_state: Any, size: int, words: int, totals: Any) -> None:
+    """Give a reading room for `size` words after all others, or none if these would be more than `words` then."""
+    totals[UNUSED] += reading_state.room
+    reading_state.stored = totals[WORDS] + size <= words
+    if reading_state.stored:
+        reading_state.at, reading_state.room = totals[WORDS], size
+        totals[WORDS] += size
+    else:
+        totals[UNSTORED] += 1
+
+
+@kernel
+def renew(s: State, new: SurfaceNormals, readings: Any, limits: tuple[int, int], totals: Any) -> int:
+    """Make the pairs of some readings with the normals `new`; return the index of the one for which there is no room.
+
+    Parameters
+    ----------
+    readings : int64
+        Which readings.
+    limits
+        The index into them to begin with, and the words that stored pairs may take.
+    totals : int64
+        Those of the evidence.
+    """
+    workspace, words = s.workspace, limits[1]
+    for i in range(limits[0], len(readings)):
+        t = readings[i]
+        reading_state = s.reading_states[t]
+        if reading_state.stored:
+            runs, bands = make(s.cones, s.lattice, new, t, workspace.pairs, 0, workspace)
+            size = WORDS_PER_RUN * runs + WORDS_PER_BAND_PAIR * bands
+            if size > reading_state.room and len(s.pairs.cell) < totals[WORDS] + size <= words:
+                return i
+            take_off(s, t)
+            if size > reading_state.room:
+                _move(reading_state, size, words, totals)
+        else:
+            take_off(s, t)
+            runs, bands = make(s.cones, s.lattice, new, t, workspace.pairs, 0, workspace)
+        reading_state.runs, reading_state.bands = runs, bands
+        pairs, at = workspace.pairs, 0
+        if reading_state.stored:
+            pairs, at = s.pairs, reading_state.at
+            for k in range(WORDS_PER_RUN * runs + 2 * bands):
+                pairs.cell[at + k] = workspace.pairs.cell[k]
+        evaluate_and_add(s, t, pairs, at)
+    return len(readings)
