@@ -120,7 +120,7 @@ class Ticker:
             seconds = time.monotonic() - self._begin
             if seconds < PATIENCE or not self._text:
                 continue
-            # what was compiled a moment ago is told until the next stage, so that the line does not flicker
+            # what was compiled a moment ago is shown until the next stage, so that the line does not flicker
             self._compiles = self._compiles or compiling()
             text = f'{self._text} {COMPILES}' if self._compiles else self._text
             if on_screen:
