@@ -12,6 +12,7 @@ from pathlib import Path
 from ..core.common.errors import OutputError, ParameterError
 from ..core.common.shell import command_line
 from ..core.joint_learning import learn_jointly
+from ..core.learning.input_warnings import input_warnings
 from ..core.learning.sensor_health import health_warning, sensor_health
 from ..files.learned_text import learned_text, parameter_file_text, write_new_file
 from ..files.output_folder import readable
@@ -65,7 +66,13 @@ def learn(options: argparse.Namespace) -> int:
         drive = read_drive(bag, parameters, extrinsics, options.range_topics, options.odom_topic, ticker.reading)
         found = learn_jointly(drive.associator.readings, parameters, options.rounds, options.keep_going, ticker.mapping)
         suspects = health_warning(sensor_health(found.maps))
-    warnings_ = (*drive.source['warnings'], *ignored, *found.warnings, *filter(None, [suspects]))
+    warnings_ = (
+        *drive.source['warnings'],
+        *ignored,
+        *input_warnings(found.maps.readings),
+        *found.warnings,
+        *filter(None, [suspects]),
+    )
     found = dataclasses.replace(found, warnings=warnings_)
     if options.quiet:
         for warning in warnings_:

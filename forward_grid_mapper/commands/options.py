@@ -143,5 +143,5 @@ def _ignored(values: Mapping[str, Any], source: str) -> str:
     names = [name for name, value in values.items() if find(name).group == 'node' and value != find(name).default]
     if not names:
         return ''
-    ignored = [f'{name} ({INSTEAD[name]})' if name in INSTEAD else name for name in names]
-    return f'{readable(source)}: of the parameters that only the node has these are ignored: {", ".join(ignored)}'
+    listed = [f'{name} ({INSTEAD[name]})' if name in INSTEAD else name for name in names]
+    return f'{readable(source)}: of the parameters that only the node has these are ignored: {", ".join(listed)}'

@@ -31,7 +31,7 @@ class Cancelled(KeyboardInterrupt):
 
 
 def cancelled_line(command: str) -> str:
-    """Return what is printed about a command that a signal ended."""
+    """Return the line about a command that a signal ended."""
     return f'{command}: cancelled; nothing was written'
 
 
@@ -48,7 +48,7 @@ def _install(handler: Any) -> dict[signal.Signals, Any]:
 def leave_at_once(command: str) -> None:
     """Let a signal end the process at once, with one line: for imports, while there is nothing to clean up.
 
-    A `KeyboardInterrupt` in an import would be swallowed by some libraries, and printed with a traceback by others.
+    A `KeyboardInterrupt` in an import would be swallowed by some libraries, and shown with a traceback by others.
     """
 
     def leave(number: int, frame: FrameType | None) -> NoReturn:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from ..core.common.errors import OutputError
 from ..core.common.grid import Grid
+from ..core.learning.input_warnings import input_warnings
 from ..core.maps.map_set import MapSet
 from .map_archive import write_npz
 from .map_files import write_raw, write_trinary
@@ -61,7 +62,11 @@ def write_results(
         write_trinary(folder / 'ml_map', maps.grid, maps.ml)
         write_raw(folder / 'uncertainty_map', maps.grid, maps.uncertainty)
         write_npz(folder / 'maps.npz', maps)
-        warnings = [*(source.get('warnings') or []), *filter(None, [quality_warning(maps)])]
+        warnings = [
+            *(source.get('warnings') or []),
+            *input_warnings(maps.readings),
+            *filter(None, [quality_warning(maps)]),
+        ]
         try:
             from .picture import write_picture
 

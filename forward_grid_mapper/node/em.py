@@ -15,6 +15,7 @@ from ..core.common.errors import Cancelled, InputError, MapperError
 from ..core.common.grid import Grid
 from ..core.common.parameters import Parameters
 from ..core.common.readings import Readings
+from ..core.learning.input_warnings import input_warnings
 from ..core.mapping import Mapper
 from ..core.maps.log_odds_map import map_grid
 from ..core.maps.map_set import MapSet
@@ -26,10 +27,11 @@ from ..files.quality_warning import quality_warning
 
 @dataclass
 class Outcome:
-    """How a run ended: `maps`, or None and the reason in `message`."""
+    """How a run ended: `maps`, or None and the reason in `message`; `warnings` say what is wrong with the readings."""
 
     maps: MapSet | None
     message: str
+    warnings: list[str] = field(default_factory=list)
 
 
 @dataclass
@@ -108,7 +110,7 @@ class EmWorker:
             cells = map_grid(run.readings, parameters).size
             if lack := shortage(cells, len(run.readings), parameters.search.threads or cores()):
                 raise InputError(lack)
-            outcome = Outcome(run.mapper.run(run.readings, watch, run.start), '')
+            outcome = Outcome(run.mapper.run(run.readings, watch, run.start), '', input_warnings(run.readings))
         except Cancelled:
             outcome = Outcome(None, 'EM was cancelled')
         except MapperError as error:

@@ -71,6 +71,7 @@ class MapperNode(Node):
         self._live_count = self._published = self._explained = 0
         self._paused = False
         self._last_run = 'none yet'
+        self._wrong_input: list[str] = []
         self._reported: set[str] = set()
         # EM's results count only if nothing was reset since it began; both are published under the lock, so that
         # maps that were forgotten cannot come after the empty ones
@@ -264,7 +265,8 @@ class MapperNode(Node):
                 self.get_logger().warning(f'EM: {outcome.message}')
             else:
                 maps = outcome.maps
-                if warning := quality_warning(maps):
+                self._wrong_input = outcome.warnings
+                for warning in filter(None, [*outcome.warnings, quality_warning(maps)]):
                     self.get_logger().warning(f'EM: {warning}')
                 self._last_run = summary(maps, sum(maps.statistics['seconds'].values()))
                 self.get_logger().info(f'EM: {self._last_run}')
@@ -302,6 +304,7 @@ class MapperNode(Node):
         self._live = LogOddsMap(self.parameters)
         self._live_count = self._published = 0
         self._last_run = 'none since the reset'
+        self._wrong_input = []
         self._sensors.clear()
         # late subscribers must not get the maps that were forgotten
         nothing = Grid(self.parameters.grid.resolution, 0, 0, 1, 1)
@@ -373,7 +376,7 @@ class MapperNode(Node):
     def _write(self, maps: MapSet, explained: int) -> str:
         associator = self._associator
         newer = len(associator.buffer) - explained
-        warnings = []
+        warnings = self._associator.limits.warnings()
         if newer > 0:
             warnings.append(f'{newer} readings came after EM: only the live map has them; call run_em before save_maps')
         if note := thinned(len(maps.readings), explained):
@@ -432,7 +435,8 @@ class MapperNode(Node):
             self._paused,
             extra,
         )
-        diagnostics.add_faults(statuses[0], self._surroundings.faults())
+        wrong = [*associator.limits.warnings(), *self._wrong_input]
+        diagnostics.add_faults(statuses[0], [*self._surroundings.faults(), *wrong])
         statuses += self._journal.statuses(self.get_fully_qualified_name().lstrip('/'))
         statuses.append(self._sensors.status(self.get_fully_qualified_name().lstrip('/'), associator.readings))
         self._diagnostics_out.publish(diagnostics.array(statuses, self.get_clock().now().to_msg()))

@@ -164,6 +164,7 @@ def _warnings(bag: Bag, associator: PoseAssociator, lookup: Extrinsics) -> list[
         warnings.append(
             f"odometry's clock jumped back {associator.time_jumps} times; what waited for a pose was dropped"
         )
+    warnings += associator.limits.warnings()
     for reason, count in associator.odometry_rejected.items():
         warnings.append(
             f'{count} of {associator.odometry_received} odometry messages were rejected: {ODOMETRY_REASONS[reason]}'
@@ -194,4 +195,5 @@ def _nothing_associated(
     reasons = '; '.join(f'{count} {reason} ({REASONS[reason]})' for reason, count in associator.rejected.most_common())
     for reason, count in associator.odometry_rejected.most_common():
         reasons += f'; {count} odometry messages were rejected too: {ODOMETRY_REASONS[reason]}'
-    return InputError(f'all {associator.received} readings were rejected: {reasons}')
+    hints = ''.join(f'; {warning}' for warning in associator.limits.warnings())
+    return InputError(f'all {associator.received} readings were rejected: {reasons}{hints}')

@@ -282,6 +282,21 @@ def test_trouble_shows_in_diagnostics_and_passes(start: Any, robot: Robot) -> No
     assert total == int(readings()['readings received'])
 
 
+def test_ranges_in_millimetres_show_in_diagnostics_until_reset(start: Any, robot: Robot) -> None:
+    start(*RELIABLE, '-p', 'sensors.sonar.pose:=[0.0, 0.0, 0.0]')
+    robot.meet()
+    messages: list[Any] = []
+    for k in range(40):
+        stamp = 100 * NANOSECONDS + k * NANOSECONDS // 10
+        messages.append(OdometryMessage(stamp, 'odom', 'base_link', Pose2(0.01 * k, 0.0, 0.0)))
+        messages.append(RangeMessage(stamp, 'sonar', 2900.0 - 10 * k, 0.1, 3.0, 0.3))
+    robot.play(messages)
+    robot.until(lambda: 'millimetres' in robot.diagnostics['readings']['message'], what='a warning')
+    assert robot.diagnostics['readings']['level'] != b'\x00'
+    assert robot.call('reset').success
+    robot.until(lambda: 'millimetres' not in robot.diagnostics['readings']['message'], what='the warning passes')
+
+
 def test_pause(start: Any, robot: Robot) -> None:
     start(*RELIABLE, '-p', 'sensors.sonar.pose:=[0.0, 0.0, 0.0]')
     robot.meet()

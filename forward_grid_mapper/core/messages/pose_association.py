@@ -13,6 +13,7 @@ from collections.abc import Callable
 
 from ..common.parameters import Parameters
 from ..common.readings import Readings
+from .limit_watch import LimitWatch
 from .map_extent import MapExtent, possible
 from .message_types import NANOSECONDS, OdometryMessage, Pose2, RangeMessage
 from .pose_history import PoseHistory
@@ -63,6 +64,8 @@ class PoseAssociator:
         The frames of the first odometry message; empty before it.
     time_jumps : int
         How often odometry's clock jumped back.
+    limits : LimitWatch
+        Warns of ranges and limits in different units.
     """
 
     def __init__(
@@ -93,6 +96,7 @@ class PoseAssociator:
         self._extent = MapExtent()
         self._patient = patient
         self.buffer = ReadingBuffer(self.parameters.max_readings)
+        self.limits = LimitWatch()
         self.received = self.odometry_received = 0
         self.rejected: Counter[str] = Counter()
         self.odometry_rejected: Counter[str] = Counter()
@@ -126,6 +130,7 @@ class PoseAssociator:
     def add_range(self, message: RangeMessage) -> None:
         """Take one Range message."""
         self.received += 1
+        self.limits.add(message)
         measured = measure(message, self.parameters)
         if isinstance(measured, str):
             self._reject(message.frame_id, measured)
@@ -154,6 +159,7 @@ class PoseAssociator:
             self.map_frame = self.base_frame = ''
             self._history.clear()
         self.buffer.clear()
+        self.limits.clear()
         self.rejected.clear()
         self.odometry_rejected.clear()
         self.rejected_by_frame.clear()

@@ -1,0 +1,236 @@
+"""Input that gives a wrong map without any error: each warning names the cause and the remedy.
+
+These look at the readings alone, so that the node and the offline tool say the same. What the messages said before they
+became readings is looked at by `messages.limit_watch`.
+
+Thresholds are far from what sound drives show: a warning that is often wrong is not read.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..common.readings import Floats, Readings
+
+ENOUGH = 30
+"""Readings of a sensor below which nothing is said of it."""
+
+COPIES = 0.3
+"""Part of the readings that must be copies of others; a driver may send a value twice now and then."""
+
+AT_ONCE = 0.3
+"""Part of a sensor's readings that share their stamp with another one of a different range."""
+
+SHARED = 100
+"""Readings of one frame from which on its ranges are searched for a period; in few there is one by chance."""
+
+LONGEST_PERIOD = 32
+"""Sensors that may share one frame; more than any ring of sonars has."""
+
+REPEATS = 0.25
+"""A range and the one a whole round of sensors earlier differ by at most this part of what neighbours differ by: at
+the upper quartiles, since some readings are random."""
+
+DIFFERS = 0.3
+"""Metres by which the ranges of neighbouring sensors differ in a quarter of the cases; less may be noise."""
+
+STILL = 0.01, 0.01
+"""Metres and radians within which a robot stands still."""
+
+STANDS = 8.0
+"""Seconds of standing from which on the ranges are looked at."""
+
+BLOCK = 3.0
+"""Seconds of the parts of such a time whose median ranges are looked at."""
+
+LEAST = 5
+"""Readings of a sensor in such a part; fewer are not looked at."""
+
+CHANGED, OFTEN = 0.4, 0.3
+"""Metres by which the medians of so large a part of them differ from the median of all where a robot drives: people who
+pass a robot that stands change a sensor's ranges now and then."""
+
+MOST_CHANGED = 0.6
+"""Part of the sensors before which they have: people walk before some, a robot that drives changes most."""
+
+STUCK, MOVED = 0.97, 2.0
+"""A stuck sensor repeats one range to the millimetre in this part of its readings, over so many metres of driving."""
+
+TURNED = 0.5
+"""Radians that the robot turned meanwhile as well: along a straight wall a range may stay the same for long."""
+
+NARROW, WIDE = math.radians(3.0), math.radians(90.0)
+"""Fields of view that no sonar has."""
+
+REACHED = 0.6
+"""Part of max_range within which all echoes lie where it is too large."""
+
+SILENT = 0.05
+"""Part of the readings that are without echo then: in a small closed room all echoes are near, and none is missing."""
+
+ECHOES = 200
+"""Echoes from which on that is said."""
+
+
+def input_warnings(readings: Readings) -> list[str]:
+    """Return what is wrong with readings that could be placed; empty if nothing seems to be."""
+    if len(readings) < ENOUGH:
+        return []
+    by_time = readings.select(np.argsort(readings.stamp, kind='stable'))
+    checks = (_copies, _shared_frame, _standing, _stuck, _field_of_view, _reach)
+    return [text for check in checks if (text := check(by_time))]
+
+
+def _sensors(readings: Readings) -> Iterable[tuple[str, Readings]]:
+    """Yield name and readings of every sensor that has enough of them."""
+    for number, name in enumerate(readings.sensor_names):
+        mine = readings.sensor == number
+        if np.count_nonzero(mine) >= ENOUGH:
+            yield name, readings.select(mine)
+
+
+def _listed(names: list[str]) -> str:
+    return ', '.join(names[:8]) + (f' and {len(names) - 8} more' if len(names) > 8 else '')
+
+
+def _copies(readings: Readings) -> str:
+    order = np.lexsort((readings.z, readings.sensor, readings.stamp))
+    stamp, sensor, z = readings.stamp[order], readings.sensor[order], readings.z[order]
+    same = (stamp[1:] == stamp[:-1]) & (sensor[1:] == sensor[:-1]) & (z[1:] == z[:-1])
+    copies = int(np.count_nonzero(same))
+    # a sensor whose readings all have one stamp is another fault
+    if copies < COPIES * len(z) or len(np.unique(stamp)) < 0.1 * len(z) / max(len(readings.sensor_names), 1):
+        return ''
+    return (
+        f'{copies} of {len(z)} readings are copies of others (same sensor, stamp and range), and count as evidence '
+        f'of their own: was a topic recorded twice, or is it published by two nodes? Leave one of them out '
+        f'(range_topics)'
+    )
+
+
+def _shared_frame(readings: Readings) -> str:
+    suspects = []
+    for name, mine in _sensors(readings):
+        z = mine.z
+        follows = mine.stamp[1:] == mine.stamp[:-1]
+        at_once = np.count_nonzero(follows & (np.abs(np.diff(z)) > DIFFERS)) > AT_ONCE * len(z)
+        steps = np.abs(np.diff(z))
+        neighbours = float(np.quantile(steps, 0.75))
+        periods = range(3, min(LONGEST_PERIOD, len(z) // 10) + 1)
+        rounds = [float(np.quantile(np.abs(z[k:] - z[:-k]), 0.75)) for k in periods]
+        takes_turns = len(z) >= SHARED and neighbours > DIFFERS and min(rounds) < REPEATS * neighbours
+        if at_once or takes_turns:
+            suspects.append(name)
+    if not suspects:
+        return ''
+    return (
+        f'the readings of frame {_listed(suspects)} take turns as those of several sensors do: do all sensors have one '
+        f'frame_id? Give each its own in its driver, with its own pose, or all readings are mapped from one pose'
+    )
+
+
+def _standing(readings: Readings) -> str:
+    """Look for a time in which odometry stands still, and the ranges of most sensors change all the same."""
+    lasted = 0.0
+    names, per_sensor = [], []
+    for name, mine in _sensors(readings):
+        names.append(name)
+        per_sensor.append(mine)
+    if not names:
+        return ''
+    for begin, end in _still_times(per_sensor[0]):
+        changed = [_changes(mine, begin, end) for mine in per_sensor]
+        judged = [change for change in changed if change is not None]
+        if len(judged) >= max(1, len(names) // 2) and sum(judged) >= MOST_CHANGED * len(judged):
+            lasted += (end - begin) / 1e9
+    if not lasted:
+        return ''
+    return (
+        f'odometry stands still for {lasted:.0f} s while the ranges of most sensors change: does the robot drive while '
+        f'odometry does not count? Check its wheel encoders, or choose another odometry topic'
+    )
+
+
+def _still_times(mine: Readings) -> Iterable[tuple[int, int]]:
+    """Yield begin and end, in nanoseconds, of the times in which a sensor did not move."""
+    moved = (np.hypot(np.diff(mine.x), np.diff(mine.y)) > STILL[0]) | (
+        np.abs(np.remainder(np.diff(mine.yaw) + math.pi, 2 * math.pi) - math.pi) > STILL[1]
+    )
+    cuts = np.flatnonzero(moved) + 1
+    for first, last in zip([0, *cuts.tolist()], [*cuts.tolist(), len(mine)], strict=True):
+        # steps too small to be seen one by one add up
+        part = slice(first, last)
+        wide = max(float(np.ptp(mine.x[part])), float(np.ptp(mine.y[part])))
+        if mine.stamp[last - 1] - mine.stamp[first] >= STANDS * 1e9 and wide <= STILL[0]:
+            yield int(mine.stamp[first]), int(mine.stamp[last - 1])
+
+
+def _changes(mine: Readings, begin: int, end: int) -> bool | None:
+    """Return whether the ranges change as those of a robot that drives do; None if there are too few readings."""
+    inside = (mine.stamp >= begin) & (mine.stamp <= end)
+    z, block = mine.z[inside], ((mine.stamp[inside] - begin) / (BLOCK * 1e9)).astype(np.int64)
+    parts = np.split(z, np.flatnonzero(np.diff(block)) + 1)
+    medians = np.array([np.median(part) for part in parts if len(part) >= LEAST])
+    if len(medians) * BLOCK < STANDS / 2:
+        return None
+    return bool(np.mean(np.abs(medians - np.median(z)) > CHANGED) >= OFTEN)
+
+
+def _stuck(readings: Readings) -> str:
+    suspects = []
+    for name, mine in _sensors(readings):
+        heard = mine.z[mine.echo]
+        if len(heard) < STUCK * len(mine) or not _drove(mine):
+            continue
+        rounded = np.rint(heard * 1000.0).astype(np.int64)
+        values, counts = np.unique(rounded, return_counts=True)
+        most = int(counts.argmax())
+        if counts[most] >= STUCK * len(mine):
+            suspects.append(f'{name} ({values[most] / 1000.0:.3f} m)')
+    if not suspects:
+        return ''
+    return (
+        f'sensor {_listed(suspects)} gives one and the same range wherever the robot drives: is it broken, or does it '
+        f'hear a part of the robot? Repair it, or leave its topic out'
+    )
+
+
+def _drove(mine: Readings) -> bool:
+    path = float(np.hypot(np.diff(mine.x), np.diff(mine.y)).sum())
+    return path >= MOVED and float(np.ptp(np.unwrap(mine.yaw))) >= TURNED
+
+
+def _field_of_view(readings: Readings) -> str:
+    angle = 2 * readings.half_angle
+    odd = (angle < NARROW) | (angle > WIDE)
+    if np.count_nonzero(odd) < 0.5 * len(readings):
+        return ''
+    degrees = math.degrees(float(np.median(angle[odd])))
+    cause = 'is it in degrees?' if degrees > 90 else 'is it half of the angle, or a default of the driver?'
+    return (
+        f'the field of view is {degrees:.3g} degrees, which no sonar has; {cause} field_of_view is the full angle of '
+        f'the cone in radians, 0.26 for 15 degrees: correct the driver, or set the parameter field_of_view'
+    )
+
+
+def _reach(readings: Readings) -> str:
+    echo = readings.echo
+    heard: Floats = readings.z[echo]
+    if len(heard) < ECHOES or np.count_nonzero(~echo) < SILENT * len(readings):
+        return ''
+    # a few wild echoes reach anywhere
+    part: NDArray[np.float64] = heard / readings.z_max[echo]
+    farthest = float(np.quantile(part, 0.995))
+    if farthest > REACHED:
+        return ''
+    limit = float(np.median(readings.z_max))
+    metres = farthest * limit
+    unit = 'is max_range in centimetres, millimetres or feet?' if farthest < 0.1 else 'does the sensor reach so far?'
+    return (
+        f'max_range is {limit:g} m, and no echo comes from beyond {metres:.1f} m: {unit} A reading without echo '
+        f'is taken to say that all is free up to max_range; set the parameter max_range to what the sensor reaches'
+    )

@@ -1,0 +1,214 @@
+"""Input that gives a wrong map without an error: warned of with cause and remedy, and sound drives never."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable
+from functools import lru_cache
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+
+from forward_grid_mapper.core.common.parameters import Parameters
+from forward_grid_mapper.core.learning.input_warnings import input_warnings
+from forward_grid_mapper.core.messages.message_types import OdometryMessage, Pose2, RangeMessage
+from forward_grid_mapper.core.messages.pose_association import PoseAssociator
+from forward_grid_mapper.simulation.drive import corridor_drive, door_drive
+from forward_grid_mapper.simulation.sonar import NOISE_FREE, NOISY, SonarArray, front_array, sonar_ring
+
+
+class Messages(NamedTuple):
+    extrinsics: dict[str, Pose2]
+    odometry: list[OdometryMessage]
+    ranges: list[RangeMessage]
+
+    def with_ranges(self, change: Callable[[RangeMessage], RangeMessage]) -> Messages:
+        return self._replace(ranges=[change(m) for m in self.ranges])
+
+
+@lru_cache(maxsize=1)
+def drive() -> Messages:
+    """Along a corridor and back with eight sonars."""
+    recording = corridor_drive(0, 1, NOISY, True, front_array())
+    return Messages(dict(recording.extrinsics), list(recording.odometry), list(recording.ranges))
+
+
+@lru_cache(maxsize=1)
+def circling() -> Messages:
+    """Round and round in a room of 8 by 6 metres, for a minute."""
+    rng = np.random.default_rng(1)
+    yaws = np.arange(8) * math.pi / 4
+    extrinsics = {f'sonar_{n}': Pose2(0.0, 0.0, float(yaw)) for n, yaw in enumerate(yaws)}
+    odometry, ranges = [], []
+    for k in range(601):
+        stamp, angle = k * 100_000_000, k / 60
+        pose = Pose2(1.5 * math.cos(angle), 1.5 * math.sin(angle), angle + math.pi / 2)
+        odometry.append(OdometryMessage(stamp, 'odom', 'base_link', pose))
+        for frame, yaw in zip(extrinsics, yaws, strict=True):
+            c, s = math.cos(pose.yaw + yaw), math.sin(pose.yaw + yaw)
+            z = min((math.copysign(4, c) - pose.x) / (c or 1e-9), (math.copysign(3, s) - pose.y) / (s or 1e-9))
+            z += rng.normal(0, 0.02)
+            ranges.append(RangeMessage(stamp, frame, math.inf if z > 5 else z, 0.1, 5.0, 0.26))
+    return Messages(extrinsics, odometry, ranges)
+
+
+def told(messages: Messages) -> list[str]:
+    """What is said of a drive, node and offline alike."""
+    associator = PoseAssociator(lambda base, frame, stamp: messages.extrinsics.get(frame), Parameters(), patient=True)
+    merged: list[OdometryMessage | RangeMessage] = [*messages.odometry, *messages.ranges]
+    for message in sorted(merged, key=lambda m: m.stamp):
+        if isinstance(message, RangeMessage):
+            associator.add_range(message)
+        else:
+            associator.add_odometry(message)
+    associator.finish()
+    return [*associator.limits.warnings(), *input_warnings(associator.readings)]
+
+
+def scaled(range_by: float, limits_by: float) -> Messages:
+    return drive().with_ranges(
+        lambda m: m._replace(
+            range=m.range * range_by, min_range=m.min_range * limits_by, max_range=m.max_range * limits_by
+        )
+    )
+
+
+def twice() -> Messages:
+    return drive()._replace(ranges=[m for m in drive().ranges for _ in range(2)])
+
+
+def one_frame(apart: int) -> Messages:
+    """All sensors in one frame, `apart` nanoseconds between two of a sweep."""
+    frames = list(drive().extrinsics)
+    return drive()._replace(
+        extrinsics={'sonar': drive().extrinsics[frames[0]]},
+        ranges=[m._replace(frame_id='sonar', stamp=m.stamp + apart * frames.index(m.frame_id)) for m in drive().ranges],
+    )
+
+
+def standing(part: float) -> Messages:
+    """Odometry that stands still from a part of the drive on."""
+    odometry = circling().odometry
+    stop = odometry[int(part * (len(odometry) - 1))]
+    return circling()._replace(odometry=[m if m.stamp < stop.stamp else m._replace(pose=stop.pose) for m in odometry])
+
+
+def stuck(frame: int, value: float) -> Messages:
+    name = list(circling().extrinsics)[frame]
+    return circling().with_ranges(lambda m: m._replace(range=value) if m.frame_id == name else m)
+
+
+SCENARIOS: dict[str, tuple[Callable[[], Messages], str]] = {
+    'every message twice': (twice, r'copies of others.*recorded twice.*Leave one'),
+    'one frame, one stamp a sweep': (lambda: one_frame(0), r'frame sonar take turns.*one frame_id.*Give each its own'),
+    'one frame, one after the other': (lambda: one_frame(8_000_000), r'frame sonar take turns.*one frame_id'),
+    'odometry never moves': (lambda: standing(0.0), r'odometry stands still.*while the ranges.*encoders'),
+    'odometry stops in the middle': (lambda: standing(0.5), r'odometry stands still for \d+ s'),
+    'a sensor at 1.2 m': (lambda: stuck(2, 1.2345), r'gives one and the same range.*Repair it'),
+    'a sensor at 0.2 m': (lambda: stuck(5, 0.2), r'sensor \S+ \(0\.200 m\) gives one and the same range'),
+    'field of view of 1 degree': (
+        lambda: drive().with_ranges(lambda m: m._replace(field_of_view=math.radians(1))),
+        r'field of view is 1 degrees.*set the parameter field_of_view',
+    ),
+    'field of view of 120 degrees': (
+        lambda: drive().with_ranges(lambda m: m._replace(field_of_view=math.radians(120))),
+        r'field of view is 120 degrees',
+    ),
+    'max_range four times too large': (
+        lambda: drive().with_ranges(
+            lambda m: m._replace(max_range=4 * m.max_range, range=math.inf if m.range >= m.max_range else m.range)
+        ),
+        r'no echo comes from beyond.*does the sensor reach so far.*set the parameter max_range',
+    ),
+    'no limit stated': (
+        lambda: drive().with_ranges(
+            lambda m: m._replace(max_range=3.4e38, range=math.inf if m.range >= m.max_range else m.range)
+        ),
+        r'does the driver state no limit.*set the parameter max_range',
+    ),
+    'ranges in centimetres': (lambda: scaled(100, 1), r'are the ranges in centimetres and the limits in metres'),
+    'ranges in millimetres': (lambda: scaled(1000, 1), r'are the ranges in millimetres and the limits in metres'),
+    'ranges in feet': (lambda: scaled(3.281, 1), r'are the ranges in feet and the limits in metres'),
+    'ranges in inches': (lambda: scaled(39.37, 1), r'are the ranges in inches and the limits in metres'),
+    'min_range in centimetres': (
+        lambda: drive().with_ranges(lambda m: m._replace(min_range=2.0)),
+        r'below min_range \(2 m\).*are the limits in centimetres',
+    ),
+    'limits in centimetres': (
+        lambda: scaled(1, 100),
+        r'max_range is 500 m, and no range.*is it in centimetres',
+    ),
+    'limits in millimetres': (lambda: scaled(1, 1000), r'max_range is 5000 m, and no range.*is it in centimetres'),
+    'all in centimetres': (lambda: scaled(100, 100), r'are ranges and limits in centimetres or millimetres'),
+    'all in millimetres': (lambda: scaled(1000, 1000), r'are ranges and limits in centimetres or millimetres'),
+}
+
+
+@pytest.mark.parametrize('name', sorted(SCENARIOS))
+def test_wrong_input_is_warned_of(name: str) -> None:
+    make, expected = SCENARIOS[name]
+    warnings = told(make())
+    assert any(re.search(expected, warning) for warning in warnings), warnings
+    assert len(warnings) == 1, f'one cause, one warning: {warnings}'
+
+
+@pytest.mark.parametrize('noise', [NOISY, NOISE_FREE])
+@pytest.mark.parametrize('sonars', [front_array, sonar_ring])
+def test_no_alarm_in_the_simulated_worlds(noise: object, sonars: Callable[[], SonarArray]) -> None:
+    for seed in range(3):
+        for recording in (
+            *(door_drive(seen, noise, seed, sonars()) for seen in (1, 3, 16)),
+            corridor_drive(seed, 1 + seed % 2, noise, noise is NOISY, sonars()),
+        ):
+            assert told(Messages(dict(recording.extrinsics), recording.odometry, recording.ranges)) == []
+
+
+@pytest.mark.parametrize('odometry', ['/odom', '/odom_corrected'])
+@pytest.mark.parametrize('name', ['office_a', 'office_b', 'building_a', 'building_b', 'building_c'])
+def test_no_alarm_on_the_recordings(shared: Path, name: str, odometry: str) -> None:
+    from forward_grid_mapper.recordings.read_drive import read_drive
+
+    bag = shared / 'data' / name / 'bag'
+    if not bag.exists():
+        pytest.skip(f'{bag} is not there')
+    found = read_drive(bag, Parameters(), {}, None, odometry)
+    assert found.associator.limits.warnings() == []
+    assert input_warnings(found.associator.readings) == []
+
+
+def test_a_robot_that_stands_while_people_walk_is_no_fault() -> None:
+    """Two of eight sensors see somebody come near; the others see the same as before."""
+    rng = np.random.default_rng(0)
+    frames = list(drive().extrinsics)
+    pose = drive().odometry[0].pose
+    odometry = [OdometryMessage(k * 100_000_000, 'odom', 'base_link', pose) for k in range(601)]
+    ranges = [
+        RangeMessage(
+            k * 100_000_000,
+            frame,
+            2.0 + rng.normal(0, 0.02) - (0.03 * (k % 50) if n < 2 else 0.0),
+            0.1,
+            5.0,
+            0.26,
+        )
+        for k in range(600)
+        for n, frame in enumerate(frames)
+    ]
+    assert told(Messages(drive().extrinsics, odometry, ranges)) == []
+
+
+def test_no_alarm_where_a_robot_circles() -> None:
+    assert told(circling()) == []
+
+
+def test_few_readings_say_nothing() -> None:
+    few = drive()._replace(ranges=twice().ranges[:28])
+    assert told(few) == []
+
+
+def test_what_a_driver_sends_for_no_echo_is_no_fault() -> None:
+    for value in (5.11, 6.5535, 65.535, 99.0):
+        assert told(drive().with_ranges(lambda m, v=value: m._replace(range=v) if m.range >= m.max_range else m)) == []
