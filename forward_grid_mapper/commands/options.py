@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 
 from ..core.common.errors import ParameterError
-from ..core.common.parameters import Parameters, find
+from ..core.common.parameters import DEPRECATED, Parameters, find
 from ..core.messages.message_types import Pose2
 from ..files.parameter_file import load_parameters, parse_setting
 from ..files.parameter_text import dump_parameters
@@ -61,6 +61,6 @@ def chosen_parameters(options: argparse.Namespace) -> tuple[Parameters, dict[str
     values, extrinsics, _ = load_parameters(options.params) if options.params else ({}, {}, {})
     settings = dict(parse_setting(text) for text in options.set)
     for name in settings:
-        if find(name).group == 'node':
+        if name not in DEPRECATED and find(name).group == 'node':
             raise ParameterError(f'--set {name}: only the node has this parameter; topics have options of their own')
     return Parameters.from_flat({**values, **settings}), dict(extrinsics)

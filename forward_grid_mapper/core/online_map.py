@@ -17,6 +17,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from .common.constants import EXTENSION, FORBIDDEN
 from .common.grid import Grid, part_of
 from .common.parameters import Parameters
 from .common.readings import Readings
@@ -28,7 +29,7 @@ from .maps.uncertainty import uncertainty_map
 from .runtime.memory import memory_for_pairs
 from .runtime.threads import cores
 from .search.flips import flip_in_order, promising
-from .search.prior import Prior, local_prior, odds_given_neighbours, shapes
+from .search.prior import has_walls, odds_given_neighbours, wall_prior
 from .search.search import LEAST, Search, Window
 from .sensor.cone_table import effective_sigma, grid_of
 
@@ -65,7 +66,7 @@ class OnlineMap:
         self._traversed = np.zeros((0, 0), np.bool_)
         self._since: list[Window] = []
         self._count = 0
-        self._prior = Prior(np.zeros(0), shapes(self._parameters.search))
+        self._prior = wall_prior(self._parameters.search, np.zeros(0, np.bool_), self._parameters.grid.resolution)
         self._last = np.zeros(0), np.zeros(0), np.zeros(0, np.int64)
         self.grid = Grid(self._parameters.grid.resolution, 0, 0, 0, 0)
 
@@ -86,8 +87,7 @@ class OnlineMap:
         p = self._parameters
         self.grid = map_grid(readings, p, within=self.grid)
         evidence = self._with_room()
-        if p.search.driven_cost > 0:
-            self._mark_traversed(readings, evidence.grid)
+        self._mark_traversed(readings, evidence.grid)
         new, known = self._sort_out(readings)
         evidence.extend(readings.select(new))
         # after the new ones, which may be what others of the same call say too
@@ -127,7 +127,7 @@ class OnlineMap:
         # the last reading may be one of before a jump, off this grid
         rows, columns = rows.clip(0, grid.height - 1), columns.clip(0, grid.width - 1)
         near = (slice(rows.min(), rows.max() + 1), slice(columns.min(), columns.max() + 1))
-        self._prior.local.reshape(grid.shape)[near] = local_prior(self._parameters.search, self._traversed[near])
+        self._prior.local.reshape(grid.shape)[near][self._traversed[near]] = -FORBIDDEN
         n = STRIDES[-1]
         self._last = x[-n:], y[-n:], stamp[-n:]
 
@@ -179,7 +179,7 @@ class OnlineMap:
             up, right = inner[0].start, inner[1].start
             self._since = [(a + up, b + up, c + right, d + right) for a, b, c, d in self._since]
             evidence.grow(larger)
-        self._prior = self._prior._replace(local=local_prior(p.search, self._traversed).ravel())
+        self._prior = wall_prior(p.search, self._traversed.ravel(), g.resolution)
         return evidence
 
     def _around(self, grid: Grid, readings: Readings) -> Window:
@@ -214,7 +214,8 @@ class OnlineMap:
             return self.grid, np.zeros((0, 0), np.int8), np.zeros((0, 0), np.float32)
         evidence, search = self._evidence, self._parameters.search
         window = evidence.grid.window(self.grid)
-        ml = post_process(evidence, search.extend, search.least_passed, self._traversed)
+        extension = EXTENSION if has_walls(search) else 0.0
+        ml = post_process(evidence, extension, search.least_passed, self._traversed)
         neighbours = odds_given_neighbours(self._prior, ml == 1)
         uncertainty = uncertainty_map(evidence.of_occupancy(), neighbours, ml, search)
         return self.grid, ml[window], uncertainty[window]

@@ -5,7 +5,8 @@ only if it met the surface nearly along its normal. Most of what speaks against 
 of real sonars, comes from readings that graze them.
 
 The normal is estimated before any search, from the echoes alone. Near a surface the bearings of those readings whose
-range agrees gather around its normal; φ and φ + π are one, so 2φ is averaged, over the 3 x 3 cells around:
+range agrees gather around its normal; φ and φ + π are one, so 2φ is averaged, over the square of `NEIGHBOURHOOD`
+around the cell:
 
     C = Σ w cos 2φ      S = Σ w sin 2φ      M = Σ w      w = exp(−(d − z)² / 2σ²)      normal = atan2(S, C) / 2
 
@@ -20,19 +21,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ..common.constants import LEAST_AGREEMENT, LEAST_WEIGHT, NEIGHBOURHOOD, THROUGH, WEIGHT_CELL
 from ..common.grid import Grid
 from ..runtime.jit import kernel
 from .cone import rows_of, runs_of
 from .cone_table import Cones, cone_of
-
-LEAST_WEIGHT = 3.0
-"""Echoes, in the sum M, that it takes to know a normal."""
-
-LEAST_AGREEMENT = 0.5
-"""Length of the mean of the doubled bearings that it takes, 1 where all agree."""
-
-THROUGH = 2.0
-"""A reading that exceeds_incidence_angle a cell does not contradict it if its range is this many σ beyond."""
 
 QUANTUM = 2.0**-20
 """Unit of the sums, which as whole numbers do not depend on their order."""
@@ -118,17 +111,37 @@ def _before(known: NDArray[Any]) -> NDArray[np.int32]:
     return out
 
 
-def _box(values: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Return the sums over 3 x 3 cells, nothing beyond the edges."""
-    wide = np.pad(values, 1)
-    rows = wide[:-2] + wide[1:-1] + wide[2:]
-    out: NDArray[np.float64] = (rows[:, :-2] + rows[:, 1:-1] + rows[:, 2:]) * QUANTUM
-    return out
+def _moving_sum(values: NDArray[np.float64], length: float) -> NDArray[np.float64]:
+    """Return the sums down the columns over `length` cells around each, of which the outermost may be parts of cells.
+
+    Parameters
+    ----------
+    values : float64, shape (height, width)
+    length : float
+        Cells, at least 1.
+    """
+    whole = math.ceil((length - 1.0) / 2.0 - 1e-9)
+    part = (length - 1.0) / 2.0 - (whole - 1)
+    height = len(values)
+    total = np.cumsum(np.pad(values, ((whole + 1, whole), (0, 0))), axis=0)
+    outer = total[2 * whole + 1 :] - total[:height]
+    if whole == 0:
+        return outer
+    inner = total[2 * whole : 2 * whole + height] - total[1 : height + 1]
+    return inner + part * (outer - inner)
 
 
-def normals_of(sums: NDArray[np.int64], shape: tuple[int, int], angle: float) -> SurfaceNormals:
+def _box(values: NDArray[np.int64], resolution: float) -> NDArray[np.float64]:
+    """Return the sums over the square of `NEIGHBOURHOOD` around each cell, in cells of `WEIGHT_CELL`."""
+    length = max(round(NEIGHBOURHOOD / resolution, 6), 1.0)
+    sums = _moving_sum(_moving_sum(values.astype(np.float64), length).T, length).T
+    return sums * (QUANTUM * (resolution / WEIGHT_CELL) ** 2)
+
+
+def normals_of(sums: NDArray[np.int64], grid: Grid, angle: float) -> SurfaceNormals:
     """Return the normals that the sums of `gather` give; readings graze more than `angle` (radians) off them."""
-    cosine, sine, mass = (_box(values.reshape(shape)) for values in sums)
+    shape = grid.shape
+    cosine, sine, mass = (_box(values.reshape(shape), grid.resolution) for values in sums)
     agreement = np.hypot(cosine, sine)
     known = (mass >= LEAST_WEIGHT) & (agreement >= LEAST_AGREEMENT * mass)
     normal = np.arctan2(sine, cosine) / 2
