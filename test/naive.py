@@ -378,7 +378,7 @@ STEPS = [(1, 0), (1, 1), (0, 1), (-1, 1), (-1, 0), (-1, -1), (0, -1), (1, -1)]
 
 
 def drawn_out(occupied: np.ndarray, told: np.ndarray, seen: np.ndarray, steps: int, barred: np.ndarray) -> np.ndarray:
-    """Cells of 0.1 m by which straight walls go on: the docstring of `extend`. `told` in nats, shape (height, width)."""
+    """Cells of 0.1 m by which straight walls go on: the docstring of `extend`. `told`: (height, width), nats."""
     run, most = round(STRAIGHT_RUN / 0.1), MOST_AGAINST_EXTENSION * 0.1
     height, width = occupied.shape
     out = np.zeros(occupied.shape, np.uint8)
