@@ -28,7 +28,7 @@ from forward_grid_mapper.core.evidence.updates import _add_to_free_zone, evaluat
 from forward_grid_mapper.core.maps.log_odds_map import arc_depth
 from forward_grid_mapper.core.maps.traversed import traversed_cells
 from forward_grid_mapper.core.search.flips import promising
-from forward_grid_mapper.core.search.prior import Prior, local_prior, shapes
+from forward_grid_mapper.core.search.prior import wall_prior
 from forward_grid_mapper.core.search.search import LEAST, Search
 from forward_grid_mapper.core.sensor.cone_table import grid_of
 from forward_grid_mapper.core.warm_up import warm_up
@@ -158,7 +158,7 @@ def profile(name: str, readings: Readings, runs: int) -> None:
     scanned = _scanned(s, cells)
     found, gains = np.empty(grid.size, np.int64), np.empty(grid.size)
     window = (0, grid.height, 0, grid.width)
-    prior = Prior(local_prior(p.search, np.zeros(grid.size, np.bool_)), shapes(p.search))
+    prior = wall_prior(p.search, np.zeros(grid.size, np.bool_), grid.resolution)
     n = len(readings)
     kernels: tuple[tuple[str, Callable[[], Any], tuple[tuple[int, str], ...]], ...] = (
         ('make pairs', lambda: _make_all(s), ((n, 'reading'), (pairs, 'pair'))),

@@ -26,15 +26,12 @@ T = TypeVar('T')
 PLAIN: dict[str, float] = {
     'surface_offset': 0.0,
     'grazing_angle': 1.5708,
-    'driven_cost': 0.0,
-    'line_bonus': 0.0,
     'end_cost': 0.0,
-    'isolated_cost': 0.0,
-    'bridges': 0,
-    'extend': 0,
     'least_passed': 0.0,
+    'likelihood_exponent': 1.0,
 }
-"""Parameters with which the search maximises nothing but log p(Z | m) + logit(prior) x (occupied cells)."""
+"""Parameters with which the search maximises nothing but log p(Z | m) + logit(prior) x (occupied cells), over maps
+without an occupied cell where a sensor was moved."""
 
 LITTLE = 0.1
 """Fraction of the machine that other processes may use during a run."""

@@ -21,7 +21,7 @@ from forward_grid_mapper.core.evidence.evidence import Evidence
 from forward_grid_mapper.core.search.search import Search
 from forward_grid_mapper.core.sensor.forward_model import log_likelihood
 
-INDEPENDENT = {'line_bonus': 0.0, 'end_cost': 0.0, 'isolated_cost': 0.0}
+INDEPENDENT = {'end_cost': 0.0}
 """Cells that know nothing of each other, as in the sum over all maps here."""
 
 

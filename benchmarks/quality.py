@@ -3,7 +3,8 @@
 
 usage: quality.py [--quick] [--ablate] [--set NAME=VALUE ...] [--runs 5] [--pictures DIR]
 
-On the simulated worlds of the paper, on worlds of our own, with cones of 15° and 30°, on readings drawn from the
+On the simulated worlds of the paper, on worlds of our own, with cones of 15° and 30°, in cells of 0.1 m and, for two
+of them, of half and a quarter of that, on readings drawn from the
 forward model itself, and on the recordings under ../shared/data where they are. Each way of mapping has the same
 parameters everywhere; but the standard map has the gains of the best F1, or of the best nav_iou, for the very world,
 and for its log loss the gains and the scale that lose least there, which nobody could know.
@@ -36,6 +37,7 @@ from quality_scores import (
     Standard,
     known_cells,
     least_loss,
+    nav_of,
     on_truth,
     oracle,
     reliability,
@@ -52,17 +54,16 @@ from forward_grid_mapper.core.sensor.cone_table import grid_of
 from forward_grid_mapper.core.warm_up import warm_up
 from forward_grid_mapper.files.parameter_file import load_parameters, parse_setting
 from forward_grid_mapper.simulation.drive import corridor_drive
+from forward_grid_mapper.simulation.score import score_map
 
 PAPER = Path(__file__).resolve().parents[1] / 'config' / 'paper.yaml'
 
-NO_SHAPES: dict[str, Any] = {'line_bonus': 0.0, 'end_cost': 0.0, 'isolated_cost': 0.0, 'bridges': 0}
+NO_WALLS: dict[str, Any] = {'end_cost': 0.0}
 
 PLAIN: dict[str, Any] = {
-    **NO_SHAPES,
+    **NO_WALLS,
     'surface_offset': 0.0,
     'grazing_angle': 1.5708,
-    'driven_cost': 0.0,
-    'extend': 0,
     'least_passed': 0.0,
 }
 """Flips and shifts, and nothing else, with the default's sensor model."""
@@ -70,10 +71,7 @@ PLAIN: dict[str, Any] = {
 ABLATIONS: dict[str, dict[str, Any]] = {
     'surfaces before the centre': {'surface_offset': 0.0},
     'surface normals': {'grazing_angle': 1.5708},
-    'traversed cells': {'driven_cost': 0.0},
-    'prior for walls': NO_SHAPES,
-    'gap closing': {'bridges': 0},
-    'wall extension': {'extend': 0},
+    'prior for walls': NO_WALLS,
     'unknown': {'least_passed': 0.0},
     'lost echoes': {'p_lost': 0.0},
     'neighbours (uncertainty)': {'neighbour_weight': 0.0, 'alpha': 0.8, 'uncertainty_prior': 0.3},
@@ -81,10 +79,14 @@ ABLATIONS: dict[str, dict[str, Any]] = {
 }
 """What the default is without each of its parts."""
 
+RESOLUTIONS = (0.1, 0.05, 0.025)
+RESOLUTION_WORLDS = ('doors 15°', 'clutter 15°')
+"""The edges of cells, metres, and the drives, their first seeds, for the table of resolutions."""
+
 DRAWN = {
     'p_hit 0.9, p_rand 0.05, p_lost 0': {'p_hit': 0.9, 'p_rand': 0.05, 'p_lost': 0.0},
     'p_hit 0.9, p_rand 0.05, p_lost 0.1': {'p_hit': 0.9, 'p_rand': 0.05, 'p_lost': 0.1},
-    'the default: four of five are noise': {},
+    'the default': {},
 }
 
 COLUMNS = (
@@ -243,6 +245,23 @@ def print_drawn(base: dict[str, Any], quick: bool) -> None:
     print('parameters, the best prior, and every cell but the one asked for taken from the true map')
 
 
+def print_resolutions(groups: dict[str, list[Case]], base: dict[str, Any], tool: ModuleType | None) -> None:
+    """Print the figures of drives mapped in cells of several sizes, all scored at the cells of the world, 0.1 m."""
+    print('\nThe same drive in cells of other sizes: a wall counts as found, and a cell as right, within 0.1 m')
+    print(f'{"":16s}{"cells":>8s}{"F1":>8s}{"cover":>8s}{"dots":>6s}{"door":>6s}{"nav_iou":>9s}{"seconds":>9s}')
+    for name in RESOLUTION_WORLDS:
+        case = groups[name][0]
+        assert case.world is not None
+        for resolution in RESOLUTIONS:
+            maps = Mapper(Parameters.from_flat({**base, 'resolution': resolution})).run(case.readings)
+            s = score_map(maps.ml, maps.grid, case.world, case.met > 0)
+            nav = nav_of(maps.ml, maps.grid, case, tool)
+            spent = sum(maps.statistics['seconds'].values())
+            door = min(s.door_widths, default=math.nan)
+            print(f'{name:16s}{100 * resolution:5g} cm{s.f1:8.3f}{s.column_coverage:8.3f}{s.false_dots:6d}', end='')
+            print(f'{door:6.1f}{nav:9.3f}{spent:9.1f}', flush=True)
+
+
 def print_cost(base: dict[str, Any], paper: dict[str, Any], runs: int) -> None:
     """Print what the default costs beside plain EM, run by turns."""
     variants = {
@@ -291,6 +310,7 @@ def main() -> None:
         print('\n'.join(reliability(result.beliefs)))
     if options.ablate:
         print_ablations(groups, base, rows['default'], tool)
+    print_resolutions(groups, base, tool)
     print_drawn(base, options.quick)
     print_cost(base, paper, options.runs)
     if options.pictures:

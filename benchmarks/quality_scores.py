@@ -13,10 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 from quality_worlds import Case
 
-from forward_grid_mapper.commands.experiment import GAINS
+from forward_grid_mapper.commands.experiment import GAINS, standard_map
 from forward_grid_mapper.core.common.grid import Grid
-from forward_grid_mapper.core.common.parameters import Parameters
-from forward_grid_mapper.core.maps.log_odds_map import LogOddsMap
 from forward_grid_mapper.simulation.score import score_map
 
 Floats = NDArray[np.float64]
@@ -90,6 +88,15 @@ def _nav(p: Floats, case: Case, tool: ModuleType | None) -> dict[str, float]:
     path = tool.path_cells(case.path_xy, np.array(case.origin), case.resolution, case.truth.shape)
     scores: dict[str, float] = tool.score(p, case.truth, path, case.resolution, ROBOT_RADIUS)
     return scores
+
+
+def nav_of(ml: NDArray[np.int8], grid: Grid, case: Case, tool: ModuleType | None) -> float:
+    """Return nav_iou of a map of any resolution (1 occupied, 0 free, -1 unknown); NaN without the scoring tool."""
+    if tool is None:
+        return math.nan
+    known, target = np.where(ml < 0, np.nan, ml), np.array(case.origin)
+    p = tool.resample(known, np.array(grid.origin), grid.resolution, case.truth.shape, target, case.resolution)
+    return _nav(p, case, tool)['nav_iou']
 
 
 def _near(cells: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -170,10 +177,10 @@ class Standard:
         self._parts: dict[float, tuple[Grid, list[Floats], list[Floats]]] = {}
         unit = {'live_p_occupied': 1 / (1 + math.exp(-1)), 'live_p_free': 1 / (1 + math.e)}
         unit['live_p_free_no_echo'] = unit['live_p_free']
-        for depth in sorted({gains['live_depth'] for gains in GAINS}):
+        for depth in sorted({gains['depth'] for gains in GAINS}):
             parts = []
             for name, value in unit.items():
-                live = LogOddsMap(Parameters.from_flat({**dict.fromkeys(unit, 0.5), name: value, 'live_depth': depth}))
+                live = standard_map({**dict.fromkeys(unit, 0.5), name: value, 'depth': depth})
                 live.add(case.readings)
                 parts.append(live.log_odds())
             self._parts[depth] = live.grid, parts, [on_truth(part, live.grid, case, tool) for part in parts]
@@ -185,7 +192,7 @@ class Standard:
 
     def map(self, gains: dict[str, float]) -> tuple[Grid, NDArray[np.int8]]:
         """Return the map with these gains: 1 occupied, 0 free, -1 in between or unknown."""
-        grid, parts, _ = self._parts[gains['live_depth']]
+        grid, parts, _ = self._parts[gains['depth']]
         odds = self._mix(gains, parts)
         ml = np.where(odds > LOGIT, 1, np.where(odds < -LOGIT, 0, -1))
         return grid, ml.astype(np.int8)
@@ -210,7 +217,7 @@ class Standard:
 
     def losses(self, gains: dict[str, float], known: NDArray[np.bool_]) -> Floats:
         """Return the log loss at the cells `known` for each of `SCALES`."""
-        odds = self._mix(gains, self._parts[gains['live_depth']][2])
+        odds = self._mix(gains, self._parts[gains['depth']][2])
         inside = known & np.isfinite(odds)
         occupied = self.case.truth[inside] > 0.5
         return np.array([Belief(1 / (1 + np.exp(-s * odds[inside])), occupied).loss for s in SCALES])

@@ -105,7 +105,7 @@ def search(readings: Readings, parameters: Parameters, most_sweeps: int = 200) -
     p = parameters
     grid = grid_of(readings, p.model, p.grid, beyond=arc_depth(p))
     table = cone_table(readings, grid, p.model)
-    causes = causes_of(readings, table['sigma'] * grid.resolution, p.model)
+    causes = causes_of(readings, table['sigma'] * grid.resolution, p.model, grid.resolution)
     lists = _lists(table, grid.shape)
     prior = math.log(p.search.prior / (1 - p.search.prior))
     numbers = (prior, LEAST_GAIN, grid.resolution)

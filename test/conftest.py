@@ -18,16 +18,15 @@ from forward_grid_mapper.core.search.search import Search
 
 sys.path.insert(0, str(Path(__file__).parent))
 
-PLAIN_MODEL: dict[str, Any] = {'grazing_angle': math.pi / 2, 'surface_offset': 0.0}
-"""Every cone whole, and obstacles at the centres of their cells."""
+PLAIN_MODEL: dict[str, Any] = {
+    'grazing_angle': math.pi / 2,
+    'surface_offset': 0.0,
+    'likelihood_exponent': 1.0,
+}
+"""Every cone whole, obstacles at the centres of their cells, and independent readings."""
 
 PLAIN_SEARCH: dict[str, Any] = {
-    'driven_cost': 0.0,
-    'line_bonus': 0.0,
     'end_cost': 0.0,
-    'isolated_cost': 0.0,
-    'bridges': 0,
-    'extend': 0,
     'least_passed': 0.0,
     'neighbour_weight': 0.0,
 }

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import math
 
 import numpy as np
 
+from forward_grid_mapper.core.common.constants import MOST_AGAINST_EXTENSION, STRAIGHT_RUN
 from forward_grid_mapper.core.common.grid import Grid
 from forward_grid_mapper.core.common.parameters import ModelParameters
 from forward_grid_mapper.core.common.readings import Readings
 from forward_grid_mapper.core.evidence.state import State
 from forward_grid_mapper.core.evidence.tile_index import Tiles
-from forward_grid_mapper.core.maps.wall_extension import MOST_AGAINST, STRAIGHT_RUN
 from forward_grid_mapper.core.search.prior import Prior
 from forward_grid_mapper.core.sensor.density import CUT
 from forward_grid_mapper.core.sensor.surface_normals import THROUGH, SurfaceNormals
@@ -58,6 +59,11 @@ def cone_cells(
 def normal(z: float, mean: float, sigma: float) -> float:
     error = (z - mean) / sigma
     return math.exp(-0.5 * error * error) / (math.sqrt(2 * math.pi) * sigma) if abs(error) <= CUT else 0.0
+
+
+def of_cells(model: ModelParameters, grid: Grid) -> ModelParameters:
+    """The model with p_hit of a cell: a wall of 0.1 m is missed if all of its cells miss it."""
+    return dataclasses.replace(model, p_hit=min(1 - (1 - model.p_hit) ** (grid.resolution / 0.1), 0.98))
 
 
 def lost(z: float, z_max: float, sigma: float, model: ModelParameters) -> float:
@@ -137,7 +143,7 @@ def log_likelihood(
     model: ModelParameters,
     normals: SurfaceNormals | None = None,
 ) -> float:
-    total = 0.0
+    total, model = 0.0, of_cells(model, grid)
     for t in range(len(readings)):
         met = obstacles(readings, t, grid, occupied, model, normals)
         total += math.log(sum(causes(readings.z[t], readings.z_max[t], sigma_of(readings, t, grid, model), met, model)))
@@ -282,6 +288,7 @@ def log_likelihoods(
     normals: SurfaceNormals | None = None,
 ) -> np.ndarray:
     """Those of many maps, shape (maps, cells), at once."""
+    model = of_cells(model, grid)
     mixture_weight = 1 - model.p_rand - model.p_lost
     total = np.zeros(len(maps))
     for t in range(len(readings)):
@@ -330,7 +337,7 @@ def passed(
     readings: Readings, grid: Grid, occupied: np.ndarray, model: ModelParameters, weight: np.ndarray | None = None
 ) -> np.ndarray:
     """How many readings are expected to have passed each cell, shape (cells,): the formula of `finishing`."""
-    out = np.zeros(grid.size)
+    out, model = np.zeros(grid.size), of_cells(model, grid)
     mixture_weight = 1 - model.p_rand - model.p_lost
     for t in range(len(readings)):
         z, z_max, sigma = readings.z[t], readings.z_max[t], sigma_of(readings, t, grid, model)
@@ -371,7 +378,8 @@ STEPS = [(1, 0), (1, 1), (0, 1), (-1, 1), (-1, 0), (-1, -1), (0, -1), (1, -1)]
 
 
 def drawn_out(occupied: np.ndarray, told: np.ndarray, seen: np.ndarray, steps: int, barred: np.ndarray) -> np.ndarray:
-    """Cells by which straight walls go on: the docstring of `extend`. Shapes (height, width); `told` in nats."""
+    """Cells of 0.1 m by which straight walls go on: the docstring of `extend`. `told`: (height, width), nats."""
+    run, most = round(STRAIGHT_RUN / 0.1), MOST_AGAINST_EXTENSION * 0.1
     height, width = occupied.shape
     out = np.zeros(occupied.shape, np.uint8)
 
@@ -381,14 +389,14 @@ def drawn_out(occupied: np.ndarray, told: np.ndarray, seen: np.ndarray, steps: i
     for y, x in np.argwhere(occupied == 1):
         for k, (dx, dy) in enumerate(STEPS):
             ahead = [STEPS[k], STEPS[(k + 1) % 8], STEPS[k - 1]]
-            straight = all(at(x - n * dx, y - n * dy) for n in range(STRAIGHT_RUN))
+            straight = all(at(x - n * dx, y - n * dy) for n in range(run))
             if not straight or any(at(x + u, y + v) for u, v in ahead):
                 continue
             for n in range(1, steps + 1):
                 u, v = x + n * dx, y + n * dy
                 if not (0 <= u < width and 0 <= v < height):
                     break
-                if barred[v, u] or occupied[v, u] or not seen[v, u] or told[v, u] < -MOST_AGAINST:
+                if barred[v, u] or occupied[v, u] or not seen[v, u] or told[v, u] < -most:
                     break
                 out[v, u] = 1
     return out

@@ -50,7 +50,9 @@ def choose_topics(
         return Topics(tuple(ranges), _named(contents, odom_topic, ODOMETRY, '--odom-topic'))
     odometry = _of_type(contents, ODOMETRY)
     if not odometry:
-        raise BagError(f'The bag has no nav_msgs/Odometry messages, which give the poses of the robot. {_listing(contents)}')
+        raise BagError(
+            f'The bag has no nav_msgs/Odometry messages, which give the poses of the robot. {_listing(contents)}'
+        )
     if len(odometry) > 1:
         lines = (f'\n  {topic}: {contents[topic][1]} messages, {frames_of(topic)}' for topic in odometry)
         raise BagError('The bag has several odometry topics; choose one with `--odom-topic`:' + ''.join(lines))

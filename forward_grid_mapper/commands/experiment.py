@@ -29,12 +29,12 @@ from .options import add_mapping_options, chosen_parameters
 COMMAND = 'experiment'
 
 GAINS = tuple(
-    {'live_p_occupied': occupied, 'live_p_free': free, 'live_p_free_no_echo': silent, 'live_depth': depth}
+    {'live_p_occupied': occupied, 'live_p_free': free, 'live_p_free_no_echo': silent, 'depth': depth}
     for occupied, free, silent, depth in itertools.product(
         (0.55, 0.6, 0.7, 0.8, 0.9, 0.97), (0.1, 0.2, 0.3, 0.4, 0.45, 0.48), (0.3, 0.45, 0.49), (0.05, 0.1)
     )
 )
-"""The settings of the standard map among which the best is taken, which a user could not know."""
+"""The settings of the standard map among which the best is taken, which a user could not know; see `standard_map`."""
 
 PAPER = {
     'p_hit': 0.9,
@@ -44,8 +44,9 @@ PAPER = {
     'surface_offset': 0.0,
     'prior': 0.5,
     'grazing_angle': math.pi / 2,
-    **dict.fromkeys(('driven_cost', 'line_bonus', 'end_cost', 'isolated_cost', 'least_passed'), 0.0),
-    **dict.fromkeys(('bridges', 'extend'), 0),
+    'end_cost': 0.0,
+    'least_passed': 0.0,
+    'likelihood_exponent': 1.0,
 }
 """Maximum likelihood without a prior, as printed in the paper."""
 
@@ -101,11 +102,16 @@ def forward(cases: Iterable[Case], parameters: Parameters, title: str) -> Outcom
     return Outcome(scores, tiles[0])
 
 
+def standard_map(gains: dict[str, float]) -> LogOddsMap:
+    """Return an empty standard map with these gains, of which `depth` is half the depth of its arcs, metres."""
+    return LogOddsMap(Parameters.from_flat({k: v for k, v in gains.items() if k != 'depth'}), gains['depth'])
+
+
 def standard(cases: Iterable[Case], gains: dict[str, float], title: str) -> Outcome:
     """Score the standard map of every case."""
     scores, tiles = [], []
     for case in cases:
-        live = LogOddsMap(Parameters.from_flat(gains))
+        live = standard_map(gains)
         live.add(case.recording.readings)
         decided = threshold(live.probability())
         scores.append(score_map(decided, live.grid, case.recording.world, case.visible))

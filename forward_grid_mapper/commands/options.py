@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 from ..core.common.errors import ParameterError
-from ..core.common.parameters import Parameters, find
+from ..core.common.parameters import DEPRECATED, Parameters, find
 from ..core.common.shell import quoted
 from ..core.messages.message_types import Pose2
 from ..files.output_folder import readable
@@ -132,7 +132,7 @@ def chosen_parameters(options: argparse.Namespace) -> Chosen:
     values, extrinsics, _ = load_parameters(options.params) if options.params else ({}, {}, {})
     settings = dict(parse_setting(text) for text in options.set)
     for name in settings:
-        if find(name).group == 'node':
+        if name not in DEPRECATED and find(name).group == 'node':
             raise ParameterError(f'--set {name}: only the node has this parameter; topics have options of their own')
     warnings = [text] if (text := _ignored(values, options.params)) else []
     return Chosen(Parameters.from_flat({**values, **settings}), dict(extrinsics), warnings)
@@ -140,7 +140,8 @@ def chosen_parameters(options: argparse.Namespace) -> Chosen:
 
 def _ignored(values: Mapping[str, Any], source: str) -> str:
     """Return what a parameter file sets in vain where the node does not run; empty if nothing."""
-    names = [name for name, value in values.items() if find(name).group == 'node' and value != find(name).default]
+    known = {name: value for name, value in values.items() if name not in DEPRECATED}
+    names = [name for name, value in known.items() if find(name).group == 'node' and value != find(name).default]
     if not names:
         return ''
     listed = [f'{name} ({INSTEAD[name]})' if name in INSTEAD else name for name in names]

@@ -11,6 +11,7 @@ from typing import Any, Concatenate, ParamSpec, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from .common.constants import EXTENSION
 from .common.grid import Grid, part_of
 from .common.parameters import Parameters
 from .common.readings import Readings, in_canonical_order
@@ -25,7 +26,7 @@ from .maps.uncertainty import uncertainty_map
 from .runtime.cancelling import check
 from .runtime.memory import memory_for_pairs
 from .runtime.threads import cores
-from .search.prior import log_prior, odds_given_neighbours
+from .search.prior import has_walls, log_prior, odds_given_neighbours
 from .search.search import Progress, Search, SearchResult
 from .sensor.forward_model import ForwardModel
 
@@ -64,7 +65,7 @@ class _Given:
     grid : Grid
         Of all maps.
     traversed : bool, shape `grid.shape`
-        Cells that sensors were moved over, all False where that is not to count.
+        Cells that sensors were moved over.
     """
 
     readings: Readings
@@ -127,8 +128,7 @@ class Mapper:
         readings, p = in_canonical_order(readings), self._parameters
         # the grid of the standard map, so that all three maps are of one shape
         grid = map_grid(readings, p)
-        traversed = traversed_cells(readings, grid) if p.search.driven_cost > 0 else np.zeros(grid.shape, np.bool_)
-        return _Given(readings, grid, traversed)
+        return _Given(readings, grid, traversed_cells(readings, grid))
 
     @_stage('index')
     def _index(self, given: _Given, start: tuple[Grid, NDArray[np.int8]] | None) -> Evidence:
@@ -154,7 +154,8 @@ class Mapper:
     @_stage('post-processing')
     def _post_process(self, given: _Given, evidence: Evidence) -> NDArray[np.int8]:
         search = self._parameters.search
-        return post_process(evidence, search.extend, search.least_passed, given.traversed)
+        extension = EXTENSION if has_walls(search) else 0.0
+        return post_process(evidence, extension, search.least_passed, given.traversed)
 
     @_stage('uncertainty')
     def _judge(
@@ -179,7 +180,8 @@ class Mapper:
             readings=given.readings,
             unexplained=unexplained,
             log_likelihood=log_likelihood,
-            objective=log_likelihood + log_prior(prior, occupied.ravel(), patterns(occupied, given.grid.shape)),
+            objective=p.model.likelihood_exponent * log_likelihood
+            + log_prior(prior, occupied.ravel(), patterns(occupied, given.grid.shape)),
             parameters=p,
             searched=evidence.observed(),
             dynamic=dynamic_echoes(forward, unexplained, ml),
@@ -193,7 +195,7 @@ class Mapper:
             'bytes_per_pair': evidence.nbytes / max(evidence.pairs, 1),
             'readings_not_stored': evidence.unstored,
             'searched_log_likelihood': evidence.log_likelihood,
-            'searched_objective': evidence.log_likelihood + found.log_prior,
+            'searched_objective': evidence.tempered_log_likelihood + found.log_prior,
             'flips': found.progress.flips,
             'shifts': found.progress.shifts,
             'sweeps': found.progress.sweeps,

@@ -19,6 +19,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from .common.constants import EXTENSION, FORBIDDEN
 from .common.grid import Grid, Window, part_of, united
 from .common.parameters import Parameters
 from .common.readings import Readings
@@ -30,7 +31,7 @@ from .maps.uncertainty import uncertainty_map
 from .runtime.memory import memory_for_pairs
 from .runtime.threads import cores
 from .search.flips import flip_in_order, promising
-from .search.prior import Prior, local_prior, odds_given_neighbours, shapes
+from .search.prior import has_walls, odds_given_neighbours, wall_prior
 from .search.search import LEAST, Search
 from .sensor.cone_table import effective_sigma, grid_of
 
@@ -61,11 +62,10 @@ MANY = 5000
 
 
 class _Traversed(NamedTuple):
-    """What new readings tell of the cells that the robot drove over: some of the grid, and their prior."""
+    """What new readings tell of the cells that the robot drove over: some of the grid."""
 
     near: tuple[slice, slice]
     cells: NDArray[np.bool_]
-    prior: NDArray[np.float64]
     last: tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]
 
 
@@ -83,7 +83,7 @@ class OnlineMap:
         self._traversed = np.zeros((0, 0), np.bool_)
         self._since: Window | None = None
         self._count = 0
-        self._prior = Prior(np.zeros(0), shapes(self._parameters.search))
+        self._prior = wall_prior(self._parameters.search, np.zeros(0, np.bool_), self._parameters.grid.resolution)
         self._last = np.zeros(0), np.zeros(0), np.zeros(0, np.int64)
         self.grid = Grid(self._parameters.grid.resolution, 0, 0, 0, 0)
         self.taken = 0
@@ -120,10 +120,9 @@ class OnlineMap:
         self._insert(evidence, readings)
         self.grid, self.taken, self._count = grid, self.taken + len(readings), self._count + len(readings)
         self._since = united(self._since, window)
-        if traversed:
-            self._traversed[traversed.near] = traversed.cells
-            self._prior.local.reshape(evidence.grid.shape)[traversed.near] = traversed.prior
-            self._last = traversed.last
+        self._traversed[traversed.near] = traversed.cells
+        self._prior.local.reshape(evidence.grid.shape)[traversed.near][traversed.cells] = -FORBIDDEN
+        self._last = traversed.last
         if len(evidence) - before > MANY:
             self._search(evidence)
         elif self._count >= min(REFINE_EVERY, max(REFINE_LEAST, REFINE_SHARE * len(evidence))):
@@ -201,11 +200,8 @@ class OnlineMap:
             return self.grid, np.zeros((0, 0), np.int8)
         return self.grid, self._evidence.observed()[self._evidence.grid.window(self.grid)]
 
-    def _newly_traversed(self, readings: Readings, grid: Grid) -> _Traversed | None:
+    def _newly_traversed(self, readings: Readings, grid: Grid) -> _Traversed:
         """Return the cells that sensors were moved over, from the last reading on; nothing is changed yet."""
-        p = self._parameters.search
-        if p.driven_cost <= 0:
-            return None
         x, y, stamp = (
             np.r_[old, new] for old, new in zip(self._last, (readings.x, readings.y, readings.stamp), strict=True)
         )
@@ -218,7 +214,7 @@ class OnlineMap:
         part = Grid(grid.resolution, grid.column + left, grid.row + bottom, cells.shape[1], cells.shape[0])
         mark_traversed(x, y, stamp, part, cells)
         n = STRIDES[-1]
-        return _Traversed(near, cells, local_prior(p, cells), (x[-n:], y[-n:], stamp[-n:]))
+        return _Traversed(near, cells, (x[-n:], y[-n:], stamp[-n:]))
 
     def _with_room(self, g: Grid) -> Evidence:
         """Return the evidence, on a grid that holds `g`."""
@@ -234,7 +230,7 @@ class OnlineMap:
         if evidence is not None:
             inner = larger.window(evidence.grid)
             traversed[inner] = self._traversed
-        prior = self._prior._replace(local=local_prior(p.search, traversed).ravel())
+        prior = wall_prior(p.search, traversed.ravel(), g.resolution)
         if evidence is None:
             threads = p.search.threads or cores()
             evidence = Evidence(larger, p.model, memory_for_pairs(p), threads, renewable=True)
@@ -279,7 +275,8 @@ class OnlineMap:
             return self.grid, np.zeros((0, 0), np.int8), np.zeros((0, 0), np.float32)
         evidence, search = self._evidence, self._parameters.search
         window = evidence.grid.window(self.grid)
-        ml = post_process(evidence, search.extend, search.least_passed, self._traversed)
+        extension = EXTENSION if has_walls(search) else 0.0
+        ml = post_process(evidence, extension, search.least_passed, self._traversed)
         neighbours = odds_given_neighbours(self._prior, ml == 1)
         uncertainty = uncertainty_map(evidence.of_occupancy(), neighbours, ml, search)
         return self.grid, ml[window], uncertainty[window]

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import yaml
 
 from ..core.common.errors import ParameterError
-from ..core.common.parameters import Parameter, find
+from ..core.common.parameters import DEPRECATED, Parameter, find
 from ..core.messages.message_types import Pose2
 from .small_text import read_text
 
@@ -28,7 +28,7 @@ class ParameterFile(NamedTuple):
     Attributes
     ----------
     values : dict
-        Checked values of the table's parameters, by name.
+        Checked values of the table's parameters, by name; those of `DEPRECATED` too, which `Parameters` leaves out.
     extrinsics : dict
         Pose of each sensor in the robot's base frame, by `frame_id`.
     node : dict
@@ -73,7 +73,7 @@ def load_parameters(path: Path | str) -> ParameterFile:
 
 
 def parse_setting(text: str) -> tuple[str, Any]:
-    """Return the name and the checked value of `name=value`.
+    """Return the name and the checked value of `name=value`; unchecked for the names of `DEPRECATED`.
 
     Raises
     ------
@@ -83,6 +83,8 @@ def parse_setting(text: str) -> tuple[str, Any]:
     name, equals, value = (part.strip() for part in text.partition('='))
     if not equals or not name:
         raise ParameterError(f'{text!r} is not of the form name=value, such as p_hit=0.6')
+    if name in DEPRECATED:
+        return name, value
     row = find(name)
     return name, row.check(_typed(row, value))
 
@@ -185,7 +187,7 @@ def _sort_out(flat: dict[str, Any]) -> ParameterFile:
         elif name.partition('.')[0] == 'sensors':
             raise ParameterError(f'{name}: sensors are given as sensors.<frame_id>.pose: [x, y, yaw]')
         else:
-            result.values[name] = find(name).check(value)
+            result.values[name] = value if name in DEPRECATED else find(name).check(value)
     return result
 
 

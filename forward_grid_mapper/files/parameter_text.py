@@ -11,9 +11,13 @@ from typing import Any
 import yaml
 
 from ..core.common.parameters import TABLE, Parameter, Parameters
+from ..core.sensor.bounds import reading_bounds
 
 _WIDTH = 100
 _INDENT = '    '
+
+BOUNDS_RANGE = 5.0
+"""Metres: the largest range for which the reference page states what one reading can say, that of a usual sonar."""
 
 
 def dump_parameters(parameters: Parameters) -> str:
@@ -42,7 +46,27 @@ def parameters_markdown() -> str:
             cells = (f'`{row.name}`', f'`{_yaml_value(row.default)}`', row.range, row.unit, row.help)
             lines.append('| ' + ' | '.join(cell.replace('|', '\\|') for cell in cells) + ' |')
         lines.append('')
+        if rows[0].group == 'model':
+            lines += [*_bounds_markdown(Parameters()), '']
     return '\n'.join(lines)
+
+
+def _bounds_markdown(parameters: Parameters) -> list[str]:
+    """Return what one reading can say at most, as the model has it."""
+    resolution = parameters.grid.resolution
+    bounds = reading_bounds(parameters.model, resolution, BOUNDS_RANGE)
+    return [
+        f'With the defaults, in cells of {resolution:g} m and up to {BOUNDS_RANGE:g} m, one reading says at most '
+        'so many nats of the objective (positive: for an obstacle):',
+        '',
+        '| reading | about | nats |',
+        '|---|---|---|',
+        f'| echo | the cell at its range | {bounds.echo_for:+.2f} |',
+        f'| echo from beyond | one cell on its way | {bounds.echo_against_cell:+.2f} |',
+        f'| echo from beyond | all cells on its way together | {bounds.echo_against_wall:+.2f} |',
+        f'| no echo | one cell on its way | {bounds.silence_against_cell:+.2f} |',
+        f'| no echo | all cells on its way together | {bounds.silence_against_wall:+.2f} |',
+    ]
 
 
 def _groups() -> Iterator[tuple[str, list[Parameter]]]:

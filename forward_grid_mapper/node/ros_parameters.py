@@ -12,7 +12,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
 
 from ..core.common.errors import ParameterError
-from ..core.common.parameters import TABLE, Parameter, Parameters
+from ..core.common.parameters import DEPRECATED, TABLE, Parameter, Parameters, deprecation
 from ..core.messages.message_types import Pose2
 
 ROS_OWN = ('use_sim_time', 'start_type_description_service', 'qos_overrides')
@@ -102,6 +102,9 @@ def _strangers(given: dict[str, RosParameter]) -> list[str]:
     for name in given:
         pose = name.startswith('sensors.') and name.endswith('.pose')
         if name in NAMES or pose or name.partition('.')[0] in ROS_OWN:
+            continue
+        if name in DEPRECATED:
+            warnings.append(deprecation(name))
             continue
         near = difflib.get_close_matches(name, NAMES, n=1)
         hint = f'; did you mean {near[0]}?' if near else ''

@@ -10,15 +10,15 @@ import numpy as np
 import pytest
 
 import naive
+from forward_grid_mapper.core.common.constants import EXTENSION, LEAST_AGREEMENT, LEAST_WEIGHT
 from forward_grid_mapper.core.common.grid import Grid
 from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.common.readings import Readings
 from forward_grid_mapper.core.mapping import Mapper
 from forward_grid_mapper.core.maps.map_set import MapSet
 from forward_grid_mapper.core.maps.traversed import traversed_cells
-from forward_grid_mapper.core.search.prior import Prior, local_prior, shapes
+from forward_grid_mapper.core.search.prior import Prior, wall_prior
 from forward_grid_mapper.core.search.search import LEAST
-from forward_grid_mapper.core.sensor.surface_normals import LEAST_AGREEMENT, LEAST_WEIGHT
 
 SEEDS = range(3)
 
@@ -62,7 +62,7 @@ class Case:
     @property
     def prior(self) -> Prior:
         search = self.maps.parameters.search
-        return Prior(local_prior(search, self.traversed).ravel(), shapes(search))
+        return wall_prior(search, self.traversed.ravel(), self.maps.grid.resolution)
 
 
 @cache
@@ -129,7 +129,9 @@ def test_no_single_flip_gains_where_the_search_ended(seed: int) -> None:
 def test_the_map_that_is_handed_out(seed: int) -> None:
     c = case(seed)
     search, model = c.maps.parameters.search, c.maps.parameters.model
-    expected = naive.handed_out(*c.told, model, c.maps.normals, c.traversed, search.extend, search.least_passed)
+    expected = naive.handed_out(
+        *c.told, model, c.maps.normals, c.traversed, round(EXTENSION / 0.1), search.least_passed
+    )
     assert np.array_equal(c.maps.ml, expected)
     assert set(np.unique(expected)) == {-1, 0, 1}
 

@@ -13,19 +13,18 @@ from hypothesis import strategies as st
 
 import naive
 from conftest import PLAIN, PLAIN_MODEL, random_readings
+from forward_grid_mapper.core import mapping
 from forward_grid_mapper.core.common.errors import Cancelled, InputError
 from forward_grid_mapper.core.common.grid import Grid
-from forward_grid_mapper.core.common.parameters import Parameters, SearchParameters
+from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.common.readings import Readings
 from forward_grid_mapper.core.mapping import Mapper
 from forward_grid_mapper.core.maps.map_set import MapSet
 from forward_grid_mapper.core.maps.traversed import traversed_cells
-from forward_grid_mapper.core.search.prior import Prior, local_prior, shapes
+from forward_grid_mapper.core.search.prior import wall_prior
 from forward_grid_mapper.core.search.search import ROUNDING
 from forward_grid_mapper.core.sensor.forward_model import log_likelihood
 from forward_grid_mapper.simulation.drive import corridor_drive
-
-PRIOR_SHAPES = shapes(SearchParameters())
 
 AREA = Grid(0.1, -13, 4, 30, 20)
 
@@ -105,14 +104,15 @@ def test_all_maps_know_the_same_grid_and_the_figures_fit_the_map() -> None:
     assert maps.objective - maps.log_likelihood == pytest.approx(
         (maps.ml == 1).sum() * math.log(prior / (1 - prior)), abs=1e-9
     )
+    assert not (maps.ml == 1)[traversed_cells(maps.readings, maps.grid)].any()
 
 
-@pytest.mark.parametrize('values', [{}, {'extend': 0, 'least_passed': 1.5}, {'line_bonus': 0.1, 'driven_cost': 0.0}])
+@pytest.mark.parametrize('values', [{}, {'least_passed': 1.5}, {'wall_cost': 3.0, 'likelihood_exponent': 1.0}])
 def test_with_all_that_makes_maps_better_they_still_know_the_same_grid(values: dict[str, float]) -> None:
     maps, plain = run(some(), **values), run(some(), **PLAIN)
     assert maps.live.shape == maps.ml.shape == maps.uncertainty.shape == maps.grid.shape
     said = ~np.isnan(maps.uncertainty)
-    traversed = traversed_cells(maps.readings, maps.grid) & (maps.parameters.search.driven_cost > 0)
+    traversed = traversed_cells(maps.readings, maps.grid)
     assert not (said & (plain.ml == -1) & ~traversed).any(), 'what nobody saw is unknown'
     assert not (maps.ml[~said] != -1).any(), 'and so is what the readings say nothing about'
     assert (maps.ml[said] == -1).any(), 'of what was seen, but not gone through, they may say something'
@@ -139,19 +139,30 @@ def test_where_the_robot_stands_is_free_before_it_moves() -> None:
     assert maps.uncertainty[place].max() < 0.1
 
 
-@pytest.mark.parametrize('driven_cost', [0.0, 20.0])
-def test_the_objective_is_the_likelihood_and_the_prior_of_the_map_that_was_found(driven_cost: float) -> None:
-    # as it is before walls are drawn out and free told from unknown; the likelihood is that of whole cones
-    whole = {**PLAIN_MODEL, 'extend': 0, 'least_passed': 0.0, 'driven_cost': driven_cost}
+@pytest.mark.parametrize('exponent', [0.4, 1.0])
+def test_the_objective_is_the_tempered_likelihood_and_the_prior_of_the_map_that_was_found(
+    exponent: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # as it is before walls are extended and free told from unknown; the likelihood is that of whole cones
+    monkeypatch.setattr(mapping, 'EXTENSION', 0.0)
+    whole = {**PLAIN_MODEL, 'least_passed': 0.0, 'likelihood_exponent': exponent}
     maps = run(some(), **whole)
     likelihood = log_likelihood(maps.readings, maps.grid, maps.ml, maps.parameters.model)
     assert maps.log_likelihood == pytest.approx(likelihood, abs=ROUNDING * len(maps.readings))
     traversed = traversed_cells(maps.readings, maps.grid)
-    search = maps.parameters.search
-    prior = Prior(local_prior(search, traversed & (driven_cost > 0)).ravel(), shapes(search))
+    prior = wall_prior(maps.parameters.search, traversed.ravel(), maps.grid.resolution)
     told = naive.log_prior(prior, maps.ml == 1, maps.grid.shape)
-    assert maps.objective - maps.log_likelihood == pytest.approx(told, abs=1e-9)
-    assert (maps.ml == 1)[traversed].any() == (driven_cost == 0.0)
+    assert maps.objective - exponent * maps.log_likelihood == pytest.approx(told, abs=1e-9)
+    assert (maps.ml == 1).any()
+    assert not (maps.ml == 1)[traversed].any()
+
+
+def test_a_start_with_occupied_cells_where_the_robot_was_is_corrected() -> None:
+    maps = run(some(), **PLAIN)
+    wrong = maps.ml.copy()
+    wrong[traversed_cells(maps.readings, maps.grid)] = 1
+    again = Mapper(maps.parameters).run(maps.readings, start=(maps.grid, wrong))
+    assert not (again.ml == 1)[traversed_cells(maps.readings, maps.grid)].any()
 
 
 @lru_cache(maxsize=1)
@@ -189,7 +200,8 @@ def test_the_search_has_the_same_likelihood_of_the_map_that_it_found() -> None:
     told = maps.statistics['searched_log_likelihood']
     assert told == pytest.approx(maps.forward_model().log_likelihood(searched), abs=error)
     assert told != pytest.approx(maps.log_likelihood, abs=error)
-    prior = Prior(local_prior(maps.parameters.search, traversed_cells(maps.readings, maps.grid)).ravel(), PRIOR_SHAPES)
+    traversed = traversed_cells(maps.readings, maps.grid).ravel()
+    prior = wall_prior(maps.parameters.search, traversed, maps.grid.resolution)
     for ml, objective, likelihood in (
         (maps.ml, maps.objective, maps.log_likelihood),
         (searched, maps.statistics['searched_objective'], told),

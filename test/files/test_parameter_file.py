@@ -189,3 +189,14 @@ def test_sensors(text: str, expected: tuple[str, Pose2]) -> None:
 def test_bad_sensors(text: str) -> None:
     with pytest.raises(ParameterError, match='form frame=x,y,yaw'):
         parse_sensor(text)
+
+
+def test_names_of_the_version_before_are_accepted_with_a_warning(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    file = tmp_path / 'old.yaml'
+    file.write_text('bridges: 10\nend_cost: 2.0\nshift_moves: true\ncell_distance: center\n')
+    values = {**load_parameters(file).values, **dict([parse_setting('driven_cost=20')])}
+    assert Parameters.from_flat(values) == Parameters.from_flat({'end_cost': 2.0})
+    assert len(caplog.messages) == 4
+    assert all('ignored' in message for message in caplog.messages)

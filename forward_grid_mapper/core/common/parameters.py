@@ -8,12 +8,15 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import logging
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, get_origin, get_type_hints
 
 from .errors import ParameterError
+
+LOG = logging.getLogger('forward_grid_mapper')
 
 
 def _param(
@@ -102,12 +105,16 @@ class GridParameters:
 class ModelParameters:
     """The forward sensor model: why a reading is what it is.
 
-    The defaults are those of no single world: chance and lost echoes are likely, so that no reading, and no person who
-    walks by, weighs more than a few nats against many others.
+    p_rand and p_lost are larger than those of any one sonar, and no estimates: together they bound what a single
+    reading can say to about two nats (`sensor.bounds`), so that no wall hangs on one reading.
     """
 
     p_hit: float = _param(
-        0.7, 'Probability that an occupied cell in the cone returns the echo.', 'probability', 0.01, 0.98
+        0.7,
+        'Probability that 0.1 m of a surface in the cone returns the echo; the same for cells of any size.',
+        'probability',
+        0.01,
+        0.98,
     )
     p_rand: float = _param(0.4, 'Probability that a reading is random, whatever the map.', 'probability', 1e-4, 0.95)
     p_lost: float = _param(
@@ -116,6 +123,14 @@ class ModelParameters:
         'probability',
         0.0,
         0.95,
+    )
+    likelihood_exponent: float = _param(
+        1.0,
+        'Weight of the readings against the prior: the exponent of p(Z | m). Readings are not independent, so together '
+        'they say less than their sum; 1 is the paper.',
+        '',
+        0.01,
+        1.0,
     )
     sigma: float = _param(
         0.1,
@@ -153,34 +168,22 @@ class SearchParameters:
 
     prior: float = _param(
         0.4,
-        "Prior probability of an occupied cell; 0.5 is the paper's plain ML, less removes dots and thins walls.",
+        'Prior probability of an occupied cell in the first part of the search, which takes cells as independent; 0.5 '
+        "is the paper's plain ML, less removes dots and thins walls.",
         'probability',
         1e-6,
         0.5,
     )
-    driven_cost: float = _param(
-        20.0,
-        'How much less likely a cell is occupied over which a sensor was moved; 0 is the paper.',
+    wall_cost: float = _param(
+        1.0, 'What a metre of wall costs in the second part of the search.', 'nats/m', 0.0, 1000.0
+    )
+    end_cost: float = _param(
+        1.3,
+        'What the end of a wall costs in the second part of the search, or a corner; a single cell has two ends. With '
+        '0 there is no second part, gaps stay open and walls are not extended, as in the paper.',
         'nats',
         0.0,
-        1000.0,
-    )
-    line_bonus: float = _param(
-        0.3,
-        'What an occupied cell gains where a wall passes through it, no more than its prior costs; 0 is the paper.',
-        'nats',
-        0.0,
-        10.0,
-    )
-    end_cost: float = _param(1.2, 'What the end of a wall costs, or a corner; 0 is the paper.', 'nats', 0.0, 100.0)
-    isolated_cost: float = _param(
-        2.0, 'What an occupied cell without occupied neighbour costs; 0 is the paper.', 'nats', 0.0, 100.0
-    )
-    bridges: int = _param(
-        10, 'Longest gap between two ends of walls that is tried to be closed at once.', 'cells', 0, 50
-    )
-    extend: int = _param(
-        6, 'Cells by which walls are drawn out at their ends where no reading speaks against it.', 'cells', 0, 20
+        100.0,
     )
     least_passed: float = _param(
         0.88,
@@ -202,16 +205,27 @@ class SearchParameters:
     )
     alpha: float = _param(
         1.0,
-        'Weight of the evidence in the uncertainty map (eq 45); 0 leaves only the prior, 1 trusts the one map found.',
+        'Weight of the evidence in the uncertainty map (eq 45). It, neighbour_weight and uncertainty_prior are the '
+        'coefficients of a logistic calibration, fitted to simulated worlds.',
         '',
         0.0,
         1.0,
     )
     neighbour_weight: float = _param(
-        0.6, 'Weight of what the neighbours of a cell say in the uncertainty map; 0 is the paper.', '', 0.0, 1.0
+        0.6,
+        'Weight of what the neighbours of a cell say in the uncertainty map, by the prior of walls (the second '
+        'coefficient of the calibration); 0 is the paper.',
+        '',
+        0.0,
+        1.0,
     )
     uncertainty_prior: float = _param(
-        0.38, 'Prior occupancy used in the uncertainty map.', 'probability', 1e-6, 0.999999
+        0.38,
+        'Occupancy that the uncertainty map states without evidence and without neighbours (the offset of the '
+        'calibration).',
+        'probability',
+        1e-6,
+        0.999999,
     )
 
 
@@ -237,14 +251,6 @@ class LiveMapParameters:
     )
     live_p_free_no_echo: float = _param(
         0.3, 'The same for a reading without echo, which may be a lost one.', 'probability', 0.001, 0.5, read_only=True
-    )
-    live_depth: float = _param(
-        0.05,
-        'Half the depth of the arc that an echo marks as occupied; never below half a cell.',
-        'm',
-        0.001,
-        5.0,
-        read_only=True,
     )
 
 
@@ -359,6 +365,8 @@ class Parameters:
     def from_flat(cls, values: Mapping[str, Any], base: Parameters | None = None) -> Parameters:
         """Return `base` (the defaults, unless given) with the named values changed.
 
+        Names of `DEPRECATED` are left out, with a warning in the log.
+
         Raises
         ------
         ParameterError
@@ -366,6 +374,9 @@ class Parameters:
         """
         changes: dict[str, dict[str, Any]] = {}
         for name, value in values.items():
+            if name in DEPRECATED:
+                LOG.warning('%s', deprecation(name))
+                continue
             row = find(name)
             changes.setdefault(row.group, {})[name] = row.check(value)
         base = base or cls()
@@ -377,6 +388,25 @@ class Parameters:
     def flat(self) -> dict[str, Any]:
         """Return every value by name, in the table's order."""
         return {row.name: getattr(getattr(self, row.group), row.name) for row in TABLE}
+
+
+DEPRECATED = {
+    'bridges': 'no longer a parameter: gaps of up to 1 m are closed where end_cost is above 0',
+    'cell_distance': 'no longer a parameter: distances are to the centers of cells; see surface_offset',
+    'cut': 'no longer a parameter: the noise density is cut off at 4 sigma',
+    'driven_cost': 'no longer a parameter: cells over which a sensor was moved are never occupied',
+    'extend': 'no longer a parameter: straight walls are extended by up to 0.4 m where end_cost is above 0',
+    'isolated_cost': 'no longer a parameter: a single cell costs two ends of a wall, twice end_cost',
+    'line_bonus': 'replaced by wall_cost: what a metre of wall costs, not what a cell of it gains',
+    'live_depth': 'no longer a parameter: an echo marks an arc of 0.05 m, or half a cell, before and behind its range',
+    'shift_moves': 'no longer a parameter: occupied cells are always tried to be moved to a neighbor',
+}
+"""Parameters of the version before: what became of each. They are accepted with a warning and have no effect."""
+
+
+def deprecation(name: str) -> str:
+    """Return the warning for a name of `DEPRECATED`."""
+    return f'parameter {name} is ignored: it is {DEPRECATED[name]}'
 
 
 def _read_table() -> tuple[Parameter, ...]:

@@ -19,8 +19,8 @@ from ..runtime.memory import THREAD_MEMORY
 from ..runtime.threads import parts, run_each
 from ..sensor.cone import rows_of, runs_of
 from ..sensor.cone_table import CONE, Cones, Floats, cone_of, cone_table
-from ..sensor.density import causes_of
-from ..sensor.surface_normals import SurfaceNormals, gather, no_normals, normals_of, on_larger_grid, renewed
+from ..sensor.density import causes_of, hit_probability
+from ..sensor.surface_normals import SurfaceNormals, gather, no_normals, normals_of, on_larger_grid, renewed, touched
 from .fixed_point import QUANTUM
 from .neighbourhood import set_patterns
 from .pairs import WORD, WORDS_PER_BAND_PAIR, WORDS_PER_RUN, Lattice, empty_pairs, workspace_for
@@ -104,10 +104,12 @@ def _index(s: State, limits: tuple[int, int, int], totals: Any) -> int:
     return end
 
 
-def reading_state_table(readings: Readings, sigma: Floats, model: ModelParameters) -> NDArray[np.void]:
-    """Return records of `READING_STATE`, shape (N,), with what no map changes; `sigma` is that of `effective_sigma`."""
+def reading_state_table(
+    readings: Readings, sigma: Floats, model: ModelParameters, resolution: float
+) -> NDArray[np.void]:
+    """Return records of `READING_STATE`, shape (N,), with what no map changes; arguments are those of `causes_of`."""
     reading_states = np.zeros(len(readings), READING_STATE)
-    causes = causes_of(readings, sigma, model)
+    causes = causes_of(readings, sigma, model, resolution)
     reading_states['floor'] = causes.random + causes.lost
     reading_states['max_range'] = causes.max_range
     reading_states['multiplicity'] = 1
@@ -183,7 +185,11 @@ class Evidence:
         self.state = State(
             normals=no_normals(),
             lattice=Lattice(grid.height, grid.width, grid.resolution),
-            model=Model(model.p_hit, 1.0 - model.p_rand - model.p_lost),
+            model=Model(
+                hit_probability(model, grid.resolution),
+                1.0 - model.p_rand - model.p_lost,
+                model.likelihood_exponent * QUANTUM,
+            ),
             cones=np.empty(0, CONE),
             reading_states=np.empty(0, READING_STATE),
             pairs=empty_pairs(0),
@@ -216,6 +222,11 @@ class Evidence:
         return sum(int(array.nbytes) for array in kept)
 
     @property
+    def tempered_log_likelihood(self) -> float:
+        """What the readings count in the objective: the likelihood exponent times log p(Z | m), in nats."""
+        return self.model.likelihood_exponent * self.log_likelihood
+
+    @property
     def log_likelihood(self) -> float:
         """Log p(Z | m) in nats."""
         reading_states = self.state.reading_states[: self._size]
@@ -227,12 +238,12 @@ class Evidence:
         return self.state.cones[: self._size]
 
     def of_occupancy(self) -> Floats:
-        """Return log p(Z | cell occupied, rest of the map) − log p(Z | cell free, rest of the map) in nats.
+        """Return γ [log p(Z | cell occupied, rest of the map) − log p(Z | cell free, rest of the map)] in nats.
 
-        Shape (cells,); 0 where no reading sees the cell.
+        Shape (cells,); 0 where no reading sees the cell. γ is the likelihood exponent.
         """
-        maps = self.state.maps
-        out: Floats = np.where(maps.occupied == 1, -QUANTUM, QUANTUM) * maps.evidence
+        maps, nats = self.state.maps, self.state.model.nats
+        out: Floats = np.where(maps.occupied == 1, -nats, nats) * maps.evidence
         return out
 
     @property
@@ -272,7 +283,9 @@ class Evidence:
         begin, end = self._size, self._size + len(readings)
         self._check_indices(again, end)
         cones = cone_table(readings, self.grid, self.model)
-        reading_states = reading_state_table(readings, cones['sigma'] * self.grid.resolution, self.model)
+        reading_states = reading_state_table(
+            readings, cones['sigma'] * self.grid.resolution, self.model, self.grid.resolution
+        )
         self._reserve(end)
         s = self.state
         s.cones[begin:end], s.reading_states[begin:end] = cones, reading_states
@@ -391,10 +404,10 @@ class Evidence:
         if self._sums is None or self._since is None:
             return None
         s, shape = self.state, self.grid.shape
-        normals = renewed(s.normals, self._sums, shape, self._since)
+        normals = renewed(s.normals, self._sums, self.grid, self._since)
         differ = np.zeros(shape, np.uint8)
         sees = np.zeros(self._size, np.uint8)
-        find_changed(s, normals, self._since, differ, sees)
+        find_changed(s, normals, touched(self._since, self.grid), differ, sees)
         readings = np.flatnonzero(sees)
         window = box_of(s.cones[readings], self.grid)
         # nothing fails from here on: where there is no memory for pairs they are not stored
@@ -498,7 +511,7 @@ class Evidence:
             gather(s.cones, self.grid.shape, (first, last), into, s.stop)
 
         self.summed(0, end, work, sums)
-        normals = normals_of(sums, self.grid.shape, self.model.grazing_angle)
+        normals = normals_of(sums, self.grid, self.model.grazing_angle)
         self.state = self.state._replace(normals=normals)
 
     def _keep_bearings(self, cones: NDArray[np.void]) -> None:

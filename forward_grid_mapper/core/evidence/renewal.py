@@ -86,11 +86,10 @@ def find_changed(s: State, new: SurfaceNormals, window: Window, differ: Any, see
         Room to work in, all 0.
     """
     height, width = s.lattice.height, s.lattice.width
-    around = max(window[0] - 1, 0), min(window[1] + 1, height), max(window[2] - 1, 0), min(window[3] + 1, width)
-    _mark_cells(s.normals, new, around, width, differ)
+    _mark_cells(s.normals, new, window, width, differ)
     tiles = s.tiles
-    for up in range(around[0] >> SHIFT, ((around[1] - 1) >> SHIFT) + 1):
-        for across in range(around[2] >> SHIFT, ((around[3] - 1) >> SHIFT) + 1):
+    for up in range(window[0] >> SHIFT, ((window[1] - 1) >> SHIFT) + 1):
+        for across in range(window[2] >> SHIFT, ((window[3] - 1) >> SHIFT) + 1):
             some = False
             for row in range(up << SHIFT, min((up + 1) << SHIFT, height)):
                 for column in range(across << SHIFT, min((across + 1) << SHIFT, width)):
@@ -103,7 +102,7 @@ def find_changed(s: State, new: SurfaceNormals, window: Window, differ: Any, see
                 for k in range(end):
                     t = tiles.chunks[chunk, k]
                     if sees[t] == 0:
-                        sees[t] = 1 if _changes(s, new, t, around, differ) else 2
+                        sees[t] = 1 if _changes(s, new, t, window, differ) else 2
                 chunk, end = tiles.chunks[chunk, CHUNK], CHUNK
     for t in range(len(sees)):
         sees[t] &= 1

@@ -54,10 +54,21 @@ changed
 
 
 class Model(NamedTuple):
-    """p_hit, and the mixture weight of the causes that the map explains, 1 − p_rand − p_lost."""
+    """What the kernels need of the sensor model.
+
+    Attributes
+    ----------
+    p_hit : float
+        Probability that an occupied cell returns the echo.
+    mixture_weight : float
+        That of the causes that the map explains, 1 − p_rand − p_lost.
+    nats : float
+        What one unit of evidence (`fixed_point.QUANTUM`) counts in the objective: the likelihood exponent times it.
+    """
 
     p_hit: float
     mixture_weight: float
+    nats: float
 
 
 class Maps(NamedTuple):

@@ -4,7 +4,7 @@ Given a map, the updates maximise the expected log-likelihood:
 
     p_rand = mean e_*     p_lost = mean e_lost, if it was not 0
     σ²     = Σ e_k (z − d_k)² / Σ e_k over readings with an echo
-    p_hit  = Σ e_k / (Σ k·e_k + Σ K·e_0)
+    p_hit  = Σ e_k / (Σ k·e_k + Σ K·e_0), of a cell, from which that of `density.HIT_LENGTH` follows
 
 With the true map they recover the truth. Learned together with the map, p_hit is biased upward, since the map has only
 as many cells as it needs.
@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..common.parameters import ModelParameters, find
+from ..sensor.density import hit_parameter
 from ..sensor.forward_model import ForwardModel
 
 MOST_UNEXPLAINED = 0.9
@@ -51,7 +52,7 @@ def learn(forward: ForwardModel, occupied: NDArray[Any]) -> ModelParameters:
     # lost echoes and random measurements say nothing about the obstacles that stood in the way
     chances = float(e.rank.sum() + (e.obstacles * e.no_echo).sum())
     if chances > 0:
-        values['p_hit'] = float(e.hit.sum()) / chances
+        values['p_hit'] = hit_parameter(float(e.hit.sum()) / chances, forward.grid.resolution)
     bounded: dict[str, Any] = {
         name: float(np.clip(value, find(name).low, find(name).high)) for name, value in values.items()
     }

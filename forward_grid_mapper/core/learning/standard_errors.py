@@ -4,7 +4,7 @@ The updates of `learning` end where, over all readings, the sum of
 
     ψ_rand  = e_* / p_rand − (e_hit + e_0) / (1 − p_rand − p_lost)
     ψ_lost  = e_lost / p_lost − (e_hit + e_0) / (1 − p_rand − p_lost)
-    ψ_hit   = e_hit / p_hit − (Σ (k − 1)·e_k + K·e_0) / (1 − p_hit)
+    ψ_hit   = [e_hit / p − (Σ (k − 1)·e_k + K·e_0) / (1 − p)] ∂p/∂p_hit    (p is p_hit of a cell)
     ψ_sigma = Σ e_k (z − d_k)² / σ³ − e_hit / σ          (echoes without a σ of their own)
 
 is zero. The first three are the derivatives of log p(z | m), by Fisher's identity; so is the last, but for the readings
@@ -25,8 +25,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..common.constants import HIT_LENGTH
 from ..common.parameters import ModelParameters, find
 from ..common.readings import Floats, Readings
+from ..sensor.density import hit_probability
 from ..sensor.forward_model import Expectations, ForwardModel
 
 LEARNED = ('p_hit', 'p_rand', 'p_lost', 'sigma')
@@ -72,8 +74,12 @@ def estimating_functions(forward: ForwardModel, occupied: NDArray[Any]) -> dict[
     explained = (e.hit + e.no_echo) / (1.0 - model.p_rand - model.p_lost)
     missed = e.rank - e.hit + e.obstacles * e.no_echo
     unstated = readings.echo & (readings.sigma == 0)
+    resolution = forward.grid.resolution
+    p_hit = hit_probability(model, resolution)
+    # of p_hit of a cell by that of the model
+    slope = resolution / HIT_LENGTH * (1.0 - p_hit) / (1.0 - model.p_hit)
     made = {
-        'p_hit': e.hit / model.p_hit - missed / (1.0 - model.p_hit),
+        'p_hit': (e.hit / p_hit - missed / (1.0 - p_hit)) * slope,
         'p_rand': e.random / model.p_rand - explained,
         'sigma': np.where(unstated, e.squared_error / model.sigma**3 - e.hit / model.sigma, 0.0),
     }

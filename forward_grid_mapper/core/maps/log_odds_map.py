@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..common.constants import ARC_DEPTH, arc_depth
 from ..common.grid import Grid
 from ..common.parameters import Parameters
 from ..common.readings import Readings
@@ -83,13 +84,12 @@ def _add(cones: Cones, gains: Any, log_odds: Any) -> None:
                     _add_run(row, max(first, outer + 1), last, offset, beam, gains[0])
 
 
-def arc_depth(parameters: Parameters) -> float:
-    """Return half the depth of the arc that an echo marks, in metres: the parameter's, or half a cell."""
-    return max(parameters.live.live_depth, parameters.grid.resolution / 2)
-
-
-def map_grid(readings: Readings, parameters: Parameters, within: Grid | None = None) -> Grid:
+def map_grid(
+    readings: Readings, parameters: Parameters, within: Grid | None = None, least_depth: float = ARC_DEPTH
+) -> Grid:
     """Return the grid on which all maps of `readings` lie: every cell that a reading touches, and all of `within`.
+
+    `least_depth` is that of `LogOddsMap`.
 
     Raises
     ------
@@ -97,14 +97,15 @@ def map_grid(readings: Readings, parameters: Parameters, within: Grid | None = N
         If there are no readings, or the grid would exceed `max_cells`.
     """
     p = parameters
-    return grid_of(readings, p.model, p.grid, within=within, beyond=arc_depth(p))
+    return grid_of(readings, p.model, p.grid, within=within, beyond=arc_depth(p.grid.resolution, least_depth))
 
 
 class LogOddsMap:
     """The log-odds of every cell, NaN where not observed, on a grid that grows as readings come; 8 bytes a cell."""
 
-    def __init__(self, parameters: Parameters) -> None:
-        self._parameters = parameters
+    def __init__(self, parameters: Parameters, least_depth: float = ARC_DEPTH) -> None:
+        """Start empty; `least_depth` is half the depth of the arcs that echoes mark, metres, if half a cell is less."""
+        self._parameters, self._least_depth = parameters, least_depth
         self.clear()
 
     def clear(self) -> None:
@@ -125,8 +126,8 @@ class LogOddsMap:
         if not len(readings):
             return
         p = self._parameters
-        depth = arc_depth(p)
-        self.grid = map_grid(readings, p, within=self.grid)
+        depth = arc_depth(p.grid.resolution, self._least_depth)
+        self.grid = map_grid(readings, p, self.grid, self._least_depth)
         self._grow()
         table = cone_table(readings, self._stored, dataclasses.replace(p.model, surface_offset=0.0))
         depth /= p.grid.resolution

@@ -12,8 +12,10 @@ of every reading, so that an echo from nearly z_max frees little more than no ec
 its beam at the cell, since what stands at the edge of a cone is easily missed. A cell through which less than about
 one reading passed is not known to be free.
 
-Where a straight wall ends in the open, the cells ahead have nothing against them and are not known to be free, it goes
-on for a few cells: a wall is more likely to leave the view than to end there.
+Passing is a count of readings, not of nats, so the likelihood exponent has no part in it. It depends on p_rand and
+p_lost: of readings without echo, (1 − p_rand − p_lost) / (1 − p_rand) count where nothing stood in the way.
+
+Straight walls go on where they leave the view (`wall_extension`).
 """
 
 from __future__ import annotations
@@ -21,6 +23,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from ..common.constants import FREE_MARGIN
 from ..evidence.evidence import Evidence
 from .free_space import expected_passes
 from .wall_extension import extend
@@ -33,17 +36,20 @@ def _grown(cells: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return out
 
 
-def post_process(evidence: Evidence, steps: int, least_passed: float, traversed: NDArray[np.bool_]) -> NDArray[np.int8]:
+def post_process(
+    evidence: Evidence, extension: float, least_passed: float, traversed: NDArray[np.bool_]
+) -> NDArray[np.int8]:
     """Return the ML map that is handed out, shape `grid.shape`: 1 occupied, 0 free, -1 not observed.
 
     Parameters
     ----------
     evidence : Evidence
         After the search.
-    steps : int
-        Cells by which to draw walls out.
+    extension : float
+        Metres by which walls go on at most where they leave the view.
     least_passed : float
-        Readings that must have passed a cell, or one beside it, for it to be free; 0 takes all cells that were seen.
+        Readings that must have passed a cell, or one within `FREE_MARGIN`, for it to be free; 0 takes all cells that
+        were seen.
     traversed : bool, shape `grid.shape`
         Cells that are known to be free, though no reading may see them.
     """
@@ -54,10 +60,12 @@ def post_process(evidence: Evidence, steps: int, least_passed: float, traversed:
     if least_passed > 0:
         passed = expected_passes(evidence, evidence.state.maps.occupied).reshape(ml.shape)
         known |= (passed >= least_passed) & (ml == 0)
-    if steps:
+    if steps := round(extension / evidence.grid.resolution):
         ahead = np.zeros(ml.shape, np.uint8)
         extend(evidence.state, steps, known.astype(np.uint8).ravel(), ahead.ravel())
         ml[ahead == 1] = 1
     if least_passed > 0:
-        ml[(ml == 0) & ~_grown(known)] = -1
+        for _ in range(max(round(FREE_MARGIN / evidence.grid.resolution), 1)):
+            known = _grown(known)
+        ml[(ml == 0) & ~known] = -1
     return ml

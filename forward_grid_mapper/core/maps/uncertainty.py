@@ -11,11 +11,9 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from ..common.constants import LEAST_EVIDENCE
 from ..common.parameters import SearchParameters
 from ..sensor.cone_table import Floats
-
-LEAST_EVIDENCE = 0.1
-"""Nats, either way, from which on a cell counts as observed though the ML map does not know it."""
 
 
 def marginals(evidence: Floats, neighbours: Floats, parameters: SearchParameters) -> NDArray[np.float32]:

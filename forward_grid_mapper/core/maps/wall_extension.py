@@ -1,20 +1,18 @@
-"""Wall extension: straight walls go on where they leave the view."""
+"""Wall extension: straight walls go on where they leave the view.
+
+Where a straight wall ends in the open, no reading speaks against the cells ahead, and these are not known to be free,
+the wall goes on for up to `EXTENSION`: a wall is more likely to leave the view than to end there.
+"""
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
-from ..evidence.fixed_point import QUANTUM
+from ..common.constants import MOST_AGAINST_EXTENSION, STRAIGHT_RUN
 from ..evidence.neighbourhood import NEIGHBOURS, neighbour, opposite
 from ..evidence.state import State
 from ..runtime.jit import kernel
-
-STRAIGHT_RUN = 4
-"""Cells in a row that make a straight wall."""
-
-
-MOST_AGAINST = 0.05
-"""Nats that may speak against a cell by which a wall goes on."""
 
 
 @kernel
@@ -28,14 +26,16 @@ def _ahead(c: int, k: int, height: int, width: int, n: int) -> int:
 @kernel
 def extend(s: State, steps: int, barred: Any, out: Any) -> None:
     """Set in `out` (uint8) the cells by which straight walls go on at their ends, up to what is `barred` (uint8)."""
-    height, width = s.lattice.height, s.lattice.width
+    height, width, resolution = s.lattice.height, s.lattice.width, s.lattice.resolution
+    run = max(int(math.floor(STRAIGHT_RUN / resolution + 0.5)), 2)
+    most = MOST_AGAINST_EXTENSION * resolution
     occupied, evidence, seen = s.maps.occupied, s.maps.evidence, s.maps.seen
     for c in range(len(occupied)):
         if not occupied[c]:
             continue
         for k in range(NEIGHBOURS):
             straight = True
-            for n in range(1, STRAIGHT_RUN):
+            for n in range(1, run):
                 o = _ahead(c, opposite(k), height, width, n)
                 straight = straight and o >= 0 and occupied[o] == 1
             # a true end has no neighbour ahead, nor abreast of what is ahead
@@ -45,6 +45,6 @@ def extend(s: State, steps: int, barred: Any, out: Any) -> None:
             if straight:
                 for n in range(1, steps + 1):
                     o = _ahead(c, k, height, width, n)
-                    if o < 0 or occupied[o] or not seen[o] or barred[o] or evidence[o] * QUANTUM < -MOST_AGAINST:
+                    if o < 0 or occupied[o] or not seen[o] or barred[o] or evidence[o] * s.model.nats < -most:
                         break
                     out[o] = 1

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+from ..common.constants import arc_depth
 from ..common.parameters import Parameters
 from ..common.readings import Readings
 from ..sensor.density import CUT
@@ -27,7 +28,7 @@ def reach_of(measured: Measurement, parameters: Parameters) -> float:
     p = parameters
     cell = p.grid.resolution
     explained = measured.z + CUT * max(measured.sigma or p.model.sigma, cell / 2)
-    return max(min(explained, measured.z_max), measured.z + max(p.live.live_depth, cell / 2)) + 2 * cell
+    return max(min(explained, measured.z_max), measured.z + arc_depth(cell)) + 2 * cell
 
 
 class MapExtent:

@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..common.readings import Floats
-from ..evidence.fixed_point import QUANTUM
 from ..evidence.neighbourhood import NEIGHBOURS, neighbour
 from ..evidence.state import State
 from ..evidence.updates import flip
@@ -19,7 +18,7 @@ from .prior import Prior, prior_gain
 @kernel
 def gain_of(s: State, prior: Prior, c: int) -> float:
     """Return what flipping cell c gains, prior included, in nats."""
-    data = s.maps.evidence[c] * QUANTUM
+    data = s.maps.evidence[c] * s.model.nats
     return float(data + prior_gain(prior, s.maps.occupied, s.maps.pattern, c, s.lattice.width))
 
 
@@ -50,7 +49,7 @@ def promising(s: State, prior: Prior, least: Least, window: tuple[int, int, int,
         for c in range(np.uint64(row * width + window[2]), np.uint64(row * width + window[3])):
             if not seen[c]:
                 continue
-            data = evidence[c] * QUANTUM
+            data = evidence[c] * s.model.nats
             if occupied[c] or pattern[c]:
                 cell: Any = np.int64(c)
                 gain = data + prior_gain(prior, occupied, pattern, cell, width)

@@ -1,10 +1,15 @@
-"""Bridges: walls that close the gap between two ends at once.
+"""Moves of whole walls: gaps between two ends are closed at once, and short walls are removed at once.
 
-Each cell of a gap costs more than it gains, as long as the next one is missing, so single flips never close it. A
-bridge is a straight run of free cells between two occupied ones through which no wall passes yet. It leaves each of
-them away from the neighbours that it has; and no cell of it may have more against it than a nat, nor all together more
-than a few. Doors have much against them: the readings that went through. Where a gap is so wide that a robot might
-go, a few such readings are enough.
+Each cell of a gap costs more than it gains, as long as the next one is missing, so single flips never close it. A gap
+is a straight run of free cells between two ends of walls. The run leads away from the neighbours of both ends. The
+readings may speak against it, but only so much: `MOST_AGAINST_METRE` for each metre, and `MOST_AGAINST_GAP` in all.
+Where a gap is so wide that a robot might go through, `MOST_AGAINST_PASSAGE` is the bound: the readings that went
+through a door speak against a wall there.
+
+Likewise, to free one cell of a short wall saves next to nothing, as long as the rest of it stands, since the rest has
+two ends as well. A short wall is a set of up to `SHORT_WALL` of occupied cells that touch each other and no others.
+
+Either move must raise the objective. All lengths are in metres, so that a finer lattice has the same gaps.
 """
 
 from __future__ import annotations
@@ -15,28 +20,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..evidence.fixed_point import QUANTUM
+from ..common.constants import (
+    AWAY,
+    MOST_AGAINST_GAP,
+    MOST_AGAINST_METRE,
+    MOST_AGAINST_PASSAGE,
+    PASSAGE,
+)
 from ..evidence.neighbourhood import DX, DY, NEIGHBOURS
 from ..evidence.state import State
 from ..evidence.updates import flip
 from ..runtime.jit import allocating_kernel, kernel
 from .flips import Least, gain_of
 from .prior import Prior
-
-MOST_AGAINST_CELL = 1.0
-"""Nats."""
-
-MOST_AGAINST_GAP = 4.0
-"""Nats."""
-
-MOST_AGAINST_PASSAGE = 1.5
-"""Nats, over a gap that is wide enough to drive through."""
-
-PASSAGE = 0.35
-"""Metres of a gap from where on a robot might drive through."""
-
-AWAY = -0.35
-"""Largest cosine between the direction of a bridge and that of the neighbours that its end has."""
 
 
 @kernel
@@ -68,13 +64,13 @@ def _may_close(s: State, prior: Prior, c: int, dx: int, dy: int) -> bool:
 
 @kernel
 def _path(s: State, c: int, dx: int, dy: int, up: bool, path: Any) -> bool:
-    """Write the cells between c and the cell at (dx, dy) from it; tell whether a bridge may stand on them.
+    """Write the cells between c and the cell at (dx, dy) from it; tell whether a wall may stand on them.
 
     Where the line passes midway between two cells, `up` takes the one of the larger row and column.
     """
     width = s.lattice.width
     n = max(abs(dx), abs(dy))
-    against = 0.0
+    against, most = 0.0, MOST_AGAINST_METRE * s.lattice.resolution
     for i in range(1, n):
         y, x = dy * i / n, dx * i / n
         if up:
@@ -82,8 +78,8 @@ def _path(s: State, c: int, dx: int, dy: int, up: bool, path: Any) -> bool:
         else:
             row, column = int(math.ceil(y - 0.5)), int(math.ceil(x - 0.5))
         o = c + row * width + column
-        data = s.maps.evidence[o] * QUANTUM
-        if s.maps.occupied[o] or not s.maps.seen[o] or data < -MOST_AGAINST_CELL:
+        data = s.maps.evidence[o] * s.model.nats
+        if s.maps.occupied[o] or not s.maps.seen[o] or data < -most:
             return False
         against -= data
         path[i - 1] = o
@@ -103,7 +99,7 @@ def _midway(dx: int, dy: int) -> bool:
 
 
 @kernel
-def _close(s: State, prior: Prior, least: Least, path: Any, n: int) -> float:
+def _flip_all(s: State, prior: Prior, least: Least, path: Any, n: int) -> float:
     """Flip the first n cells of `path`; flip them back, and return 0, if that does not gain enough."""
     gain, needed = 0.0, 10.0 * least[0]
     for i in range(n):
@@ -137,7 +133,7 @@ def _list_gaps(
                 for up in range(0 if _midway(dx, dy) else 1, 2):
                     if m == len(gaps) or not _path(s, c, dx, dy, up == 1, path):
                         continue
-                    gain = _close(s, prior, least, path, n - 1)
+                    gain = _flip_all(s, prior, least, path, n - 1)
                     if gain > 0.0:
                         for i in range(n - 1):
                             flip(s, path[i])
@@ -149,10 +145,17 @@ def _list_gaps(
 
 @allocating_kernel
 def close_gaps(s: State, prior: Prior, least: Least, cells: NDArray[np.int64], longest: int) -> tuple[int, float]:
-    """Build the bridges that gain, the shortest first, and of one length the one first that gains most.
+    """Close the gaps that gain, the shortest first, and of one length the one first that gains most.
 
-    So what is built does not depend on the order of cells, which differs in a mirrored map. Returns the number of
-    flips and the total gain. `cells` are the occupied ones to start from.
+    So what is closed does not depend on the order of cells, which differs in a mirrored map. Returns the number of
+    flips and the total gain.
+
+    Parameters
+    ----------
+    cells : int64, shape (N,)
+        The occupied ones to start from.
+    longest : int
+        Cells from one end of a gap to the other.
     """
     path = np.empty(longest, np.int64)
     gaps, gains = np.empty((2 * len(cells) + 64, 4), np.int64), np.empty(2 * len(cells) + 64)
@@ -162,8 +165,63 @@ def close_gaps(s: State, prior: Prior, least: Least, cells: NDArray[np.int64], l
         for k in np.argsort(-gains[:m], kind='mergesort'):
             c, dx, dy, up = gaps[k, 0], gaps[k, 1], gaps[k, 2], gaps[k, 3]
             if _may_close(s, prior, c, dx, dy) and _path(s, c, dx, dy, up == 1, path):
-                gain = _close(s, prior, least, path, n - 1)
+                gain = _flip_all(s, prior, least, path, n - 1)
                 if gain > 0.0:
                     flips += n - 1
                     total += gain
+    return flips, total
+
+
+@kernel
+def _connected(s: State, reached: Any, wall: Any) -> int:
+    """List all occupied cells that are connected to the first one of `wall`, by any neighbours; return their number.
+
+    Sets them in `reached` (uint8, shape (cells,)).
+    """
+    height, width = s.lattice.height, s.lattice.width
+    reached[wall[0]] = 1
+    n, i = 1, 0
+    while i < n:
+        row, column = wall[i] // width, wall[i] % width
+        i += 1
+        for y in range(max(row - 1, 0), min(row + 2, height)):
+            for x in range(max(column - 1, 0), min(column + 2, width)):
+                o = y * width + x
+                if s.maps.occupied[o] and not reached[o]:
+                    reached[o] = 1
+                    wall[n] = o
+                    n += 1
+    return n
+
+
+@allocating_kernel
+def remove_short_walls(
+    s: State, prior: Prior, least: Least, cells: NDArray[np.int64], longest: int
+) -> tuple[int, float]:
+    """Free the short walls whose removal gains; return the number of flips and the total gain.
+
+    Walls of a single cell are left to single flips.
+
+    Parameters
+    ----------
+    cells : int64, shape (N,)
+        The occupied ones to start from.
+    longest : int
+        Cells of a wall that counts as short.
+    """
+    reached = np.zeros(len(s.maps.occupied), np.uint8)
+    wall = np.empty(int(s.maps.occupied.sum()), np.int64)
+    flips, total = 0, 0.0
+    for c in cells:
+        if s.stop[0]:
+            break
+        if reached[c] or not s.maps.occupied[c]:
+            continue
+        wall[0] = c
+        n = _connected(s, reached, wall)
+        if 1 < n <= longest:
+            gain = _flip_all(s, prior, least, wall, n)
+            if gain > 0.0:
+                flips += n
+                total += gain
     return flips, total

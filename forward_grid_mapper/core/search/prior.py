@@ -1,10 +1,14 @@
-"""The prior of a map: how likely cells are occupied, given what is traversed over and given their neighbours.
+"""The prior of a map: how likely cells are occupied, given what was traversed and given their neighbours.
 
     log p(m) = Σ over occupied cells c of [ local(c) + shape(the occupied ones of its eight neighbours) ]
 
-Walls are curves. A cell through which a curve passes, with two occupied neighbours on opposite sides of it, costs next
-to nothing; the end of a curve costs something, and a cell on its own more. With all three 0 this is the paper's
-prior, where cells are independent.
+The search uses two priors, one after the other. In the first, cells are independent, as in the paper: an occupied cell
+has the log odds of `prior`, and its neighbours do not matter. In the second, walls are curves: a curve costs
+`wall_cost` for each metre and `end_cost` for each of its two ends. A cell with two occupied neighbours on opposite
+sides is inside a curve; any other cell is an end; a cell without neighbours is a curve with both ends in one cell. A
+corner of less than 135° costs as much as an end. Both costs are the same in cells of any size.
+
+No sensor moves through a wall. So traversed cells are never occupied.
 """
 
 from __future__ import annotations
@@ -15,13 +19,15 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ..common.constants import FORBIDDEN
 from ..common.parameters import SearchParameters
 from ..evidence.neighbourhood import NEIGHBOURS, offset, opposite, patterns
 from ..runtime.jit import allocating_kernel, kernel
 from ..sensor.cone_table import Floats
 
 OPPOSITE_ENOUGH = 3
-"""Eighths of a turn between two neighbours that a curve can pass through."""
+"""Eighths of a turn between two neighbours that a curve can pass through: 135°, so that a curve on the lattice may run
+in any direction, but may not turn a corner."""
 
 
 class Prior(NamedTuple):
@@ -39,27 +45,55 @@ class Prior(NamedTuple):
     shape: Floats
 
 
-LEAST_COST = 0.05
-"""Nats that a cell of a wall must cost, all in all; if walls were likelier than none, they would grow out of sight."""
+def has_walls(parameters: SearchParameters) -> bool:
+    """Tell whether there is a prior of walls; without one, cells are independent, as in the paper."""
+    return parameters.end_cost > 0
 
 
-def shapes(parameters: SearchParameters) -> Floats:
-    """Return what each of the 256 patterns adds to the log prior odds of an occupied cell."""
-    cost = math.log((1 - parameters.prior) / parameters.prior)
-    line = min(parameters.line_bonus, max(cost - LEAST_COST, 0.0))
-    out = np.full(256, -parameters.end_cost)
-    out[0] = -parameters.isolated_cost
+def independent_prior(parameters: SearchParameters, traversed: NDArray[np.bool_]) -> Prior:
+    """Return the prior of independent cells.
+
+    Parameters
+    ----------
+    parameters : SearchParameters
+        Of which `prior` counts.
+    traversed : bool, shape (cells,)
+        Cells over which a sensor was moved.
+    """
+    odds = math.log(parameters.prior / (1 - parameters.prior))
+    return Prior(_local(odds, traversed), np.zeros(256))
+
+
+def wall_prior(parameters: SearchParameters, traversed: NDArray[np.bool_], resolution: float) -> Prior:
+    """Return the prior of walls; that of independent cells where `has_walls` denies it.
+
+    Parameters
+    ----------
+    parameters : SearchParameters
+        Of which `wall_cost` and `end_cost` count.
+    traversed : bool, shape (cells,)
+        Cells over which a sensor was moved.
+    resolution : float
+        Edge length of a cell, metres.
+    """
+    if not has_walls(parameters):
+        return independent_prior(parameters, traversed)
+    return Prior(_local(-parameters.wall_cost * resolution, traversed), shapes(parameters.end_cost))
+
+
+def shapes(end_cost: float) -> Floats:
+    """Return what each of the 256 patterns adds to the log prior odds of an occupied cell, nats."""
+    out = np.full(256, -end_cost)
+    out[0] = -2.0 * end_cost
     for pattern in range(1, 256):
         bits = [k for k in range(8) if pattern >> k & 1]
         if any(min((a - b) % 8, (b - a) % 8) >= OPPOSITE_ENOUGH for a in bits for b in bits):
-            out[pattern] = line
+            out[pattern] = 0.0
     return out
 
 
-def local_prior(parameters: SearchParameters, traversed: NDArray[np.bool_]) -> Floats:
-    """Return the log prior odds of each cell by itself, given which are `traversed` over; the same shape."""
-    odds = math.log(parameters.prior / (1 - parameters.prior))
-    out: Floats = np.where(traversed, odds - parameters.driven_cost, odds)
+def _local(odds: float, traversed: NDArray[np.bool_]) -> Floats:
+    out: Floats = np.where(traversed, -FORBIDDEN, odds)
     return out
 
 

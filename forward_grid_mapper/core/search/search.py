@@ -10,12 +10,15 @@ first, until no single flip gains. *Block moves* follow: occupied cells move to 
 updates and block moves alternate until neither gains. Ties keep the state, except at the end: occupied cells that
 nothing needs are freed.
 
-All this happens twice: at first as if the cells of a map were independent, then, from the map found so, with what the
-prior says of walls (`prior`), and with bridges (`bridges`) when nothing else gains. In either part the objective
+All this happens twice: at first as if the cells of a map were independent, then, from the map found so, with the prior
+of walls (`prior`). The second part also closes gaps in walls, and removes short walls, when nothing else gains
+(`gap_closing`). In either part the objective
 
-    J(m) = log p(Z | m) + log p(m)
+    J(m) = γ log p(Z | m) + log p(m)
 
-never falls, and at the end no single flip raises it by more than `LEAST_GAIN` and the cell's share of `ROUNDING`.
+never falls. γ is the likelihood exponent: readings are not independent of each other, so together they say less than
+their sum (a tempered likelihood). At no time are traversed cells occupied. At the end no single flip raises J by more
+than `LEAST_GAIN` and the cell's share of `ROUNDING`.
 """
 
 from __future__ import annotations
@@ -26,6 +29,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ..common.constants import LONGEST_GAP, SHORT_WALL
 from ..common.grid import Window
 from ..common.parameters import SearchParameters
 from ..evidence.evidence import Evidence
@@ -34,8 +38,8 @@ from ..evidence.state import State
 from ..runtime.cancelling import check
 from ..sensor.cone_table import Floats
 from .flips import flip_in_order, free_unneeded, highest, promising
-from .gap_closing import close_gaps
-from .prior import Prior, local_prior, log_prior, shapes
+from .gap_closing import close_gaps, remove_short_walls
+from .prior import Prior, has_walls, independent_prior, log_prior, wall_prior
 from .shifts import best_shifts, see_any, shift_in_order, try_shifts, unsettle
 
 LEAST_GAIN = 1e-4
@@ -74,7 +78,8 @@ class SearchResult:
     occupied : uint8, shape (cells,)
         1 occupied, 0 free; cells that no reading touches are 0.
     evidence : float64, shape (cells,)
-        log p(Z | cell occupied, rest of the map) − log p(Z | cell free, rest of the map) in nats, 0 where untouched.
+        γ [log p(Z | cell occupied, rest of the map) − log p(Z | cell free, rest of the map)] in nats, 0 where
+        untouched.
     prior : Prior
         That which the map was found with.
     log_prior : float
@@ -120,9 +125,12 @@ class Search:
         height, width = evidence.grid.shape
         self._window = window or (0, height, 0, width)
         traversed = np.zeros(evidence.grid.size, np.bool_) if traversed is None else traversed
-        self._whole = Prior(local_prior(parameters, traversed), shapes(parameters))
-        # as if cells were independent
-        self._prior = self._whole._replace(shape=np.zeros(256))
+        self._prior = independent_prior(parameters, traversed)
+        self._of_walls = wall_prior(parameters, traversed, evidence.grid.resolution)
+        occupied = evidence.state.maps.occupied
+        if occupied[traversed].any():
+            occupied[traversed] = 0
+            evidence.rebuild()
         self._settled = np.zeros(evidence.grid.size, np.uint8)
         self._tried_at = -1
         self.progress = Progress(0, 0, 0, 0.0)
@@ -138,7 +146,7 @@ class Search:
 
     def _objective(self) -> float:
         maps = self.evidence.state.maps
-        return self.evidence.log_likelihood + log_prior(self._prior, maps.occupied, maps.pattern)
+        return self.evidence.tempered_log_likelihood + log_prior(self._prior, maps.occupied, maps.pattern)
 
     def run(self, watch: Watch = lambda progress: None) -> SearchResult:
         """Search until no flip and no move gains; `watch` is called after every sweep.
@@ -151,7 +159,7 @@ class Search:
             If `stop` was set.
         """
         if self.evidence.state.maps.occupied.any():
-            independent, self._prior = self._prior, self._whole
+            independent, self._prior = self._prior, self._of_walls
             converged = self._climb(watch)
             if converged and not self.progress.flips and not self.progress.shifts:
                 return self._result(converged)
@@ -164,8 +172,8 @@ class Search:
     def refine(self, watch: Watch = lambda progress: None) -> SearchResult:
         """Do as `run` does, but without the rounds at the beginning."""
         converged = self._climb(watch)
-        if self._whole.shape.any():
-            self._prior = self._whole
+        if has_walls(self._parameters):
+            self._prior = self._of_walls
             self._settled[:] = 0
             converged = self._climb(watch)
         return self._result(converged)
@@ -182,10 +190,12 @@ class Search:
         )
 
     def _climb(self, watch: Watch) -> bool:
-        """Flip, shift and bridge until nothing gains; return whether that was reached."""
-        p = self._parameters
+        """Make moves of all kinds until nothing gains; return whether that was reached."""
+        walls = self._prior is self._of_walls and has_walls(self._parameters)
         while self._more():
-            if self._sweep(watch) or self._shift(watch) or (p.bridges > 1 and self._close_gaps(watch)):
+            if self._sweep(watch) or self._shift(watch):
+                continue
+            if walls and (self._close_gaps(watch) or self._remove_short_walls(watch)):
                 continue
             if not self._free(watch):
                 return True
@@ -267,8 +277,18 @@ class Search:
             self._advance(flips, 0, max(gain, 0.0), watch)
         return flips
 
+    def _cells(self, length: float) -> int:
+        """Return how many cells a length in metres is."""
+        return max(round(length / self.evidence.grid.resolution), 1)
+
     def _close_gaps(self, watch: Watch) -> int:
         s = self.evidence.state
-        flips, gain = close_gaps(s, self._prior, LEAST, self._occupied(), self._parameters.bridges)
+        flips, gain = close_gaps(s, self._prior, LEAST, self._occupied(), self._cells(LONGEST_GAP))
+        self._advance(flips, 0, gain, watch)
+        return flips
+
+    def _remove_short_walls(self, watch: Watch) -> int:
+        s = self.evidence.state
+        flips, gain = remove_short_walls(s, self._prior, LEAST, self._occupied(), self._cells(SHORT_WALL))
         self._advance(flips, 0, gain, watch)
         return flips

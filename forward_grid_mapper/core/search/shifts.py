@@ -163,7 +163,7 @@ def best_shifts(
             o = neighbour(c, k, height, width)
             if o < 0 or s.maps.occupied[o] or not s.maps.seen[o]:
                 continue
-            gain = loss + gain_of(s, prior, o) + joint[i, k] * QUANTUM
+            gain = loss + gain_of(s, prior, o) + joint[i, k] * s.model.nats
             if gain > max(gains[i], least_gain(s, least, c) + least_gain(s, least, o)):
                 targets[i], gains[i] = o, gain
         s.maps.occupied[c] ^= 1

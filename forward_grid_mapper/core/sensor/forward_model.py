@@ -143,7 +143,7 @@ class ForwardModel:
             Occupied cells are 1; anything else counts as free.
         """
         resolution, model = self.grid.resolution, self.model
-        causes = causes_of(self.readings, self.cones['sigma'] * resolution, model)
+        causes = causes_of(self.readings, self.cones['sigma'] * resolution, model, resolution)
         given = _Given(self.cones, self._pairing, self.normals, causes, resolution)
         out = np.empty((8, len(self.readings)))
         _expect(given, np.ascontiguousarray(np.asarray(occupied) == 1).view(np.uint8), out)

@@ -5,7 +5,8 @@ only if it met the surface nearly along its normal. Most of what speaks against 
 of real sonars, comes from readings that graze them.
 
 The normal is estimated before any search, from the echoes alone. Near a surface the bearings of those readings whose
-range agrees gather around its normal; φ and φ + π are one, so 2φ is averaged, over the 3 x 3 cells around:
+range agrees gather around its normal; φ and φ + π are one, so 2φ is averaged, over the square of `NEIGHBOURHOOD`
+around the cell:
 
     C = Σ w cos 2φ      S = Σ w sin 2φ      M = Σ w      w = exp(−(d − z)² / 2σ²)      normal = atan2(S, C) / 2
 
@@ -20,19 +21,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ..common.constants import LEAST_AGREEMENT, LEAST_WEIGHT, NEIGHBOURHOOD, THROUGH, WEIGHT_CELL
 from ..common.grid import Grid, Window
 from ..runtime.jit import kernel
 from .cone import rows_of, runs_of
 from .cone_table import Cones, cone_of
-
-LEAST_WEIGHT = 3.0
-"""Echoes, in the sum M, that it takes to know a normal."""
-
-LEAST_AGREEMENT = 0.5
-"""Length of the mean of the doubled bearings that it takes, 1 where all agree."""
-
-THROUGH = 2.0
-"""A reading that exceeds_incidence_angle a cell does not contradict it if its range is this many σ beyond."""
 
 BLOCK = 2**16
 """Cells whose normals are estimated at once, which bounds the memory that it takes."""
@@ -121,45 +114,64 @@ def _before(known: NDArray[Any]) -> NDArray[np.int32]:
     return out
 
 
-def _box(values: NDArray[np.int64], window: Window) -> NDArray[np.float64]:
-    """Return the sums over the 3 x 3 cells around each cell of a window, nothing beyond the edges of the grid."""
+def _half_width(resolution: float) -> tuple[int, float]:
+    """Return how many cells `NEIGHBOURHOOD` reaches beyond the middle one, and which part of the outermost counts."""
+    half = (max(round(NEIGHBOURHOOD / resolution, 6), 1.0) - 1.0) / 2.0
+    whole = math.ceil(half - 1e-9)
+    return whole, half - whole + 1.0
+
+
+def _box(values: NDArray[np.int64], resolution: float, window: Window) -> NDArray[np.float64]:
+    """Return the sums over the square of `NEIGHBOURHOOD` around each cell of a window, in cells of `WEIGHT_CELL`.
+
+    Nothing is added from beyond the edges of the grid. The order of summation does not depend on the window.
+    """
     bottom, top, left, right = window
     height, width = values.shape
-    inside = values[max(bottom - 1, 0) : top + 1, max(left - 1, 0) : right + 1]
-    missing = (int(bottom == 0), int(top == height)), (int(left == 0), int(right == width))
+    n, part = _half_width(resolution)
+    inside = values[max(bottom - n, 0) : top + n, max(left - n, 0) : right + n]
+    missing = (max(n - bottom, 0), max(top + n - height, 0)), (max(n - left, 0), max(right + n - width, 0))
     wide = np.pad(inside, missing)
-    rows = wide[:-2] + wide[1:-1] + wide[2:]
-    out: NDArray[np.float64] = (rows[:, :-2] + rows[:, 1:-1] + rows[:, 2:]) * QUANTUM
-    return out
+    weights = np.ones(2 * n + 1)
+    if n:
+        weights[[0, -1]] = part
+    rows = np.zeros((top - bottom, wide.shape[1]))
+    for k, weight in enumerate(weights):
+        rows += weight * wide[k : k + top - bottom]
+    out = np.zeros((top - bottom, right - left))
+    for k, weight in enumerate(weights):
+        out += weight * rows[:, k : k + right - left]
+    return out * (QUANTUM * (resolution / WEIGHT_CELL) ** 2)
 
 
-def _estimate(normals: SurfaceNormals, sums: NDArray[np.int64], shape: tuple[int, int], window: Window) -> None:
+def _estimate(normals: SurfaceNormals, sums: NDArray[np.int64], grid: Grid, window: Window) -> None:
     """Write the normals of the cells of a window."""
+    shape = grid.shape
     bottom, top, left, right = window
     known, x, y = (array.reshape(shape) for array in (normals.known, normals.x, normals.y))
     step = max(BLOCK // (right - left), 1)
     for first in range(bottom, top, step):
         part = first, min(first + step, top), left, right
         cells = slice(*part[:2]), slice(*part[2:])
-        cosine, sine, mass = (_box(values.reshape(shape), part) for values in sums)
+        cosine, sine, mass = (_box(values.reshape(shape), grid.resolution, part) for values in sums)
         told = (mass >= LEAST_WEIGHT) & (np.hypot(cosine, sine) >= LEAST_AGREEMENT * mass)
         angle = np.arctan2(sine, cosine) / 2
         known[cells], x[cells], y[cells] = told, np.where(told, np.cos(angle), 0.0), np.where(told, np.sin(angle), 0.0)
     np.cumsum(known[bottom:top], axis=1, dtype=np.int32, out=normals.before[bottom:top, 1:])
 
 
-def normals_of(sums: NDArray[np.int64], shape: tuple[int, int], angle: float) -> SurfaceNormals:
+def normals_of(sums: NDArray[np.int64], grid: Grid, angle: float) -> SurfaceNormals:
     """Return the normals that the sums of `gather` give.
 
     Parameters
     ----------
     sums : int64, shape (3, cells)
-    shape : (height, width)
+    grid : Grid
     angle : float
         Radians off the normal beyond which a surface returns no echo.
     """
-    normals = _unknown(shape, math.cos(angle) ** 2)
-    _estimate(normals, sums, shape, (0, shape[0], 0, shape[1]))
+    normals = _unknown(grid.shape, math.cos(angle) ** 2)
+    _estimate(normals, sums, grid, (0, grid.height, 0, grid.width))
     return normals
 
 
@@ -169,24 +181,29 @@ def _unknown(shape: tuple[int, int], cos2_limit: float) -> SurfaceNormals:
     return SurfaceNormals(known, x, y, before, cos2_limit)
 
 
-def renewed(normals: SurfaceNormals, sums: NDArray[np.int64], shape: tuple[int, int], window: Window) -> SurfaceNormals:
+def renewed(normals: SurfaceNormals, sums: NDArray[np.int64], grid: Grid, window: Window) -> SurfaceNormals:
     """Return the normals after the sums changed in a window; those given stay as they are.
 
     Parameters
     ----------
     normals : SurfaceNormals
     sums : int64, shape (3, cells)
-    shape : (height, width)
+    grid : Grid
     window
         Where the sums changed: first row, last one plus one, and columns likewise.
     """
     new = normals._replace(
         known=normals.known.copy(), x=normals.x.copy(), y=normals.y.copy(), before=normals.before.copy()
     )
-    bottom, top, left, right = window
-    around = max(bottom - 1, 0), min(top + 1, shape[0]), max(left - 1, 0), min(right + 1, shape[1])
-    _estimate(new, sums, shape, around)
+    _estimate(new, sums, grid, touched(window, grid))
     return new
+
+
+def touched(window: Window, grid: Grid) -> Window:
+    """Return the window of the cells whose normals depend on the sums in `window`."""
+    bottom, top, left, right = window
+    n, _ = _half_width(grid.resolution)
+    return max(bottom - n, 0), min(top + n, grid.height), max(left - n, 0), min(right + n, grid.width)
 
 
 @kernel

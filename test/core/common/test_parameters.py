@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from forward_grid_mapper.core.common.errors import ParameterError
-from forward_grid_mapper.core.common.parameters import TABLE, Parameters, find
+from forward_grid_mapper.core.common.parameters import DEPRECATED, TABLE, Parameters, deprecation, find
 
 
 @pytest.mark.parametrize('row', TABLE, ids=lambda row: row.name)
@@ -43,3 +43,12 @@ def test_unknown_names_get_a_hint() -> None:
 def test_causes_must_leave_something_for_the_map() -> None:
     with pytest.raises(ParameterError, match='p_rand'):
         Parameters.from_flat({'p_rand': 0.7, 'p_lost': 0.5})
+
+
+@pytest.mark.parametrize('name', DEPRECATED)
+def test_names_of_the_version_before_are_left_out_with_a_warning(name: str, caplog: pytest.LogCaptureFixture) -> None:
+    assert name not in {row.name for row in TABLE}
+    base = Parameters.from_flat({'p_hit': 0.5})
+    assert Parameters.from_flat({name: 3, 'p_rand': 0.1}, base=base) == Parameters.from_flat({'p_rand': 0.1}, base=base)
+    assert caplog.messages == [deprecation(name)]
+    assert name in deprecation(name)

@@ -152,7 +152,8 @@ def test_the_evidence_of_every_cell_is_what_flipping_it_gains(seed: int) -> None
 def test_what_no_map_changes_is_that_of_the_forward_model(some: object) -> None:
     readings, model = some(np.random.default_rng(0), GRID, 100), MODEL
     sigma = np.array([naive.sigma_of(readings, t, GRID, model) for t in range(len(readings))])
-    reading_states, causes = reading_state_table(readings, sigma, model), causes_of(readings, sigma, model)
+    reading_states = reading_state_table(readings, sigma, model, GRID.resolution)
+    causes = causes_of(readings, sigma, model, GRID.resolution)
     assert reading_states['floor'] == pytest.approx(causes.random + causes.lost)
     assert np.array_equal(reading_states['max_range'], causes.max_range)
     assert (reading_states['multiplicity'] == 1).all()

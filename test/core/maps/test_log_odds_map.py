@@ -10,6 +10,7 @@ import pytest
 
 import naive
 from conftest import random_readings
+from forward_grid_mapper.core.common.constants import ARC_DEPTH
 from forward_grid_mapper.core.common.errors import InputError
 from forward_grid_mapper.core.common.grid import Grid
 from forward_grid_mapper.core.common.parameters import Parameters
@@ -26,12 +27,12 @@ def logit(p: float) -> float:
 @pytest.mark.parametrize('depth', [0.05, 0.12, 1.0])
 def test_log_odds_are_those_of_the_twin(depth: float) -> None:
     readings = random_readings(np.random.default_rng(0), AREA, 80)
-    parameters = Parameters.from_flat({'live_depth': depth})
-    live = LogOddsMap(parameters)
+    parameters = Parameters()
+    live = LogOddsMap(parameters, depth)
     live.add(readings)
     p = parameters.live
     logits = logit(p.live_p_occupied), logit(p.live_p_free), logit(p.live_p_free_no_echo)
-    expected = naive.live_log_odds(readings, live.grid, p.live_depth, logits)
+    expected = naive.live_log_odds(readings, live.grid, depth, logits)
     assert live.log_odds() == pytest.approx(expected, abs=1e-4, nan_ok=True)
 
 
@@ -78,9 +79,8 @@ def test_probabilities_are_unknown_exactly_where_no_cone_reaches() -> None:
     live = LogOddsMap(Parameters())
     live.add(readings)
     known = np.isfinite(live.probability()).ravel()
-    depth = Parameters().live.live_depth
     pose = (readings.x[0], readings.y[0], readings.yaw[0])
-    cells = naive.cone_cells(pose, readings.half_angle[0], readings.z[0] + depth, live.grid)
+    cells = naive.cone_cells(pose, readings.half_angle[0], readings.z[0] + ARC_DEPTH, live.grid)
     assert set(np.flatnonzero(known).tolist()) == set(cells)
 
 
@@ -123,12 +123,11 @@ def test_a_thin_beam_marks_the_cells_that_it_crosses() -> None:
 
 
 def test_a_deep_arc_does_not_depend_on_the_order() -> None:
-    parameters = Parameters.from_flat({'live_depth': 3.0})
     rng = np.random.default_rng(5)
     readings = random_readings(rng, AREA, 40)
     maps = []
     for order in (np.arange(40), np.arange(40)[::-1]):
-        live = LogOddsMap(parameters)
+        live = LogOddsMap(Parameters(), 3.0)
         for k in order:
             live.add(readings.select(np.array([k])))
         maps.append(live.log_odds())

@@ -10,6 +10,7 @@ import pytest
 
 import naive
 from conftest import plain_model, random_readings
+from forward_grid_mapper.core.common.constants import FREE_MARGIN, MOST_AGAINST_EXTENSION
 from forward_grid_mapper.core.common.grid import Grid
 from forward_grid_mapper.core.common.parameters import ModelParameters
 from forward_grid_mapper.core.common.readings import Readings
@@ -17,10 +18,11 @@ from forward_grid_mapper.core.evidence.evidence import Evidence
 from forward_grid_mapper.core.evidence.fixed_point import QUANTUM
 from forward_grid_mapper.core.maps.free_space import expected_passes
 from forward_grid_mapper.core.maps.post_processing import post_process
-from forward_grid_mapper.core.maps.wall_extension import MOST_AGAINST, extend
+from forward_grid_mapper.core.maps.wall_extension import extend
 from forward_grid_mapper.core.runtime import threads
 
 GRID = Grid(0.1, 0, 0, 14, 11)
+MOST_AGAINST = MOST_AGAINST_EXTENSION * GRID.resolution
 NOWHERE = np.zeros(GRID.shape, bool)
 
 
@@ -120,11 +122,11 @@ def seen_by_all(occupied: np.ndarray) -> Evidence:
 
 def test_finish_draws_walls_out_by_so_many_cells_and_no_farther_than_something_speaks_against_it() -> None:
     evidence = seen_by_all(wall_at(5, 4, 8))
-    assert np.array_equal(post_process(evidence, 0, 0.0, NOWHERE) == 1, wall_at(5, 4, 8) == 1)
-    assert np.array_equal(post_process(evidence, 2, 0.0, NOWHERE) == 1, wall_at(5, 2, 10) == 1)
+    assert np.array_equal(post_process(evidence, 0.0, 0.0, NOWHERE) == 1, wall_at(5, 4, 8) == 1)
+    assert np.array_equal(post_process(evidence, 0.2, 0.0, NOWHERE) == 1, wall_at(5, 2, 10) == 1)
     evidence.state.maps.evidence.reshape(GRID.shape)[5, 10] = round(-1.1 * MOST_AGAINST / QUANTUM)
     evidence.state.maps.evidence.reshape(GRID.shape)[5, 2] = round(-0.9 * MOST_AGAINST / QUANTUM)
-    assert np.array_equal(post_process(evidence, 3, 0.0, NOWHERE) == 1, wall_at(5, 1, 9) == 1)
+    assert np.array_equal(post_process(evidence, 0.3, 0.0, NOWHERE) == 1, wall_at(5, 1, 9) == 1)
     assert np.array_equal(evidence.observed() == 1, wall_at(5, 4, 8) == 1), 'the search goes on from its own map'
 
 
@@ -132,19 +134,19 @@ def test_no_wall_is_drawn_out_over_where_the_robot_was_or_readings_passed() -> N
     traversed = NOWHERE.copy()
     traversed[5, 10] = True
     evidence = seen_by_all(wall_at(5, 4, 8))
-    assert np.array_equal(post_process(evidence, 3, 0.0, traversed) == 1, wall_at(5, 1, 9) == 1)
+    assert np.array_equal(post_process(evidence, 0.3, 0.0, traversed) == 1, wall_at(5, 1, 9) == 1)
     # ten readings that went through a gap
     readings = Readings.from_columns(x=1.15, y=0.05, yaw=math.pi / 2, z=np.full(10, 1.0), z_max=1.3, half_angle=0.02)
     evidence = made(readings, plain_model(sigma=0.05), wall_at(5, 4, 8))
     evidence.state.maps.seen[:], evidence.state.maps.evidence[:] = 1, 1
-    assert np.array_equal(post_process(evidence, 6, 0.0, NOWHERE)[5] == 1, np.arange(14) <= 13)
-    told = post_process(evidence, 6, 1.0, NOWHERE)
+    assert np.array_equal(post_process(evidence, 0.6, 0.0, NOWHERE)[5] == 1, np.arange(14) <= 13)
+    told = post_process(evidence, 0.6, 1.0, NOWHERE)
     assert told[5, 11] == 0
     assert (told[5, 9:11] == 1).all(), 'up to what is known'
 
 
 def test_three_cells_are_no_straight_wall() -> None:
-    assert np.array_equal(post_process(seen_by_all(wall_at(5, 4, 6)), 3, 0.0, NOWHERE) == 1, wall_at(5, 4, 6) == 1)
+    assert np.array_equal(post_process(seen_by_all(wall_at(5, 4, 6)), 0.3, 0.0, NOWHERE) == 1, wall_at(5, 4, 6) == 1)
 
 
 @pytest.mark.parametrize('seed', range(6))
@@ -156,21 +158,40 @@ def test_cells_through_which_nobody_passed_are_unknown(seed: int) -> None:
     plain = evidence.observed()
     plain[traversed & (plain < 0)] = 0
     passed = expected_passes(evidence, occupied).reshape(GRID.shape)
-    assert np.array_equal(post_process(evidence, 0, 0.0, traversed), plain)
+    assert np.array_equal(post_process(evidence, 0.0, 0.0, traversed), plain)
     for least in (0.5, 1.5):
-        told = post_process(evidence, 0, least, traversed)
+        told = post_process(evidence, 0.0, least, traversed)
         known = ((passed >= least) | traversed) & (plain == 0)
         beside = naive.box_sum(known.astype(int)) > 0
         expected = np.where((plain == 0) & ~beside, -1, plain)
         assert np.array_equal(told, expected)
-    assert (post_process(evidence, 0, 100.0, NOWHERE) != 0).all()
+    assert (post_process(evidence, 0.0, 100.0, NOWHERE) != 0).all()
 
 
 def test_behind_a_wall_nothing_is_free() -> None:
     # fifty echoes of a wall 0.6 m ahead, and one that went through a gap
     readings = Readings.from_columns(x=0.05, y=0.55, yaw=0.0, z=np.full(50, 0.6), z_max=1.3, half_angle=0.02)
     evidence = made(readings, dataclasses.replace(plain_model(), sigma=0.05), wall_at(5, 6, 6))
-    told = post_process(evidence, 0, 0.9, NOWHERE)
+    told = post_process(evidence, 0.0, 0.9, NOWHERE)
     assert told[5, :7].tolist() == [0] * 6 + [1]
     assert (told[5, 9:] == -1).all()
     assert math.isfinite(evidence.log_likelihood)
+
+
+@pytest.mark.parametrize('parts', [1, 2, 4])
+def test_margins_and_extensions_are_lengths_in_metres(parts: int) -> None:
+    grid = Grid(0.1 / parts, 0, 0, 14 * parts, 11 * parts)
+    wall = np.zeros(grid.shape, np.uint8)
+    wall[5 * parts, 4 * parts : 9 * parts] = 1
+    evidence = Evidence(grid, plain_model(sigma=0.05), start=wall)
+    # a thin beam along the middle of a row, so often that it is known to be free
+    readings = Readings.from_columns(
+        x=0.01, y=0.75 + 0.05 / parts, yaw=0.0, z=np.full(20, 1.35), z_max=2.0, half_angle=0.002
+    )
+    evidence.extend(readings)
+    evidence.state.maps.seen[:], evidence.state.maps.evidence[:] = 1, 1
+    told = post_process(evidence, 0.3, 1.0, np.zeros(grid.shape, bool))
+    columns = np.flatnonzero(told[5 * parts] == 1)
+    assert (columns[0], columns[-1]) == (1 * parts, 12 * parts - 1)
+    free = np.flatnonzero(told[:, 7 * parts] == 0)
+    assert len(free) * grid.resolution == pytest.approx(2 * FREE_MARGIN + grid.resolution)

@@ -25,14 +25,14 @@ from forward_grid_mapper.core.evidence.neighbourhood import (
     patterns,
 )
 from forward_grid_mapper.core.search.prior import (
-    LEAST_COST,
     Prior,
-    local_prior,
+    independent_prior,
     log_prior,
     odds_given_neighbours,
     prior_gain,
     prior_gains,
     shapes,
+    wall_prior,
 )
 
 sides = st.tuples(st.integers(1, 5), st.integers(1, 5))
@@ -101,7 +101,7 @@ def test_the_log_prior_is_the_sum_over_occupied_cells_and_gains_are_its_differen
 PARAMETERS = [
     SearchParameters(),
     plain_search(prior=0.2),
-    SearchParameters(prior=0.1, line_bonus=1.5, end_cost=0.3, isolated_cost=4.0),
+    SearchParameters(wall_cost=3.0, end_cost=0.3),
     SearchParameters(prior=0.5),
 ]
 
@@ -110,7 +110,7 @@ PARAMETERS = [
 @given(maps, st.sampled_from(PARAMETERS))
 def test_a_map_turned_or_mirrored_is_as_likely(occupied: np.ndarray, parameters: SearchParameters) -> None:
     def told(cells: np.ndarray) -> float:
-        prior = Prior(local_prior(parameters, np.zeros(cells.size, bool)), shapes(parameters))
+        prior = wall_prior(parameters, np.zeros(cells.size, bool), 0.1)
         return log_prior(prior, np.ascontiguousarray(cells).ravel(), patterns(cells, cells.shape))
 
     for other in (occupied[::-1], occupied[:, ::-1], occupied.T, np.rot90(occupied)):
@@ -122,40 +122,44 @@ def bits(*directions: int) -> int:
 
 
 def test_shapes_tell_walls_from_ends_and_dots() -> None:
-    told = shapes(SearchParameters(prior=0.1, line_bonus=0.5, end_cost=1.5, isolated_cost=3.0))
+    told = shapes(1.5)
     assert told[0] == -3.0
     for wall in ((EAST, WEST), (NORTH_WEST, SOUTH_EAST), (EAST, SOUTH_WEST), (NORTH, SOUTH_EAST), range(8)):
-        assert told[bits(*wall)] == 0.5
+        assert told[bits(*wall)] == 0.0
     for end in ((EAST,), (NORTH_WEST,), (EAST, NORTH), (NORTH_WEST, SOUTH_WEST), (NORTH, NORTH_WEST, WEST)):
         assert told[bits(*end)] == -1.5
     for pattern in range(1, 256):
         angles = [k * math.pi / 4 for k in range(8) if pattern >> k & 1]
         # the bend of the straightest curve from one neighbour through the cell to another
         bend = min(abs(math.remainder(a - b - math.pi, 2 * math.pi)) for a in angles for b in angles)
-        assert told[pattern] == (0.5 if bend < math.pi / 4 + 1e-9 else -1.5)
+        assert told[pattern] == (0.0 if bend < math.pi / 4 + 1e-9 else -1.5)
 
 
-@pytest.mark.parametrize('prior', [1e-6, 0.1, 0.4, 0.42, 0.49, 0.5])
-@pytest.mark.parametrize('line_bonus', [0.0, 0.3, 10.0])
-def test_walls_are_never_likelier_than_none(prior: float, line_bonus: float) -> None:
-    parameters = SearchParameters(prior=prior, line_bonus=line_bonus)
-    cost = math.log((1 - prior) / prior)
-    line = shapes(parameters).max()
-    assert 0 <= line <= line_bonus
-    assert line == 0 or cost - line >= LEAST_COST - 1e-12
-    if line < line_bonus:
-        assert line == 0 or cost - line == pytest.approx(LEAST_COST)
+@pytest.mark.parametrize('resolution', [0.1, 0.05, 0.025])
+def test_a_wall_costs_its_length_and_two_ends_in_cells_of_any_size(resolution: float) -> None:
+    parameters = SearchParameters(wall_cost=0.8, end_cost=1.3)
+    for length in (2.0, 0.5, resolution):
+        occupied = np.zeros((3, 100), np.uint8)
+        occupied[1, 5 : 5 + round(length / resolution)] = 1
+        prior = wall_prior(parameters, np.zeros(occupied.size, bool), resolution)
+        told = log_prior(prior, occupied.ravel(), patterns(occupied, occupied.shape))
+        assert told == pytest.approx(-0.8 * length - 2 * 1.3)
 
 
-def test_plain_parameters_make_cells_independent() -> None:
-    assert not shapes(plain_search()).any()
+def test_without_a_cost_of_ends_cells_are_independent() -> None:
+    parameters, traversed = plain_search(prior=0.2, wall_cost=5.0), np.zeros(6, bool)
+    for prior in (wall_prior(parameters, traversed, 0.1), independent_prior(parameters, traversed)):
+        assert not prior.shape.any()
+        assert prior.local == pytest.approx(math.log(0.2 / 0.8))
 
 
-@pytest.mark.parametrize('cost', [0.0, 7.0])
-def test_cells_driven_over_cost_more(cost: float) -> None:
-    traversed = np.array([[True, False, False], [False, False, True]])
-    told = local_prior(SearchParameters(prior=0.3, driven_cost=cost), traversed)
-    odds = math.log(0.3 / 0.7)
-    assert told.shape == traversed.shape
-    assert told[~traversed] == pytest.approx(odds)
-    assert told[traversed] == pytest.approx(odds - cost)
+def test_a_traversed_cell_is_never_worth_occupying() -> None:
+    traversed = np.array([True, False, False, False, False, True])
+    parameters = SearchParameters(prior=0.3, wall_cost=1.0)
+    for prior, odds in (
+        (independent_prior(parameters, traversed), math.log(0.3 / 0.7)),
+        (wall_prior(parameters, traversed, 0.2), -0.2),
+    ):
+        assert prior.local[~traversed] == pytest.approx(odds)
+        assert (prior.local[traversed] < -1e5).all()
+        assert np.isfinite(0.0 * prior.local).all()

@@ -22,7 +22,7 @@ from forward_grid_mapper.core.evidence.updates import flip
 from forward_grid_mapper.core.maps.uncertainty import LEAST_EVIDENCE, marginals, uncertainty_map
 from forward_grid_mapper.core.search import search as search_module
 from forward_grid_mapper.core.search.flips import gain_of
-from forward_grid_mapper.core.search.prior import Prior, local_prior, odds_given_neighbours, shapes
+from forward_grid_mapper.core.search.prior import Prior, independent_prior, odds_given_neighbours, wall_prior
 from forward_grid_mapper.core.search.search import FEW, LEAST, Progress, Search
 from forward_grid_mapper.core.sensor.forward_model import log_likelihood
 
@@ -308,16 +308,16 @@ def test_max_sweeps_bounds_rounds_sweeps_and_shifts_together(most: int) -> None:
     assert not result.converged
 
 
-# With the prior of shapes, traversed cells and bridges
+# With the prior of walls, traversed cells, gaps and short walls
 
-SHAPED = SearchParameters(prior=0.4, driven_cost=3.0)
-ENDS = SearchParameters(prior=0.2, line_bonus=1.2, end_cost=2.5, isolated_cost=4.0, bridges=6)
+SHAPED = SearchParameters(prior=0.4, wall_cost=1.0, end_cost=1.2)
+ENDS = SearchParameters(prior=0.2, wall_cost=3.0, end_cost=2.5)
 
 
 def shaped(readings: Readings, grid: Grid, parameters: SearchParameters, traversed: np.ndarray) -> tuple[Search, Prior]:
     evidence = Evidence(grid, MODEL)
     evidence.extend(readings)
-    whole = Prior(local_prior(parameters, traversed).ravel(), shapes(parameters))
+    whole = wall_prior(parameters, traversed.ravel(), grid.resolution)
     return Search(evidence, parameters, traversed.ravel()), whole
 
 
@@ -330,7 +330,7 @@ def test_with_shapes_the_objective_of_either_stage_never_falls_and_ends_at_an_op
     readings = random_readings(rng, grid, int(rng.integers(1, 150)))
     traversed = rng.random(grid.shape) < 0.1
     search, whole = shaped(readings, grid, parameters, traversed)
-    plain = whole._replace(shape=np.zeros(256))
+    plain = independent_prior(parameters, traversed.ravel())
     maps = search.evidence.state.maps
     rounding = 3e-7 * len(readings)
     stage = plain
@@ -395,7 +395,7 @@ def test_cells_driven_over_stay_free() -> None:
     free = np.zeros(AREA.shape, bool)
     before = shaped(readings, AREA, SHAPED, free)[0].run().occupied
     traversed = before.reshape(AREA.shape) == 1
-    search, _ = shaped(readings, AREA, dataclasses.replace(SHAPED, driven_cost=1000.0), traversed)
+    search, _ = shaped(readings, AREA, SHAPED, traversed)
     after = search.run().occupied
     assert before.any()
     assert not (after[traversed.ravel()]).any()
@@ -411,7 +411,7 @@ def test_a_search_changes_nothing_outside_of_its_window() -> None:
     inside = np.zeros(AREA.shape, bool)
     inside[5:20, 8:30] = True
     assert occupied[inside].any()
-    # shifts and bridges may end a cell or a few beyond it
+    # shifts and gaps may end a cell or a few beyond it
     assert not occupied[naive.box_sum(inside.astype(int)) == 0].any()
 
 

@@ -10,10 +10,12 @@ import pytest
 
 import naive
 from conftest import random_readings
+from forward_grid_mapper.core.common.constants import MOST_HIT
 from forward_grid_mapper.core.common.grid import Grid
 from forward_grid_mapper.core.common.parameters import ModelParameters
+from forward_grid_mapper.core.common.readings import Readings
 from forward_grid_mapper.core.learning.model_update import learn
-from forward_grid_mapper.core.sensor.density import CUT
+from forward_grid_mapper.core.sensor.density import CUT, hit_parameter, hit_probability
 from forward_grid_mapper.core.sensor.forward_model import ForwardModel, expectations, log_likelihood
 from forward_grid_mapper.core.sensor.surface_normals import SurfaceNormals
 
@@ -196,3 +198,31 @@ def test_learning_never_lowers_the_likelihood() -> None:
         now = log_likelihood(readings, grid, occupied, model)
         assert now >= before - 1e-9
         before, model = now, learn(ForwardModel(readings, grid, model), occupied)
+
+
+@pytest.mark.parametrize('parts', [2, 4])
+def test_a_wall_is_heard_alike_in_cells_of_any_size(parts: int) -> None:
+    model = ModelParameters(p_hit=0.6, p_rand=0.1, p_lost=0.1, sigma=0.1, surface_offset=0.0)
+    told = []
+    for k in (1, parts):
+        grid = Grid(0.1 / k, 0, 0, 20 * k, 20 * k)
+        wall = np.zeros(grid.shape, np.uint8)
+        # a line about 1.05 m from the sensor
+        wall[10 * k + k // 2] = 1
+        readings = Readings.from_columns(
+            x=1.0, y=0.0, yaw=math.pi / 2, z=[1.05, 0.5, 2.0], z_max=2.0, half_angle=0.3, stamp=np.arange(3)
+        )
+        told.append(expectations(readings, grid, wall, model).log_likelihood)
+    assert told[1] == pytest.approx(told[0], abs=0.1)
+
+
+@pytest.mark.parametrize('resolution', [0.01, 0.1, 0.3])
+def test_p_hit_of_a_cell_and_back(resolution: float) -> None:
+    for p_hit in (0.01, 0.3, 0.7, 0.9):
+        model = ModelParameters(p_hit=p_hit)
+        of_cell = hit_probability(model, resolution)
+        assert 0 < of_cell <= MOST_HIT
+        assert (1 - of_cell) ** (0.1 / resolution) == pytest.approx(1 - p_hit) or of_cell == MOST_HIT
+        if of_cell < MOST_HIT:
+            assert hit_parameter(of_cell, resolution) == pytest.approx(p_hit)
+    assert hit_probability(ModelParameters(p_hit=0.7), 0.1) == pytest.approx(0.7)

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 import naive
 from conftest import plain_model, random_readings
+from forward_grid_mapper.core.common.constants import LEAST_AGREEMENT, LEAST_WEIGHT, WEIGHT_CELL
 from forward_grid_mapper.core.common.grid import Grid
 from forward_grid_mapper.core.common.parameters import ModelParameters
 from forward_grid_mapper.core.common.readings import Readings
@@ -19,9 +20,8 @@ from forward_grid_mapper.core.evidence.evidence import Evidence
 from forward_grid_mapper.core.evidence.updates import find_observing, flip
 from forward_grid_mapper.core.runtime import threads
 from forward_grid_mapper.core.sensor.surface_normals import (
-    LEAST_AGREEMENT,
-    LEAST_WEIGHT,
     QUANTUM,
+    _box,
     exceeds_incidence_angle,
     gather,
     no_normals,
@@ -93,6 +93,36 @@ def test_the_normal_of_a_wall_is_across_it() -> None:
     assert np.abs(normals.y.reshape(GRID.shape)[row, 5:20][wall == 1]).min() > 0.9
 
 
+@pytest.mark.parametrize(
+    ('resolution', 'within', 'part'), [(0.1, 1, 1.0), (0.05, 3, 0.5), (0.06, 2, 1.0), (0.4, 0, 1.0)]
+)
+def test_sums_are_over_a_square_in_metres_of_which_the_edge_may_be_parts_of_cells(
+    resolution: float, within: int, part: float
+) -> None:
+    rng = np.random.default_rng(0)
+    values = rng.integers(-1000, 1000, (9, 12))
+    weights = np.ones(2 * within + 1)
+    weights[[0, -1]] = part
+    expected = np.zeros(values.shape)
+    for row, column in np.ndindex(values.shape):
+        for i, j in np.ndindex(len(weights), len(weights)):
+            y, x = row + i - within, column + j - within
+            if 0 <= y < 9 and 0 <= x < 12:
+                expected[row, column] += weights[i] * weights[j] * values[y, x]
+    scale = QUANTUM * (resolution / WEIGHT_CELL) ** 2
+    assert _box(values, resolution) == pytest.approx(expected * scale, abs=1e-12)
+
+
+def test_the_same_wall_has_its_normals_in_cells_of_any_size() -> None:
+    readings, share = along_wall(400), []
+    for parts in (1, 2, 4):
+        grid = Grid(0.1 / parts, GRID.column * parts, GRID.row * parts, GRID.width * parts, GRID.height * parts)
+        evidence = Evidence(grid, MODEL)
+        evidence.extend(readings)
+        share.append(evidence.state.normals.known.mean())
+    assert share == pytest.approx([share[0]] * 3, rel=0.15)
+
+
 def test_readings_without_echo_tell_no_normal() -> None:
     readings = along_wall()
     readings.z[:] = readings.z_max
@@ -106,7 +136,7 @@ def test_a_straight_angle_leaves_out_nothing() -> None:
         assert evidence.state.normals.cos2_limit == no_normals().cos2_limit == 0.0
     # all surfaces graze nobody where the angle has hardly any cosine
     sums = sums_of(evidence, (0, len(readings)))
-    assert normals_of(sums, GRID.shape, math.pi / 2).cos2_limit < 1e-12
+    assert normals_of(sums, GRID, math.pi / 2).cos2_limit < 1e-12
 
 
 @pytest.mark.parametrize('readings', [along_wall(), random_readings(np.random.default_rng(2), GRID, 120)])

@@ -1,0 +1,93 @@
+"""The named constants of the model: what decides about the maps, besides the parameters, with units and reasons.
+
+Lengths are in metres and costs in nats a metre, so that the same drive gives the same map in cells of any size.
+"""
+
+from __future__ import annotations
+
+# The sensor model
+
+HIT_LENGTH = 0.1
+"""Metres of surface that `p_hit` is for: a cell of the default resolution, so that there it is the paper's p_hit."""
+
+MOST_HIT = 0.98
+"""Largest probability that a cell returns the echo; freeing a cell divides by the rest."""
+
+# Normals of surfaces
+
+NEIGHBOURHOOD = 0.3
+"""Edge in metres of the square whose echoes make the normal of the cell in its middle: three cells of 0.1 m. It holds
+what one wall returns, and hardly anything of the next one."""
+
+WEIGHT_CELL = 0.1
+"""Edge in metres of the cells in which `LEAST_WEIGHT` counts. Smaller cells share what one such cell receives."""
+
+LEAST_WEIGHT = 3.0
+"""Echoes, summed over the cells of `WEIGHT_CELL` in the square, that it takes to know a normal. One echo gives about
+one to each cell on its arc, so this is one echo at the least, and mostly several."""
+
+LEAST_AGREEMENT = 0.5
+"""Length of the mean of the doubled bearings that it takes to know a normal; 1 where all agree, 0 where none do."""
+
+THROUGH = 2.0
+"""σ beyond a cell at which a range lies for the reading to have gone through: nearer ranges may be of the cell."""
+
+# The prior of walls
+
+FORBIDDEN = 1e6
+"""Nats that an occupied cell costs where a sensor was moved: more than all readings of any drive can say for it, and
+still a finite number, so that its product with a weight of zero is zero."""
+
+# Gaps and short walls
+
+LONGEST_GAP = 1.0
+"""Metres. Gaps of chance between the echoes of a wall are shorter: with 0.6 m coverage is 0.01 less, with 1.5 m no
+figure is better by as much."""
+
+MOST_AGAINST_METRE = 10.0
+"""Nats that may speak against a metre of a gap; no cell may have more than its part of them."""
+
+MOST_AGAINST_GAP = 4.0
+"""Nats that may speak against all of a gap."""
+
+MOST_AGAINST_PASSAGE = 1.5
+"""Nats that may speak against all of a gap that is wide enough to drive through: a few readings that went through."""
+
+PASSAGE = 0.35
+"""Metres of a gap from where on a robot might drive through: a small one, with some room."""
+
+AWAY = -0.35
+"""Largest cosine between the direction of a gap and that of the neighbours that its end has: 110° or more, so that it
+may turn by the eighths of a turn that the lattice has, but not back along its wall."""
+
+SHORT_WALL = 0.5
+"""Metres of connected occupied cells, put end to end, that are removed at once: a few echoes that agree by chance make
+no more, and twice as much changes nothing."""
+
+# What is handed out
+
+EXTENSION = 0.4
+"""Metres by which a wall goes on at most. Between 0.3 and 1 m the maps hardly differ."""
+
+STRAIGHT_RUN = 0.4
+"""Metres of occupied cells in a row that make a straight wall; fewer are often in a row by chance."""
+
+MOST_AGAINST_EXTENSION = 0.5
+"""Nats that may speak against a metre by which a wall goes on: the tails of readings that end before it."""
+
+FREE_MARGIN = 0.1
+"""Metres around a cell known to be free within which others are free, if nothing occupies them. Without it a fringe of
+unknown cells stands before every wall."""
+
+LEAST_EVIDENCE = 0.1
+"""Nats, either way, from which on a cell counts as observed though the ML map does not know it."""
+
+# The standard map
+
+ARC_DEPTH = 0.05
+"""Metres before and behind its range that an echo marks as occupied: the σ of a usual sonar."""
+
+
+def arc_depth(resolution: float, least: float = ARC_DEPTH) -> float:
+    """Return half the depth of the arc that an echo marks, metres: no less than half a cell of edge `resolution`."""
+    return max(least, resolution / 2)

@@ -1,0 +1,64 @@
+"""What a single reading can say at most for or against an obstacle: bounds of its part of the objective.
+
+A reading multiplies the odds of an obstacle by [(c + T') / (c + T)]^γ, where c gathers the causes that no map changes,
+T and T' those that the map explains without and with the obstacle, and γ is the likelihood exponent. Since c is never
+zero, the ratio is bounded: the random measurement bounds what an echo says, the lost echo what a reading without echo
+says. So no wall stands or falls by one reading.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+from ..common.parameters import ModelParameters
+from .density import density, hit_probability
+
+
+class ReadingBounds(NamedTuple):
+    """Bounds in nats of the objective: positive for an obstacle, negative against it.
+
+    Attributes
+    ----------
+    echo_for : float
+        An echo for the cell at its range, where the map explains it by nothing else.
+    echo_against_cell, echo_against_wall : float
+        An echo from far beyond against one cell on its way, and against any number of cells.
+    silence_against_cell, silence_against_wall : float
+        A reading without echo, likewise. It speaks for no cell.
+    """
+
+    echo_for: float
+    echo_against_cell: float
+    echo_against_wall: float
+    silence_against_cell: float
+    silence_against_wall: float
+
+
+def reading_bounds(model: ModelParameters, resolution: float, z_max: float) -> ReadingBounds:
+    """Return what a reading can say at most.
+
+    Parameters
+    ----------
+    model : ModelParameters
+    resolution : float
+        Edge length of a cell, metres.
+    z_max : float
+        Largest range of the sensor, metres.
+    """
+    gamma, p_hit = model.likelihood_exponent, hit_probability(model, resolution)
+    peak = density(0.0, max(model.sigma, resolution / 2))
+    explained = (1.0 - model.p_rand - model.p_lost) * peak
+    random = model.p_rand / z_max
+    silent = random + model.p_lost * peak
+
+    def against(floor: float, left: float) -> float:
+        return gamma * math.log((floor + left * explained) / (floor + explained))
+
+    return ReadingBounds(
+        echo_for=gamma * math.log1p(p_hit * explained / random),
+        echo_against_cell=against(random, 1.0 - p_hit),
+        echo_against_wall=against(random, 0.0),
+        silence_against_cell=against(silent, 1.0 - p_hit),
+        silence_against_wall=against(silent, 0.0),
+    )
