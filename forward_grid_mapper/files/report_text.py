@@ -106,7 +106,9 @@ def _result(data: dict[str, Any]) -> Iterator[str]:
         mean = f' ({likelihood / readings:.3f} a reading)' if readings else ''
         yield from _line('Log-likelihood', f'{likelihood:,.1f} nats{mean}')
     if (objective := result.get('objective')) is not None:
-        yield from _line('Objective', f'{objective:,.1f} nats')
+        searched = statistics.get('searched_objective')
+        before = '' if searched is None else f'; {searched:,.1f} nats where the search ended, before post-processing'
+        yield from _line('Objective', f'{objective:,.1f} nats{before}')
     if (unexplained := result.get('unexplained')) is not None:
         share = _share(unexplained, readings)
         yield from _line('Unexplained', f'{unexplained:,} readings ({share}) are most likely random measurements')

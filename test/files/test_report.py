@@ -36,6 +36,8 @@ STATISTICS: dict[str, Any] = {
     'flips': 321,
     'shifts': 12,
     'sweeps': 5,
+    'searched_objective': -151.5,
+    'searched_log_likelihood': -125.0,
     'converged': np.bool_(False),
     'seconds': {'index': np.float64(0.25), 'search': 0.5},
 }
@@ -83,6 +85,7 @@ def test_text_tells_what_matters() -> None:
         '4.0 x 3.0 m: 40 x 30 cells of 0.1 m, corner (-2.00, -1.50)',
         '120 occupied, 816 free, 264 not observed',
         '-123.5 nats (-2.058 a reading)',
+        '-150.2 nats; -151.5 nats where the search ended, before post-processing\n',
         'NOT converged',
         'index 0.25, search 0.50; together 0.75',
         f'p_hit  0.3  (default {Parameters().model.p_hit})',
