@@ -94,11 +94,11 @@ def feed(online: OnlineMap, readings: Readings, size: int = SONARS) -> Times:
     return Times(1000 * np.array(taken), np.array(refined))
 
 
-def spread(milliseconds: NDArray[np.float64], shares: tuple[int, ...] = (50, 95, 99, 100)) -> str:
+def spread(milliseconds: NDArray[np.float64], percents: tuple[int, ...] = (50, 95, 99, 100)) -> str:
     """Return percentiles; 100 is the maximum."""
     if not len(milliseconds):
-        return f'{"-":>8s}' * len(shares)
-    return ''.join(f'{np.percentile(milliseconds, share):8.2f}' for share in shares)
+        return f'{"-":>8s}' * len(percents)
+    return ''.join(f'{np.percentile(milliseconds, percent):8.2f}' for percent in percents)
 
 
 def corridor(passes: int) -> Readings:

@@ -121,11 +121,11 @@ def test_renewed_on_a_grid_that_grew(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_words_out_of_use_are_packed_away(monkeypatch: pytest.MonkeyPatch) -> None:
-    readings = along_wall(300)
+    readings = along_wall(400)
     monkeypatch.setattr(module, 'MOST_UNUSED', 1.0)
-    loose = portions(readings, math.inf, 30)
+    loose = portions(readings, math.inf)
     assert loose._totals[UNUSED] > 0
     monkeypatch.setattr(module, 'MOST_UNUSED', 0.0)
-    packed = portions(readings, math.inf, 30)
+    packed = portions(readings, math.inf)
     assert packed._totals[UNUSED] == 0
     assert snapshot(loose) == snapshot(packed)
