@@ -22,8 +22,8 @@ OURS: tuple[tuple[Any, str], ...] = (
     *((evidence, name) for name in ('cone_table', 'reading_state_table', 'no_tiles', 'more_chunks', 'empty_pairs')),
     *((evidence, name) for name in ('workspace_for', 'normals_of', 'renewed', 'on_larger_grid', 'box_of', '_maps')),
     *((evidence.Evidence, name) for name in ('_reserve', '_make_room', '_insert', 'grow', 'extend', 'renew_normals')),
-    *((online_map, name) for name in ('map_grid', 'grid_of', 'local_prior', 'mark_traversed', 'Evidence', 'Search')),
-    *((search, name) for name in ('log_prior', 'best_shifts', 'local_prior')),
+    *((online_map, name) for name in ('map_grid', 'grid_of', 'wall_prior', 'mark_traversed', 'Evidence', 'Search')),
+    *((search, name) for name in ('log_prior', 'best_shifts', 'independent_prior', 'wall_prior')),
 )
 
 

@@ -111,7 +111,7 @@ def terms(readings: Readings, t: int, grid: Grid, occupied: np.ndarray, model: M
 
 
 def test_one_reading_gives_back_its_inverse_model_and_not_eq_4_as_printed() -> None:
-    values = {'resolution': 0.1, 'live_p_occupied': 0.8, 'live_p_free': 0.25, 'live_depth': 0.05}
+    values = {'resolution': 0.1, 'live_p_occupied': 0.8, 'live_p_free': 0.25}
     live = LogOddsMap(Parameters.from_flat({**values}))
     live.add(along(0.55))
     p, log_odds = live.probability(LINE)[0], live.log_odds(LINE)[0]

@@ -127,13 +127,13 @@ class Search:
         traversed = np.zeros(evidence.grid.size, np.bool_) if traversed is None else traversed
         self._prior = independent_prior(parameters, traversed)
         self._of_walls = wall_prior(parameters, traversed, evidence.grid.resolution)
+        self._settled = np.zeros(evidence.grid.size, np.uint8)
+        self._tried_at = -1
+        self.progress = Progress(0, 0, 0, 0.0)
         occupied = evidence.state.maps.occupied
         if occupied[traversed].any():
             occupied[traversed] = 0
             evidence.rebuild()
-        self._settled = np.zeros(evidence.grid.size, np.uint8)
-        self._tried_at = -1
-        self.progress = Progress(0, 0, 0, 0.0)
 
     def _advance(self, flips: int, shifts: int, gain: float, watch: Watch) -> None:
         check(self.evidence.state.stop)

@@ -249,7 +249,7 @@ def test_short_walls_are_removed_where_the_twin_has_it(seed: int, longest: int) 
         gain = maps.evidence[cells].sum() * QUANTUM + (
             naive.log_prior(prior, without, GRID.shape) - naive.log_prior(prior, expected, GRID.shape)
         )
-        if 1 < len(cells) <= longest and gain > 1e-2:
+        if 1 < len(cells) <= longest and gain > 10.0 * LEAST[0]:
             expected, total = without, total + gain
     flips, gain = removed(evidence, prior, longest)
     assert np.array_equal(maps.occupied, expected)
