@@ -30,7 +30,8 @@ from rclpy.qos import QoSProfile
 from sensor_msgs.msg import Range
 
 from forward_grid_mapper.files.journal import drive_file
-from forward_grid_mapper.files.journal_format import Contents, read
+from forward_grid_mapper.files.journal_format import Contents
+from forward_grid_mapper.files.journal_reader import read
 
 SECOND = 1_000_000_000
 

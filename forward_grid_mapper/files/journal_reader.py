@@ -267,7 +267,7 @@ def _for_reading(path: Path) -> Iterator[tuple[sqlite3.Connection, int]]:
             head = _log_head(log)
             if not head:
                 before, size = path.stat(), extent(path)
-                with closing(connect(path, 'mode=ro&immutable=1', size)) as database:
+                with closing(_salvaging(path, 'mode=ro&immutable=1', size)) as database:
                     yield database, size
                 after = path.stat()
                 if (before.st_size, before.st_mtime_ns) != (after.st_size, after.st_mtime_ns):
@@ -278,10 +278,21 @@ def _for_reading(path: Path) -> Iterator[tuple[sqlite3.Connection, int]]:
             # What SQLite moved from the log into the file meanwhile is in the copy of the log as well, unless the log
             # began anew.
             if head == _log_head(log) == _log_head(log_of(copy)):
-                with closing(connect(copy, 'mode=rw', size)) as database:
+                with closing(_salvaging(copy, 'mode=rw', size)) as database:
                     yield database, size
                 return
     raise BagError(f'{path} changes too fast to be read; stop the node that writes it')
+
+
+def _salvaging(path: Path, options: str, size: int) -> sqlite3.Connection:
+    database = connect(path, options, size)
+    try:
+        # without this, SQLite refuses a file that is shorter than its header says
+        database.execute('PRAGMA writable_schema=ON')
+    except BaseException:
+        database.close()
+        raise
+    return database
 
 
 @contextmanager

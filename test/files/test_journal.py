@@ -276,9 +276,8 @@ def test_without_a_free_descriptor_nothing_is_written_twice(tmp_path: Path, monk
         until(lambda: not journal.unwritten)
         journal.begin_drive()
         journal.put(made(500, 10), FRAMES)
-        # and one to begin a file
-        until(lambda: journal.trouble)
-        assert journal.unwritten == 10
+        # nor to begin a file more than the last one had
+        until(lambda: not journal.unwritten)
     finally:
         for file in taken:
             os.close(file)
@@ -389,10 +388,10 @@ def test_a_file_that_was_left_half_made_is_made_anew(tmp_path: Path) -> None:
 @pytest.mark.parametrize('content', ['bytes', 'directory', 'nan', 'cut', 'newer', 'rollback', 'empty'])
 def test_a_damaged_file_is_left_as_it_is_and_its_readings_carried_over(tmp_path: Path, content: str) -> None:
     path, expected = tmp_path / 'drive_0007.journal', list(range(1000))
-    forged = database(path, [rows(made(100 * k, 100)).tobytes() for k in range(10)], ())
+    forged = database(path, [rows(made(10 * k, 10)).tobytes() for k in range(100)], ())
     forged.executemany('INSERT INTO sensors VALUES (?, ?)', [(0, b'left'), (1, b'right')])
     if content == 'nan':
-        bad = rows(made(0, 100))
+        bad = rows(made(0, 10))
         bad['yaw'][7] = np.nan
         forged.execute('UPDATE readings SET rows = ? WHERE number = 0', (bad.tobytes(),))
         del expected[7]
