@@ -43,6 +43,9 @@ from .journal_format import (
 APPLICATION_AT = 68
 """Offset of the application id in the header of an SQLite database."""
 
+PAGES_AT = 28
+"""Offset of the count of pages in that header."""
+
 LOG_HEAD = 32
 """Bytes of the header of the log. They change each time the log begins anew."""
 
@@ -265,34 +268,37 @@ def _for_reading(path: Path) -> Iterator[tuple[sqlite3.Connection, int]]:
     with tempfile.TemporaryDirectory(prefix='journal_') as folder:
         for _ in range(TRIES):
             head = _log_head(log)
-            if not head:
+            cut = _pages_cut_off(path)
+            if not head and not cut:
                 before, size = path.stat(), extent(path)
-                with closing(_salvaging(path, 'mode=ro&immutable=1', size)) as database:
+                with closing(connect(path, 'mode=ro&immutable=1', size)) as database:
                     yield database, size
                 after = path.stat()
                 if (before.st_size, before.st_mtime_ns) != (after.st_size, after.st_mtime_ns):
                     raise BagError(f'{path} was written while it was read; read it again')
                 return
             copy = Path(folder) / 'copy'
-            size = _copy(path, copy) + _copy(log, log_of(copy))
+            size = _copy(path, copy) + (_copy(log, log_of(copy)) if head else 0)
+            if cut:
+                with copy.open('r+b') as file:
+                    # without a count, SQLite counts by itself
+                    file.seek(PAGES_AT)
+                    file.write(bytes(4))
             # What SQLite moved from the log into the file meanwhile is in the copy of the log as well, unless the log
             # began anew.
             if head == _log_head(log) == _log_head(log_of(copy)):
-                with closing(_salvaging(copy, 'mode=rw', size)) as database:
+                with closing(connect(copy, 'mode=rw', size)) as database:
                     yield database, size
                 return
     raise BagError(f'{path} changes too fast to be read; stop the node that writes it')
 
 
-def _salvaging(path: Path, options: str, size: int) -> sqlite3.Connection:
-    database = connect(path, options, size)
-    try:
-        # without this, SQLite refuses a file that is shorter than its header says
-        database.execute('PRAGMA writable_schema=ON')
-    except BaseException:
-        database.close()
-        raise
-    return database
+def _pages_cut_off(path: Path) -> bool:
+    """Return whether a database is shorter than its header says, which SQLite refuses to read."""
+    head = _head(path, PAGES_AT + 4).ljust(PAGES_AT + 4, b'\0')
+    size, pages = int.from_bytes(head[16:18], 'big'), int.from_bytes(head[PAGES_AT:], 'big')
+    # 1 stands for what 16 bits cannot hold
+    return path.stat().st_size < pages * (size if size > 1 else 1 << 16)
 
 
 @contextmanager

@@ -470,7 +470,12 @@ def killed_again_and_again(folder: Path, times: int, seed: int) -> float:
         process = subprocess.Popen(
             [sys.executable, str(program), str(folder)], stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
         )
-        time.sleep(rng.uniform(0.5, 3.0))
+        log = Path(f'{folder}.accepted')
+        size = log.stat().st_size if log.exists() else 0
+        # once it writes, or while it starts
+        if rng.random() < 0.8:
+            until(lambda: log.exists() and log.stat().st_size > size, 60.0)
+        time.sleep(rng.uniform(0.0, 2.0))
         died = time.time_ns()
         process.send_signal(signal.SIGKILL)
         _, said = process.communicate()
@@ -488,7 +493,6 @@ def killed_again_and_again(folder: Path, times: int, seed: int) -> float:
             names = np.array(readings.sensor_names)[readings.sensor]
             expected = np.array(('front', 'hinten links', '超音波'))[readings.x.astype(int) % 3]
             assert (names == expected).all()
-        log = Path(f'{folder}.accepted')
         counts, moments = np.fromfile(log, '<i8').reshape(-1, 2).T if log.exists() else np.zeros((2, 0), np.int64)
         # of this run, since what a run loses the next one accepts anew
         lost = moments[(counts > len(x)) & (moments > began)]

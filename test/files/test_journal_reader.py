@@ -259,10 +259,10 @@ def test_a_schema_without_end(path: Path) -> None:
     forged.close()
     content = path.read_bytes()
     first = len(content) // PAGE + 1
+    begins = struct.unpack_from(f'>{struct.unpack_from(">H", content, 103)[0]}H', content, 108)
     kept, repeated = [], []
-    for k in range(struct.unpack_from('>H', content, 103)[0]):
-        begin = struct.unpack_from('>H', content, 108 + 2 * k)[0]
-        end = PAGE if k == 0 else struct.unpack_from('>H', content, 108 + 2 * (k - 1))[0]
+    for begin in begins:
+        end = min((other for other in begins if other > begin), default=PAGE)
         (repeated if b'sqlite_autoindex' in content[begin:end] else kept).append(content[begin:end])
     assert len(repeated) == 1
     storeys = {first + k: branch([first + k + 1] * 400) for k in range(15)}
@@ -276,7 +276,7 @@ def test_a_schema_without_end(path: Path) -> None:
         },
     )
     result = examined(path)
-    assert 'it takes more steps than it has bytes' in result['error'].replace('to read it', 'it') or result['error']
+    assert 'to read it takes more steps than it has bytes' in result['error']
     assert result['count'] == 0
 
 
@@ -314,8 +314,9 @@ def test_a_file_cut_off_anywhere_gives_what_is_left(path: Path, tmp_path: Path) 
             assert str(path) in str(error)
             assert length < 8 * PAGE
             continue
-        assert found == list(range(len(found)))
-        assert len(found) > 600 * length / len(whole) - 150
+        # what was cut off of a page counts as zeros, which are no readings
+        assert found == sorted(set(found) & set(range(600)))
+        assert len(found) > 600 * length / len(whole) - 200
         # the end of the last page may hold nothing
         assert contents.harm or len(found) == 600
 

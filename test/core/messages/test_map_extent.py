@@ -47,9 +47,9 @@ def test_a_cone_of_millions_of_cells_is_refused() -> None:
 
 def test_restored_readings_count() -> None:
     extent = MapExtent()
-    readings = Readings.from_columns(x=[0.0, 36.0], y=0.0, yaw=0.0, z=[1.0, 1.0], z_max=4.0, half_angle=0.15)
+    readings = Readings.from_columns(x=[0.0, 25.0], y=0.0, yaw=0.0, z=[1.0, 1.0], z_max=4.0, half_angle=0.15)
     assert not any(mask.any() for mask in extent.restore(readings, PARAMETERS).values())
-    assert extent.admit(Pose2(55, 0, 0), measured(), Parameters.from_flat({'max_jump': 20.0})) == ''
+    assert extent.admit(Pose2(40, 0, 0), measured(), Parameters.from_flat({'max_jump': 20.0})) == ''
     assert extent.admit(Pose2(90, 0, 0), measured(), PARAMETERS) == 'far_from_map'
 
 
