@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import functools
 import os
 import random
 import resource
@@ -460,21 +461,24 @@ def test_a_journal_of_the_previous_format_goes_on_in_a_new_file(tmp_path: Path) 
 # kills
 
 
+def written_since(path: Path, moment: int) -> bool:
+    return path.exists() and path.stat().st_mtime_ns > moment
+
+
 def killed_again_and_again(folder: Path, times: int, seed: int) -> float:
     """Kill the writer of a journal at random moments; return the most seconds that were ever lost."""
     rng = random.Random(seed)
     program = Path(__file__).parent / 'journal_writer.py'
     worst = 0.0
+    log = Path(f'{folder}.accepted')
     for _ in range(times):
         began = time.time_ns()
         process = subprocess.Popen(
             [sys.executable, str(program), str(folder)], stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
         )
-        log = Path(f'{folder}.accepted')
-        size = log.stat().st_size if log.exists() else 0
         # once it writes, or while it starts
         if rng.random() < 0.8:
-            until(lambda: log.exists() and log.stat().st_size > size, 60.0)
+            until(functools.partial(written_since, log, began), 60.0)
         time.sleep(rng.uniform(0.0, 2.0))
         died = time.time_ns()
         process.send_signal(signal.SIGKILL)
