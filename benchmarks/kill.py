@@ -53,8 +53,8 @@ from forward_grid_mapper.files.journal_format import APPLICATION, ROW, TABLES, V
 from forward_grid_mapper.files.journal_reader import log_of, read
 
 SECOND = 1_000_000_000
-START = 120
-"""Seconds that a node may take to its first reading."""
+START = 600
+"""Seconds that a node may take to its first reading; the first start compiles kernels."""
 
 KINDS = ('nothing', 'reset', 'deleted', 'moved', 'cut', 'full', 'descriptors', 'hostile', 'starting')
 
