@@ -1,34 +1,49 @@
 """A journal: a folder that holds every accepted reading on disk, so that a node that dies loses at most a second.
 
 The folder holds `drive_0001.journal`, `drive_0002.journal` and so on, a new one after every reset, and `lock`, by which
-one node at a time writes. Nothing is ever deleted. A thread writes at once what it is given, which no kill of the
-process undoes; another asks the disk once a second to keep it (fdatasync), so that a power cut loses little more.
+one node at a time writes. While a node writes, SQLite's log (`drive_0001.journal-wal`) lies beside its file. Nothing is
+ever deleted.
+
+A thread commits at once what it is given, which no kill of the process undoes: `synchronous=NORMAL` waits for the disk
+only when SQLite moves its log into the file, once in 4 MB. A second thread asks the disk once a second to keep the log,
+so that a power cut takes little more than a second. The node's own thread never waits for the disk.
 """
 
 from __future__ import annotations
 
-import fcntl
-import os
-import re
+import itertools
+import json
+import sqlite3
 import threading
+import time
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from ..core.common.errors import BagError, OutputError
 from ..core.common.readings import Readings
-from .journal_format import MAGIC, Contents, frames_block, name_block, path_block, read, readings_block
+from .journal_database import DRIVE, FULL, Drive, DriveWriter, FolderLock, GoneError, Insert, following, number_of
+from .journal_format import BLOCK, Contents, encoded, points_of, rows_of
+from .journal_reader import is_journal, one_line, read
 from .output_folder import output_errors
 from .syncing import Syncer
-
-_DRIVE = re.compile(r'drive_(\d{4,9})\.journal')
 
 MOST_PENDING = 32 << 20
 """Bytes that wait for a disk that is full or slow; half a million readings. What comes then is not in the journal."""
 
+BATCH = 4 << 20
+"""Bytes that are committed at once, so that what fits is written when a disk is nearly full."""
+
 RETRY = 1.0
 """Seconds after which a write that failed is tried again."""
+
+PATIENCE = 10.0
+"""Seconds that the start waits for a slow disk at the most, at each step."""
+
+LOOK = 1.0
+"""Seconds between two looks whether the file is still there, where nothing is written meanwhile."""
 
 
 def drives(folder: Path) -> list[Path]:
@@ -39,8 +54,8 @@ def drives(folder: Path) -> list[Path]:
     OSError
         If the folder cannot be searched.
     """
-    found = [path for path in folder.iterdir() if _DRIVE.fullmatch(path.name)] if folder.is_dir() else []
-    return sorted(found, key=_number)
+    found = [path for path in folder.iterdir() if DRIVE.fullmatch(path.name)] if folder.is_dir() else []
+    return sorted(found, key=number_of)
 
 
 def drive_file(path: Path) -> Path | None:
@@ -48,18 +63,37 @@ def drive_file(path: Path) -> Path | None:
     try:
         if path.is_dir():
             return next(reversed(drives(path)), None)
-        with path.open('rb') as file:
-            return path if file.read(len(MAGIC)) == MAGIC else None
+        return path if is_journal(path) else None
     except OSError:
         return None
 
 
 class _Item(NamedTuple):
-    """What the writer is to do: append `data`, which holds `readings`, or go on in the file `begin`."""
+    """Rows to be written into the file of a drive.
 
-    data: bytes
+    `readings` and `size` are the readings and bytes that they hold, `following` the number of the reading after them.
+    """
+
+    drive: Drive
+    rows: Iterable[Insert]
     readings: int
-    begin: Path | None = None
+    size: int
+    following: int
+
+
+@dataclass(frozen=True)
+class _Everything:
+    """The rows of a whole drive. They are made when they are written: it may be long work, and the node cannot wait."""
+
+    head: list[Insert]
+    readings: Readings
+    numbers: Mapping[str, int]
+    path: list[tuple[float, float]]
+
+    def __iter__(self) -> Iterator[Insert]:
+        yield from self.head
+        yield from _path_rows(self.path, 0)
+        yield from _reading_rows(self.readings, self.numbers, 0)
 
 
 class Journal:
@@ -67,31 +101,35 @@ class Journal:
 
     Attributes
     ----------
-    path : Path
-        The file of the drive that goes on.
     contents : Contents
-        What it held when it was opened, once `restore` was exhausted.
+        What the file held when it was opened, once `restore` was exhausted.
     trouble : str
         Why nothing can be written at the moment; empty if all is well.
+    notice : str
+        What was found wrong with a file last, and was dealt with; empty if nothing was.
+    noticed : float
+        When, by `time.monotonic`.
     lost : int
         Readings that will never be in the journal.
+    parameters : dict
+        Parameters of the node that the file is to name, those that are not the defaults.
     """
 
     def __init__(self, folder: Path | str, warn: Callable[[str], object]) -> None:
-        """Open the newest drive of a journal, or begin one; call `restore` before anything else.
+        """Take the folder of a journal; call `restore` before anything else.
 
         Raises
         ------
         OutputError
-            If another process has it open, or the folder cannot be made or written.
+            If another process has it, or the folder cannot be made or written.
         """
         self.folder = Path(folder).expanduser().absolute()
         self._warn = warn
-        self.trouble = ''
+        self.trouble = self.notice = ''
+        self.noticed = 0.0
         self.lost = 0
         self.contents = Contents()
-        self._numbers: dict[str, int] = {}
-        self._frames = ('', '')
+        self.parameters: dict[str, Any] = {}
         self._pending: deque[_Item] = deque()
         self._bytes = self._unwritten = 0
         self._wake = threading.Condition()
@@ -100,163 +138,257 @@ class Journal:
         self._thread: threading.Thread | None = None
         with output_errors(self.folder):
             self.folder.mkdir(parents=True, exist_ok=True)
-            self._lock = os.open(self.folder / 'lock', os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+            self._lock = FolderLock(self.folder)
             try:
-                self._take_lock()
                 found = drives(self.folder)
-                self.path = found[-1] if found else self.folder / 'drive_0001.journal'
-                self._file = _open(self.path)
             except BaseException:
-                os.close(self._lock)
+                self._lock.release()
                 raise
-        self._end = 0
+        self._writer = DriveWriter(self._lock)
+        self._source = found[-1] if found else None
+        self._drive = Drive(self._source or self.folder / 'drive_0001.journal', made=bool(found))
+        self._numbers: dict[str, int] = {}
+        self._told: tuple[Any, ...] = ()
+        self._next = self._next_points = 0
 
-    def _take_lock(self) -> None:
-        try:
-            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise OutputError(f'{self.folder} is the journal of another node that runs; give each its own') from None
+    @property
+    def path(self) -> Path:
+        """The file of the drive that goes on."""
+        return self._drive.path
 
-    def restore(self) -> Iterator[Readings]:
-        """Yield the readings of the drive that goes on, cut off a torn end, and begin to take more.
-
-        Raises
-        ------
-        OutputError
-            If the file is none of a journal, or cannot be read.
-        """
-        try:
-            yield from read(self.path, self.contents)
-        except BagError as error:
-            raise OutputError(f'{error}; move it away, or give another journal') from error
-        if self.contents.harm:
-            self._warn(f'journal {self.path}: {self.contents.harm}')
-        self._end = self.contents.end
-        self._numbers = {name: number for number, name in self.contents.names.items()}
-        self._frames = (self.contents.map_frame, self.contents.base_frame)
-        with output_errors(self.path):
-            os.ftruncate(self._file, self._end)
-        self._syncer = Syncer(self._warn)
-        self._thread = threading.Thread(target=self._work, name='journal', daemon=True)
-        self._thread.start()
+    @property
+    def gone(self) -> bool:
+        """Whether the file vanished or was damaged, so that `renew` has to write what is in memory to a new one."""
+        return self._drive.gone
 
     @property
     def unwritten(self) -> int:
         """Readings that wait to be written."""
         return self._unwritten
 
-    def put(self, readings: Readings, frames: tuple[str, str], path: Iterable[tuple[float, float]] = ()) -> None:
+    def restore(self) -> Iterator[Readings]:
+        """Yield the readings of the drive that goes on, and begin to take more.
+
+        A file that is damaged, or of the previous format, is left as it is: its readings are written to a new one.
+
+        Raises
+        ------
+        OutputError
+            If another program has the file open.
+        """
+        source, contents = self._source, self.contents
+        if source is not None and self._writer.resume(self._drive):
+            yield from self._writer.readings(contents)
+            # it was sound a moment ago
+            self._drive.gone = bool(contents.harm)
+            self._numbers = {name: number for number, name in contents.sensors.items()}
+            self._told = (contents.map_frame, contents.base_frame, contents.parameters)
+            self._next, self._next_points = contents.next, contents.next_points
+            self._work_in_background()
+            return
+        if source is not None:
+            self._drive = Drive(following(source))
+        self._work_in_background()
+        # the file is to be there before the first reading is
+        self._queue((), 0, 0)
+        with self._wake:
+            self._wake.wait_for(lambda: self._drive.made or self.trouble, PATIENCE)
+        if source is not None:
+            yield from self._carry_over(source)
+
+    def _carry_over(self, source: Path) -> Iterator[Readings]:
+        """Yield the readings of a file that the journal cannot go on in, and write them to the one that it can."""
+        contents = self.contents
+        try:
+            for found in read(source, contents):
+                yield found
+                self.put(found, (contents.map_frame, contents.base_frame))
+                with self._wake:
+                    self._wake.wait_for(lambda: self._bytes <= MOST_PENDING // 2 or self.trouble, PATIENCE)
+        except BagError as error:
+            self._notice(f'{error}; the journal goes on in {self.path.name}')
+        self.put(None, (contents.map_frame, contents.base_frame), contents.path)
+        for text in filter(None, (contents.note, contents.harm)):
+            self._notice(f'{source}: {text}; the journal goes on in {self.path.name}')
+
+    def put(self, readings: Readings | None, frames: tuple[str, str], path: Iterable[tuple[float, float]] = ()) -> None:
         """Append readings, new points of the robot's path, and the map and base frame if they are new."""
+        count = 0 if readings is None else len(readings)
         if self._bytes > MOST_PENDING:
             if not self.lost:
                 self._warn(f'journal {self.path}: too much waits to be written; readings are lost from here on')
-            self.lost += len(readings)
+            self.lost += count
             return
-        data = []
-        if frames != self._frames:
-            self._frames = frames
-            data.append(frames_block(*frames))
-        for name in readings.sensor_names:
-            if name not in self._numbers:
-                self._numbers[name] = max(self._numbers.values(), default=-1) + 1
-                data.append(name_block(self._numbers[name], name))
-        points = list(path)
-        if points:
-            data.append(path_block(points))
-        if len(readings):
-            data.append(readings_block(readings, self._numbers))
-        if data:
-            self._queue(_Item(b''.join(data), len(readings)))
+        rows = self._head(readings, frames)
+        points = list(_path_rows(list(path), self._next_points))
+        self._next_points += len(points)
+        rows += points
+        if readings is not None:
+            rows += _reading_rows(readings, self._numbers, self._next)
+        self._next += count
+        if rows:
+            self._queue(rows, count, sum(len(values[-1]) for _, values in rows))
 
     def begin_drive(self) -> None:
         """Go on in a new file; the old one is kept. Nothing happens if nothing was written yet."""
-        if not self._end and not self._pending:
-            return
-        self.path = self.folder / f'drive_{_number(self.path) + 1:04d}.journal'
-        self._numbers, self._frames = {}, ('', '')
-        self._queue(_Item(b'', 0, self.path))
+        if any(self._told) or self._next:
+            self._begin()
+
+    def renew(self, readings: Readings, frames: tuple[str, str], path: Iterable[tuple[float, float]]) -> None:
+        """Go on in a new file that begins with all that is in memory, since the present one is `gone`."""
+        self._begin()
+        head = self._head(readings, frames)
+        points = list(path)
+        self._next, self._next_points = len(readings), len(points)
+        self._queue(_Everything(head, readings, dict(self._numbers), points), len(readings), 0)
 
     def close(self, seconds: float = 2.0) -> None:
         """Write what is left, as far as that goes in so many seconds, and let go of the folder."""
         with self._wake:
             self._closing = True
-            self._wake.notify()
-        if self._thread is not None:
+            self._wake.notify_all()
+        if self._thread is None:
+            self._writer.close()
+        else:
             self._thread.join(seconds)
             if self._thread.is_alive():
                 # the lock goes with the process
                 return
         if self._syncer is not None:
             self._syncer.close(seconds)
-        os.close(self._file)
-        os.close(self._lock)
+        self._lock.release()
 
-    def _queue(self, item: _Item) -> None:
+    def _begin(self) -> None:
+        """Begin a new drive, and its file."""
         with self._wake:
-            self._pending.append(item)
-            self._bytes += len(item.data)
-            self._unwritten += item.readings
-            self._wake.notify()
+            if self._drive.gone:
+                # for a file that will not come back
+                self._pending = deque(item for item in self._pending if item.drive is not self._drive)
+                self._bytes = sum(item.size for item in self._pending)
+                self._unwritten = sum(item.readings for item in self._pending)
+            self._drive = Drive(following(self._drive.path))
+        self._numbers, self._told = {}, ()
+        self._next = self._next_points = 0
+        self._queue((), 0, 0)
+
+    def _head(self, readings: Readings | None, frames: tuple[str, str]) -> list[Insert]:
+        """Return the rows that have to be there before those of the readings."""
+        rows: list[Insert] = []
+        told = (*frames, self.parameters)
+        if told != self._told:
+            self._told = (*frames, dict(self.parameters))
+            rows.append(('drive', (0, *map(encoded, frames), json.dumps(self.parameters).encode())))
+        for name in readings.sensor_names if readings is not None else ():
+            if name not in self._numbers:
+                self._numbers[name] = max(self._numbers.values(), default=-1) + 1
+                rows.append(('sensors', (self._numbers[name], encoded(name))))
+        return rows
+
+    def _queue(self, rows: Iterable[Insert], readings: int, size: int) -> None:
+        with self._wake:
+            self._pending.append(_Item(self._drive, rows, readings, size, self._next))
+            self._bytes += size
+            self._unwritten += readings
+            self._wake.notify_all()
+
+    # in the background
+
+    def _work_in_background(self) -> None:
+        self._syncer = Syncer(self._warn)
+        self._thread = threading.Thread(target=self._work, name='journal', daemon=True)
+        self._thread.start()
 
     def _work(self) -> None:
         while True:
             with self._wake:
-                self._wake.wait_for(lambda: self._pending or self._closing)
-                if not self._pending:
-                    return
-                item = self._pending[0]
+                self._wake.wait_for(lambda: self._closing or self._due(), LOOK)
+                items = self._batch()
+                if not items and self._closing:
+                    break
             try:
-                self._do(item)
-                self._done(item)
-            except OSError as error:
+                if items:
+                    self._write(items)
+                else:
+                    self._writer.look()
+            except GoneError as error:
+                self._lose(error.drive, str(error))
+            except Exception as error:
+                # of whatever kind: the thread must not end silently
                 if self._failed(error):
-                    return
+                    break
+        self._writer.close()
 
-    def _done(self, item: _Item) -> None:
+    def _due(self) -> bool:
+        return bool(self._pending) and not self._pending[0].drive.gone
+
+    def _batch(self) -> list[_Item]:
+        """Return what is to be committed next: items of one drive, up to `BATCH` bytes or else one."""
+        items: list[_Item] = []
+        size = 0
+        for item in self._pending if self._due() else ():
+            size += item.size
+            if items and (item.drive is not items[0].drive or size > BATCH):
+                break
+            items.append(item)
+        return items
+
+    def _write(self, items: list[_Item]) -> None:
+        rows = itertools.chain.from_iterable(item.rows for item in items)
+        log = self._writer.write(items[0].drive, rows, items[-1].following)
+        assert self._syncer is not None
+        self._syncer.changed(log)
         with self._wake:
-            self._pending.popleft()
-            self._bytes -= len(item.data)
-            self._unwritten -= item.readings
-        if self.trouble:
-            self._warn(f'journal {self.path}: writing works again')
-            self.trouble = ''
+            for item in items:
+                self._pending.popleft()
+                self._bytes -= item.size
+                self._unwritten -= item.readings
+            if self.trouble:
+                self._warn(f'journal {self.path}: writing works again')
+                self.trouble = ''
+            self._wake.notify_all()
 
-    def _failed(self, error: OSError) -> bool:
-        """Report a write that failed, and wait before the next try; return whether to give up."""
-        trouble = error.strerror or str(error)
+    def _lose(self, drive: Drive, why: str) -> None:
+        """Take note that the file of a drive is not what it was."""
+        self._notice(f'journal {drive.path}: {why}; a new file begins with what is in memory')
+        with self._wake:
+            if drive is self._drive:
+                drive.gone = True
+            else:
+                # a drive that is over: what still waits for it is all there is
+                drive.path, drive.made, drive.next = following(drive.path), False, 0
+
+    def _failed(self, error: Exception) -> bool:
+        """Tell of a write that failed, and wait before the next try; return whether to give up."""
+        trouble = _words(error)
         if trouble != self.trouble:
             self._warn(f'journal {self.path} cannot be written: {trouble}; mapping goes on without it')
-        self.trouble = trouble
         with self._wake:
+            self.trouble = trouble
+            self._wake.notify_all()
             self._wake.wait_for(lambda: self._closing, RETRY)
             return self._closing
 
-    def _do(self, item: _Item) -> None:
-        if item.begin is not None:
-            opened = _open(item.begin)
-            if self._syncer is not None:
-                self._syncer.closed(self._file)
-            os.close(self._file)
-            self._file, self._end = opened, 0
-            return
-        data = item.data if self._end else MAGIC + item.data
-        done = 0
-        try:
-            while done < len(data):
-                done += os.pwrite(self._file, data[done:], self._end + done)
-        except OSError:
-            # half a block would hide what comes after it
-            os.ftruncate(self._file, self._end)
-            raise
-        self._end += len(data)
-        if self._syncer is not None:
-            self._syncer.changed(self._file)
+    def _notice(self, text: str) -> None:
+        self.notice, self.noticed = text, time.monotonic()
+        self._warn(text)
 
 
-def _open(path: Path) -> int:
-    return os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+def _words(error: Exception) -> str:
+    if isinstance(error, sqlite3.Error):
+        text = one_line(error)
+        return 'No space left on device' if FULL in text else text
+    if isinstance(error, OSError):
+        return error.strerror or str(error)
+    return str(error) if isinstance(error, OutputError) else repr(error)
 
 
-def _number(path: Path) -> int:
-    match = _DRIVE.fullmatch(path.name)
-    return int(match[1]) if match else 0
+def _path_rows(points: list[tuple[float, float]], number: int) -> Iterator[Insert]:
+    for first in range(0, len(points), BLOCK):
+        yield 'path', (number, points_of(points[first : first + BLOCK]).tobytes())
+        number += 1
+
+
+def _reading_rows(readings: Readings, numbers: Mapping[str, int], number: int) -> Iterator[Insert]:
+    for first in range(0, len(readings), BLOCK):
+        part = readings.select(slice(first, first + BLOCK))
+        yield 'readings', (number + first, rows_of(part, numbers).tobytes())

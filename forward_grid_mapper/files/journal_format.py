@@ -1,188 +1,250 @@
-"""The bytes of a journal: blocks that are appended, each with a checksum, so that any damage costs only itself.
+"""What a journal file holds: its tables, the layout of a reading, and the checks that everything read back must pass.
 
-A file begins with `MAGIC`. A block is `SYNC`, its kind, the length of its payload, and the CRC-32 of kind, length and
-payload; little endian. Kinds:
+A journal file is an SQLite database in WAL mode:
 
-    FRAMES    JSON: map_frame and base_frame
-    NAME      number of a sensor (uint32), and its frame_id in UTF-8
-    READINGS  rows of `ROW`
-    PATH      points of the robot's path: x, y (float64)
+    drive      one row: map_frame and base_frame (UTF-8), and the parameters of the node that wrote it (JSON)
+    sensors    number of a sensor, and its frame_id in UTF-8
+    path       points of the robot's path in the map frame: x, y (float64)
+    readings   number of the first reading of a block, and the block: rows of `ROW`
+
+Readings are counted from the begin of the drive. The count is the key of the table, so that a block which is written
+again after a failure takes the place that it has.
 """
 
 from __future__ import annotations
 
 import json
-import mmap
-import struct
-import zlib
-from collections.abc import Iterable, Iterator
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
-from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from ..core.common.errors import BagError
+from ..core.common.errors import ParameterError
+from ..core.common.parameters import TABLE, Parameters
 from ..core.common.readings import Readings
+from ..core.messages.map_extent import FARTHEST
+from ..core.messages.message_types import NANOSECONDS
 
-MAGIC = b'FGMAPJ1\n'
-SYNC = b'\xf5FGM'
-_HEAD = struct.Struct('<4sBxxxII')
-FRAMES, NAME, READINGS, PATH = 1, 2, 3, 4
-LONGEST = 1 << 26
-"""Bytes of a payload; a length beyond it is damage."""
+SQLITE = b'SQLite format 3\0'
+"""The first bytes of every SQLite database."""
+
+APPLICATION = 0x46474D4A
+"""`PRAGMA application_id` of a journal: FGMJ in ASCII. It tells a journal from a rosbag2 file."""
+
+VERSION = 1
+"""`PRAGMA user_version`: the version of the tables. A file of another version is refused."""
+
+TABLES = {
+    'drive': 'CREATE TABLE drive (number INTEGER PRIMARY KEY, map_frame BLOB, base_frame BLOB, parameters BLOB)',
+    'sensors': 'CREATE TABLE sensors (number INTEGER PRIMARY KEY, name BLOB)',
+    'path': 'CREATE TABLE path (number INTEGER PRIMARY KEY, points BLOB)',
+    'readings': 'CREATE TABLE readings (number INTEGER PRIMARY KEY, rows BLOB)',
+}
+"""The whole schema. No table has an index of its own, so that `sqlite_master` has these rows and no others."""
 
 COLUMNS = ('x', 'y', 'yaw', 'z', 'z_max', 'half_angle', 'sigma')
 ROW = np.dtype([('stamp', '<i8'), *((name, '<f8') for name in COLUMNS), ('sensor', '<u4')])
 """A reading; 68 bytes."""
 
+BLOCK = 10_000
+"""Readings of a block at the most; 680 kB, so that no row of the database is longer than `LONGEST`."""
+
 CHUNK = 50_000
-"""Readings that are handed on at once when a journal is read."""
+"""Readings that are handed on at once when a journal is read; 3.4 MB."""
+
+LONGEST = 1 << 20
+"""Bytes of a value in the database. A longer one is damage, and is not even loaded."""
+
+MOST_SENSORS = 10_000
+"""Sensors of a drive; ten times what the node tells apart."""
+
+LONGEST_NAME = 1020
+"""Bytes of a frame's name: 255 characters of four bytes."""
+
+MOST_POINTS = 200_000
+"""Points of the path that are kept in memory while a journal is read; of more, every other one goes."""
+
+LATEST = (1 << 32) * NANOSECONDS
+"""Nanoseconds that a stamp may be away from 0: what seconds of 32 bits can say, so that differences fit 64 bits."""
 
 
-def block(kind: int, payload: bytes) -> bytes:
-    """Return the bytes of a block."""
-    return _HEAD.pack(SYNC, kind, len(payload), _checksum(kind, payload)) + payload
-
-
-def frames_block(map_frame: str, base_frame: str) -> bytes:
-    """Return the block with the frames of the drive."""
-    return block(FRAMES, json.dumps({'map_frame': map_frame, 'base_frame': base_frame}).encode())
-
-
-def name_block(number: int, name: str) -> bytes:
-    """Return the block that names a sensor."""
-    return block(NAME, struct.pack('<I', number) + name.encode('utf-8', 'surrogatepass'))
-
-
-def readings_block(readings: Readings, numbers: dict[str, int]) -> bytes:
-    """Return the block that holds readings of sensors with these numbers."""
+def rows_of(readings: Readings, numbers: Mapping[str, int]) -> NDArray[np.void]:
+    """Return readings as rows of `ROW`, shape (N,); `numbers` gives the number of each sensor by its name."""
     rows = np.empty(len(readings), ROW)
     for name in ('stamp', *COLUMNS):
         rows[name] = getattr(readings, name)
     rows['sensor'] = np.array([numbers.get(name, 0) for name in readings.sensor_names] or [0])[readings.sensor]
-    return block(READINGS, rows.tobytes())
+    return rows
 
 
-def path_block(points: Iterable[tuple[float, float]]) -> bytes:
-    """Return the block that holds points of the path."""
-    return block(PATH, np.array(list(points), '<f8').tobytes())
+def points_of(path: Iterable[tuple[float, float]]) -> NDArray[np.float64]:
+    """Return points of the path as they are stored, shape (P, 2)."""
+    return np.array(list(path), '<f8').reshape(-1, 2)
+
+
+def encoded(name: str) -> bytes:
+    """Return the bytes that stand for a frame's name, whatever characters it has."""
+    return name.encode('utf-8', 'surrogatepass')
+
+
+def stated(parameters: Parameters) -> dict[str, Any]:
+    """Return the parameters that decide about maps and are not the defaults, by name, as a journal tells them."""
+    values = parameters.flat()
+    return {row.name: values[row.name] for row in TABLE if row.group != 'node' and values[row.name] != row.default}
 
 
 @dataclass
 class Contents:
-    """What a journal file holds besides its readings, complete once they were read.
+    """What a journal file holds besides its readings, complete once they were read, and what is wrong with it.
 
     Attributes
     ----------
-    names : dict of int → str
-        Sensors by number.
     map_frame, base_frame : str
+    parameters : dict
+        Those of the node that wrote the file, where they are not the defaults.
+    sensors : dict of int → str
+        Names by number.
     path : list of (x, y)
-    end : int
-        Bytes up to the end of the last sound block.
-    torn : int
-        Bytes after it: a block that was being written when the writer died.
-    damaged : int
-        Bytes before it that are no sound block.
+        Metres, in the map frame.
+    next, next_points : int
+        Numbers of the reading, and of the points of the path, that would come next.
+    faults : list of str
+        What is wrong with the file as a whole.
+    left_out : Counter of str
+        Readings that cannot be, by what is wrong with them; they are not handed on.
+    note : str
+        What the user should know of a file that is sound; empty if nothing.
     """
 
-    names: dict[int, str] = field(default_factory=dict)
     map_frame: str = ''
     base_frame: str = ''
+    parameters: dict[str, Any] = field(default_factory=dict)
+    sensors: dict[int, str] = field(default_factory=dict)
     path: list[tuple[float, float]] = field(default_factory=list)
-    end: int = 0
-    torn: int = 0
-    damaged: int = 0
+    next: int = 0
+    next_points: int = 0
+    faults: list[str] = field(default_factory=list)
+    left_out: Counter[str] = field(default_factory=Counter)
+    note: str = ''
 
     @property
     def harm(self) -> str:
         """What is wrong with the file, in words; empty if nothing is."""
-        parts = []
-        if self.torn:
-            parts.append(f'its last {self.torn} bytes are a block that was cut off')
-        if self.damaged:
-            parts.append(f'{self.damaged} bytes inside it are damaged, and their readings lost')
-        return ' and '.join(parts)
+        counts = [f'{count} readings are left out, since {reason}' for reason, count in self.left_out.items()]
+        return '; '.join(self.faults + counts)
+
+    def fault(self, text: str) -> None:
+        """Note what is wrong with the file, each thing once."""
+        if text not in self.faults:
+            self.faults.append(text)
+
+    def add_sensor(self, number: int, name: object) -> None:
+        """Take a sensor's name, if it is one."""
+        text = _name(name)
+        if text is None or not 0 <= number < 1 << 32:
+            self.fault('the name of a sensor is damaged')
+        elif len(self.sensors) >= MOST_SENSORS and number not in self.sensors:
+            self.fault(f'it names more than {MOST_SENSORS} sensors')
+        else:
+            self.sensors[number] = text
+
+    def set_frames(self, map_frame: object, base_frame: object) -> None:
+        """Take the frames of the drive, if they are names."""
+        names = _name(map_frame), _name(base_frame)
+        if names[0] is None or names[1] is None:
+            self.fault('the frames of the drive are damaged')
+        else:
+            self.map_frame, self.base_frame = names[0], names[1]
+
+    def set_parameters(self, data: object) -> None:
+        """Take the parameters of the node. Another version may have others, so what is not admitted is passed over."""
+        try:
+            values = json.loads(data) if isinstance(data, bytes) else None
+        except (ValueError, RecursionError):
+            values = None
+        if not isinstance(values, dict):
+            self.fault('the parameters of the node are damaged')
+            return
+        for row in TABLE:
+            if row.name in values:
+                with suppress(ParameterError, OverflowError):
+                    self.parameters[row.name] = row.check(values[row.name])
+
+    def add_path(self, data: object) -> None:
+        """Take points of the path, those that are on Earth."""
+        if not isinstance(data, bytes) or len(data) % 16:
+            self.fault('points of the path are damaged')
+            return
+        points = np.frombuffer(data, '<f8').reshape(-1, 2)
+        good = (np.abs(points) < FARTHEST).all(axis=1)
+        if not good.all():
+            self.fault('points of the path are not finite')
+        self.path += [(x, y) for x, y in points[good].tolist()]
+        while len(self.path) > MOST_POINTS:
+            del self.path[1::2]
+
+    def sound(self, rows: NDArray[np.void]) -> NDArray[np.void]:
+        """Return the rows that can be readings; the others are counted by what is wrong with them."""
+        good = np.ones(len(rows), bool)
+        for reason, bad in _wrong(rows, self.sensors):
+            count = int(np.count_nonzero(bad & good))
+            if count:
+                self.left_out[reason] += count
+                good &= ~bad
+        return rows if good.all() else rows[good]
+
+    def readings(self, rows: NDArray[np.void]) -> Readings:
+        """Return rows that are `sound` as readings."""
+        known, sensor = np.unique(rows['sensor'], return_inverse=True)
+        names = tuple(self.sensors[int(number)] for number in known)
+        return Readings.from_columns(names=names, sensor=sensor, **{name: rows[name] for name in ('stamp', *COLUMNS)})
 
 
-def read(path: Path, contents: Contents) -> Iterator[Readings]:
-    """Yield the readings of a journal file, some ten thousand at a time; fills `contents` on the way.
-
-    Raises
-    ------
-    BagError
-        If the file cannot be read, or is no journal.
-    """
-    try:
-        with path.open('rb') as file:
-            size = path.stat().st_size
-            begin = file.read(len(MAGIC))
-            if size < len(MAGIC) and MAGIC.startswith(begin):
-                # died before its first block
-                contents.torn = size
-                return
-            if begin != MAGIC:
-                raise BagError(f'{path} is not a journal')
-            with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
-                yield from _chunks(data, contents)
-    except OSError as error:
-        raise BagError(f'{path} cannot be read: {error.strerror or error}') from error
-
-
-def _chunks(data: mmap.mmap, contents: Contents) -> Iterator[Readings]:
-    rows: list[bytes] = []
-    left = CHUNK * ROW.itemsize
-    for kind, payload in _blocks(data, contents):
-        if kind == READINGS and len(payload) % ROW.itemsize == 0:
-            rows.append(payload)
-            left -= len(payload)
-        elif kind == NAME and len(payload) >= 4:
-            number = struct.unpack_from('<I', payload)[0]
-            contents.names[number] = payload[4:].decode('utf-8', 'surrogatepass')
-        elif kind == FRAMES:
-            frames = json.loads(payload)
-            contents.map_frame, contents.base_frame = str(frames['map_frame']), str(frames['base_frame'])
-        elif kind == PATH:
-            contents.path += [(x, y) for x, y in np.frombuffer(payload, '<f8').reshape(-1, 2).tolist()]
-        if left <= 0:
-            yield _readings(rows, contents)
-            rows, left = [], CHUNK * ROW.itemsize
-    if rows:
-        yield _readings(rows, contents)
-
-
-def _readings(payloads: list[bytes], contents: Contents) -> Readings:
-    rows = np.frombuffer(b''.join(payloads), ROW)
-    known, sensor = np.unique(rows['sensor'], return_inverse=True)
-    columns = {name: rows[name] for name in ('stamp', *COLUMNS)}
-    # a name that was damaged
-    names = tuple(contents.names.get(int(number), f'sensor number {number}') for number in known)
-    return Readings.from_columns(names=names, sensor=sensor, **columns)
-
-
-def _blocks(data: mmap.mmap, contents: Contents) -> Iterator[tuple[int, bytes]]:
-    """Yield kind and payload of every sound block; what lies between them is damage."""
-    at = contents.end = len(MAGIC)
-    while 0 <= at <= len(data) - _HEAD.size:
-        found = _block_at(data, at)
-        if found is None:
-            at = data.find(SYNC, at + 1)
-            continue
-        contents.damaged += at - contents.end
-        at += _HEAD.size + len(found[1])
-        contents.end = at
-        yield found
-    contents.torn = len(data) - contents.end
-
-
-def _block_at(data: mmap.mmap, at: int) -> tuple[int, bytes] | None:
-    sync, kind, length, checksum = _HEAD.unpack_from(data, at)
-    begin = at + _HEAD.size
-    if sync != SYNC or length > LONGEST or begin + length > len(data):
+def _name(data: object) -> str | None:
+    if not isinstance(data, bytes) or len(data) > LONGEST_NAME:
         return None
-    payload = bytes(data[begin : begin + length])
-    return (kind, payload) if _checksum(kind, payload) == checksum else None
+    try:
+        return data.decode('utf-8', 'surrogatepass')
+    except UnicodeDecodeError:
+        return None
 
 
-def _checksum(kind: int, payload: bytes) -> int:
-    return zlib.crc32(payload, zlib.crc32(struct.pack('<BI', kind, len(payload))))
+def _wrong(rows: NDArray[np.void], sensors: Mapping[int, str]) -> Iterator[tuple[str, NDArray[np.bool_]]]:
+    """Yield what may be wrong with readings, and the mask of those with which it is.
+
+    Comparisons are written so that a NaN fails them.
+    """
+    z, z_max = rows['z'], rows['z_max']
+    on_earth = (np.abs(rows['x']) < FARTHEST) & (np.abs(rows['y']) < FARTHEST) & np.isfinite(rows['yaw'])
+    yield 'their pose is not finite or not on Earth', ~on_earth
+    yield 'their range is not between 0 and the largest range', ~((z > 0) & (z <= z_max) & (z_max < np.inf))
+    yield (
+        'their field of view is not between 0 and 180 degrees',
+        ~((rows['half_angle'] > 0) & (rows['half_angle'] < np.pi / 2)),
+    )
+    yield 'their standard deviation is negative or not finite', ~((rows['sigma'] >= 0) & (rows['sigma'] < np.inf))
+    yield 'their stamp cannot be', ~((rows['stamp'] > -LATEST) & (rows['stamp'] < LATEST))
+    yield 'their sensor has no name', ~np.isin(rows['sensor'], np.fromiter(sensors, np.int64, len(sensors)))
+
+
+def in_chunks(blocks: Iterable[NDArray[np.void]], contents: Contents) -> Iterator[Readings]:
+    """Yield the sound readings of blocks of rows, some `CHUNK` at a time."""
+    waiting: list[NDArray[np.void]] = []
+    count = 0
+    for rows in blocks:
+        waiting.append(rows)
+        count += len(rows)
+        if count >= CHUNK:
+            yield from _joined(waiting, contents)
+            waiting, count = [], 0
+    yield from _joined(waiting, contents)
+
+
+def _joined(waiting: Sequence[NDArray[np.void]], contents: Contents) -> Iterator[Readings]:
+    rows = contents.sound(np.concatenate([np.empty(0, ROW), *waiting]))
+    if len(rows):
+        yield contents.readings(rows)

@@ -5,36 +5,28 @@ from __future__ import annotations
 import os
 import threading
 from collections.abc import Callable
+from pathlib import Path
 
 PERIOD = 1.0
-"""Seconds between two requests."""
+"""Seconds between two requests: what a power cut may take, beside what a kill takes."""
 
 
 class Syncer:
-    """Calls fdatasync on the files that changed; whoever writes never waits for it."""
+    """Calls fdatasync on the file that changed; whoever writes never waits for it."""
 
     def __init__(self, warn: Callable[[str], object]) -> None:
         self._warn = warn
         self._trouble = ''
-        self._changed: dict[int, int] = {}
+        self._changed: Path | None = None
         self._lock = threading.Lock()
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._work, name='sync', daemon=True)
         self._thread.start()
 
-    def changed(self, file: int) -> None:
-        """Note that something was written to an open file, which may be closed right away."""
+    def changed(self, path: Path) -> None:
+        """Note that something was written to a file."""
         with self._lock:
-            if file not in self._changed:
-                self._changed[file] = os.dup(file)
-
-    def closed(self, file: int) -> None:
-        """Note that the file is closed, so that its number may come to mean another."""
-        with self._lock:
-            copy = self._changed.pop(file, None)
-            if copy is not None:
-                # numbers below zero are nobody's
-                self._changed[-copy - 1] = copy
+            self._changed = path
 
     def close(self, seconds: float) -> None:
         """Ask once more, and give it so many seconds."""
@@ -48,13 +40,21 @@ class Syncer:
 
     def _flush(self) -> None:
         with self._lock:
-            files, self._changed = list(self._changed.values()), {}
-        for file in files:
+            path, self._changed = self._changed, None
+        if path is None:
+            return
+        try:
+            # a descriptor of its own, since the writer may close its own at any moment
+            file = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
             try:
                 os.fdatasync(file)
-            except OSError as error:
-                if error.strerror != self._trouble:
-                    self._trouble = error.strerror or str(error)
-                    self._warn(f'the disk does not keep what is written to it: {self._trouble}')
             finally:
                 os.close(file)
+            self._trouble = ''
+        except FileNotFoundError:
+            # closed in order, and synced then
+            pass
+        except OSError as error:
+            if error.strerror != self._trouble:
+                self._trouble = error.strerror or str(error)
+                self._warn(f'the disk does not keep what is written to it: {self._trouble}')

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import time
 from collections.abc import Callable
 from typing import Any
 
@@ -10,12 +11,17 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.node import Node
 
 from ..core.common.errors import OutputError
+from ..core.common.parameters import Parameters
 from ..core.messages.pose_association import PoseAssociator
 from ..files.journal import Journal
+from ..files.journal_format import stated
 from .diagnostics import status
 
 PERIOD = 0.1
 """Seconds between two looks for new readings."""
+
+NOTICE = 60.0
+"""Seconds for which the status warns of what was found wrong and dealt with; a key tells it for ever."""
 
 FULL = (errno.ENOSPC, errno.EDQUOT)
 
@@ -26,17 +32,28 @@ class JournalKeeper:
     def __init__(self, node: Node, folder: str, associator: PoseAssociator, clock: Any) -> None:
         """Open the journal and give its readings to the associator.
 
+        Parameters
+        ----------
+        node : Node
+            Its attribute `parameters` holds the parameters of the mapper.
+        folder : str
+        associator : PoseAssociator
+        clock : Clock
+            Of the timer that looks for new readings.
+
         Raises
         ------
         OutputError
             If the journal is another node's, or cannot be opened for another reason than a full disk.
         """
+        self._node = node
         self._associator = associator
         self._journal: Journal | None = None
         self._folder = folder
         self._trouble = ''
         self._restored = self._taken = 0
         self._last_point: tuple[float, float] | None = None
+        self._parameters: Parameters | None = None
         if not folder:
             return
         warn: Callable[[str], Any] = node.get_logger().warning
@@ -49,35 +66,53 @@ class JournalKeeper:
             self._trouble = str(error)
             warn(f'there is no journal: {error}')
             return
-        self._restore(node, self._journal)
+        self._restore(self._journal)
         # both before readings go and as they come
         associator.buffer.before_thinning.append(self.take)
         node.create_timer(PERIOD, self.take, clock=clock)
 
-    def _restore(self, node: Node, journal: Journal) -> None:
-        associator = self._associator
+    def _restore(self, journal: Journal) -> None:
+        associator, logger = self._associator, self._node.get_logger()
+        refused = 0
         for readings in journal.restore():
-            associator.restore(readings)
+            refused += associator.restore(readings)
         associator.map_frame, associator.base_frame = journal.contents.map_frame, journal.contents.base_frame
         for point in journal.contents.path:
             associator.extend_path(point)
         self._restored = self._taken = len(associator.buffer)
-        node.get_logger().info(
+        logger.info(
             f'journal {journal.path}: {self._restored} readings of an earlier run are back, in frame '
             f'{associator.map_frame or "(none yet)"}'
         )
+        if refused:
+            logger.warning(
+                f'journal {journal.path}: {refused} of its readings do not fit on the map (max_cells, resolution) and '
+                f'are left out of it'
+            )
 
     def take(self) -> None:
-        """Hand what is new to the journal."""
+        """Hand what is new to the journal, or all that is in memory where the journal has to begin anew."""
         journal, associator = self._journal, self._associator
-        if journal is None or len(associator.buffer) == self._taken:
+        if journal is None:
             return
-        new = associator.buffer.snapshot(self._taken)
-        self._taken = len(associator.buffer)
-        point = associator.path[-1] if associator.path else None
-        points = [point] if point is not None and point != self._last_point else []
-        self._last_point = point
-        journal.put(new, (associator.map_frame, associator.base_frame), points)
+        self._describe(journal)
+        frames = associator.map_frame, associator.base_frame
+        if journal.gone:
+            self._taken = len(associator.buffer)
+            journal.renew(associator.buffer.snapshot(), frames, associator.path)
+        elif len(associator.buffer) > self._taken:
+            new = associator.buffer.snapshot(self._taken)
+            self._taken = len(associator.buffer)
+            point = associator.path[-1] if associator.path else None
+            points = [point] if point is not None and point != self._last_point else []
+            self._last_point = point
+            journal.put(new, frames, points)
+
+    def _describe(self, journal: Journal) -> None:
+        parameters = self._node.parameters
+        if parameters is not self._parameters:
+            self._parameters = parameters
+            journal.parameters = stated(parameters)
 
     def reset(self) -> str:
         """Begin a new drive, since readings were forgotten; return where the old ones are."""
@@ -104,10 +139,13 @@ class JournalKeeper:
         if journal is not None:
             if journal.lost:
                 trouble = trouble or f'{journal.lost} readings came while nothing could be written'
+            if time.monotonic() < journal.noticed + NOTICE:
+                trouble = trouble or journal.notice
             values |= {
                 'file': journal.path.name,
                 'readings to be written': journal.unwritten,
                 'readings lost': journal.lost,
+                'last fault of a file': journal.notice or 'none',
             }
         level = DiagnosticStatus.WARN if trouble else DiagnosticStatus.OK
         return [status(f'{name}: journal', level, trouble or 'writing', name, values)]

@@ -7,12 +7,17 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from ..core.common.errors import InputError, ParameterError
-from ..core.common.parameters import Parameters
+from ..core.common.parameters import TABLE, Parameters
 from ..core.messages.message_types import NANOSECONDS, Pose2
 from ..core.messages.pose_association import PoseAssociator
-from ..files.journal_format import Contents, read
+from ..core.messages.rep117 import REASONS
+from ..files.journal_format import Contents
+from ..files.journal_reader import read
 from ..files.output_folder import readable
 from .drive import Drive, LogOddsMapOfAll, thinning_note
+
+MOST_NAMED = 10
+"""Parameters that a warning names."""
 
 
 def read_journal(
@@ -29,7 +34,7 @@ def read_journal(
     BagError
         If the file cannot be read.
     InputError
-        If it holds no reading.
+        If it holds no reading that can be mapped.
     ParameterError
         If topics are asked for.
     """
@@ -44,11 +49,13 @@ def read_journal(
         first, last = min(first, int(readings.stamp.min())), max(last, int(readings.stamp.max()))
         names |= set(readings.sensor_names)
     if not len(associator.buffer):
-        raise InputError(f'the journal {path} holds no reading{f": {contents.harm}" if contents.harm else ""}')
+        reasons = [f'{count} are refused: {REASONS[reason]}' for reason, count in associator.rejected.items()]
+        why = '; '.join(filter(None, [contents.harm, *reasons]))
+        raise InputError(f'the journal {path} holds no reading{f" to map: {why}" if why else ""}')
     associator.map_frame, associator.base_frame = contents.map_frame, contents.base_frame
     for point in contents.path:
         associator.extend_path(point)
-    warnings = [f'{path.name}: {contents.harm}'] if contents.harm else []
+    warnings = _warnings(path, contents, associator, parameters)
     if extrinsics:
         warnings.append(
             'a journal holds readings in the map frame: the poses of sensors that were given change nothing'
@@ -62,7 +69,32 @@ def read_journal(
         'stamps': [int(first), int(last)],
         'duration_s': (last - first) / NANOSECONDS,
         'path_m': sum(math.dist(a, b) for a, b in zip(associator.path, associator.path[1:], strict=False)),
-        'counts': {'received': associator.received, 'accepted': len(associator.buffer), 'rejected': {}},
+        'counts': {
+            'received': associator.received,
+            'accepted': len(associator.buffer),
+            'rejected': dict(associator.rejected),
+        },
         'warnings': warnings + thinning_note(associator),
     }
     return Drive(associator, source, live)
+
+
+def _warnings(path: Path, contents: Contents, associator: PoseAssociator, parameters: Parameters) -> list[str]:
+    warnings = []
+    if contents.harm:
+        warnings.append(f'{path.name}: {contents.harm}')
+    if contents.note:
+        warnings.append(f'{path.name}: {contents.note}; a node that starts with this journal goes on in a new file')
+    for reason, count in associator.rejected.items():
+        warnings.append(f'{count} of {associator.received} readings are refused: {REASONS[reason]}')
+    ours = parameters.flat()
+    other = {
+        row.name: contents.parameters.get(row.name, row.default)
+        for row in TABLE
+        if row.group != 'node' and contents.parameters.get(row.name, row.default) != ours[row.name]
+    }
+    # a file of the previous format tells none
+    if other and not contents.note:
+        named = ', '.join(f'{name}={value}' for name, value in list(other.items())[:MOST_NAMED])
+        warnings.append(f'the node that kept {path.name} mapped with {named}; --set gives the same here')
+    return warnings

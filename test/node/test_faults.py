@@ -148,7 +148,7 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
     """A file system of 400 kB."""
     folder = tmp_path / 'a small disk'
     folder.mkdir()
-    mounted = subprocess.run(['extrinsic', '-t', 'tmpfs', '-o', 'size=400k', 'none', str(folder)], check=False)
+    mounted = subprocess.run(['mount', '-t', 'tmpfs', '-o', 'size=400k', 'none', str(folder)], check=False)
     if mounted.returncode:
         pytest.skip('mounting needs root')
     yield folder
@@ -177,7 +177,8 @@ def test_a_full_disk_is_a_warning_and_nothing_is_half_written(start: Any, robot:
     robot.until(lambda: robot.diagnostics['journal']['readings to be written'] == '0', what='the journal catches up')
     assert robot.call('reset').success
     node.stop(signal.SIGKILL)
-    from forward_grid_mapper.files.journal_format import Contents, read
+    from forward_grid_mapper.files.journal_format import Contents
+    from forward_grid_mapper.files.journal_reader import read
 
     contents = Contents()
     found = list(read(small_disk / 'journal' / 'drive_0001.journal', contents))

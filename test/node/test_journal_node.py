@@ -97,11 +97,12 @@ def test_a_node_that_is_killed_goes_on_where_it_was(start: Any, domain: int, tmp
     assert node.stop() == 0
     node = start(*options)
     assert '50 readings of an earlier run are back' in node.output
-    assert sorted(path.name for path in folder.iterdir()) == ['drive_0001.journal', 'drive_0002.journal', 'lock']
-    assert process_bag([str(folder / 'drive_0001.journal'), '-o', str(tmp_path / 'old'), '-q']) == 0
-    # a node stopped in order writes everything
+    # a node stopped in order leaves no log, and one that runs has one
+    files = {path.name for path in folder.iterdir()}
+    assert files - {'drive_0002.journal-wal'} == {'drive_0001.journal', 'drive_0002.journal', 'lock'}
     first = folder / 'drive_0001.journal'
-    first.write_bytes(first.read_bytes()[:-10])
+    assert process_bag([str(first), '-o', str(tmp_path / 'old'), '-q']) == 0
+    first.write_bytes(first.read_bytes()[: first.stat().st_size * 2 // 3])
     assert process_bag([str(first), '-o', str(tmp_path / 'torn'), '-q']) == 0
 
 
@@ -132,3 +133,41 @@ def test_a_journal_that_cannot_be(start: Any, tmp_path: Path) -> None:
     assert node.process.wait(60) == 1
     assert 'is a file' in node.output
     assert 'Traceback' not in node.output
+
+
+def journal_status(robot: Robot) -> dict[str, Any]:
+    return dict(robot.diagnostics.get('journal', {}))
+
+
+def test_a_journal_that_is_deleted_or_hostile_is_begun_anew(start: Any, robot: Robot, tmp_path: Path) -> None:
+    folder = tmp_path / 'journal'
+    options = (*OPTIONS, '-p', f'journal:={folder}')
+    node = start(*options)
+    robot.meet()
+    robot.play(drive(0, 300))
+    until_accepted(robot, 300)
+    # also while nothing comes
+    (folder / 'drive_0001.journal').unlink()
+    robot.until(lambda: journal_status(robot).get('file') == 'drive_0002.journal', what='a new file')
+    assert journal_status(robot)['level'] != b'\x00'
+    assert 'was deleted or moved' in journal_status(robot)['message']
+    assert 'was deleted or moved' in node.output
+    robot.play(drive(300, 100))
+    until_accepted(robot, 400)
+    # while the node writes
+    assert process_bag([str(folder), '-o', str(tmp_path / 'offline'), '-q']) == 0
+    report = json.loads((tmp_path / 'offline' / 'report.json').read_text())
+    assert report['sensors']['sonar/left']['accepted'] == 400
+    node.stop(signal.SIGKILL)
+    path = folder / 'drive_0002.journal'
+    Path(f'{path}-wal').unlink(missing_ok=True)
+    path.write_bytes(b'SQLite format 3\0' + bytes(range(256)) * 100)
+    node = start(*options)
+    assert 'the journal goes on in drive_0003.journal' in node.output
+    assert '0 readings of an earlier run are back' in node.output
+    robot.sent = 0
+    robot.meet()
+    robot.play(drive(400, 100))
+    until_accepted(robot, 100)
+    assert 'Traceback' not in node.output
+    assert node.stop() == 0

@@ -2,31 +2,32 @@
 
 from __future__ import annotations
 
+import sqlite3
+import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
+sys.path.insert(0, str(Path(__file__).parents[1] / 'files'))
+
+from journal_samples import Previous
+
 from forward_grid_mapper.commands.process_bag import main as process_bag
 from forward_grid_mapper.core.common.readings import Readings
 from forward_grid_mapper.files.journal import Journal
+from forward_grid_mapper.files.journal_format import ROW
 from forward_grid_mapper.files.map_archive import read_npz
 
 
-def journal(folder: Path, count: int) -> Path:
+def journal(folder: Path, count: int, parameters: dict[str, Any] | None = None, **columns: Any) -> Path:
     made = Journal(folder, print)
     assert not list(made.restore())
     number = np.arange(count)
-    readings = Readings.from_columns(
-        names=('sonar',),
-        x=0.0,
-        y=0.0,
-        yaw=0.01 * number,
-        z=2.0 + 0 * number,
-        z_max=5.0,
-        half_angle=0.1,
-        stamp=number,
-    )
+    values = {'x': 0.0, 'y': 0.0, 'yaw': 0.01 * number, 'z_max': 5.0, 'half_angle': 0.1, 'stamp': number, **columns}
+    readings = Readings.from_columns(names=('sonar',), z=values.pop('z', 2.0) + 0 * number, **values)
+    made.parameters = parameters or {}
     made.put(readings, ('map', 'base'), [(0.0, 0.0)])
     made.close()
     return folder
@@ -48,10 +49,50 @@ def test_options_that_a_journal_has_no_use_for(tmp_path: Path, capsys: pytest.Ca
 
 def test_a_damaged_journal_is_mapped_as_far_as_it_goes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = journal(tmp_path / 'j', 300)
-    path = folder / 'drive_0001.journal'
-    with path.open('ab') as file:
-        file.write(b'\xf5FGMtorn')
+    changed = sqlite3.connect(folder / 'drive_0001.journal')
+    rows = np.frombuffer(changed.execute('SELECT rows FROM readings').fetchone()[0], ROW).copy()
+    rows['z'][:20] = np.nan
+    changed.execute('UPDATE readings SET rows = ?', (rows.tobytes(),))
+    changed.commit()
+    changed.close()
     assert process_bag([str(folder), '-o', str(tmp_path / 'out'), '-q', '--bag']) == 0
-    assert 'cut off' in capsys.readouterr().err
+    assert '20 readings are left out, since their range is not' in capsys.readouterr().err
     assert read_npz(tmp_path / 'out' / 'maps.npz').ml.size > 0
     assert (tmp_path / 'out' / 'maps.mcap_bag').is_dir()
+
+
+def test_readings_that_no_map_can_hold_are_refused_in_words(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    far = np.zeros(300)
+    far[[5, 7]] = 1.9e7, -1.9e7
+    folder = journal(tmp_path / 'far', 300, x=far)
+    assert process_bag([str(folder), '-o', str(tmp_path / 'a'), '-q']) == 0
+    assert '2 of 300 readings are refused: the map would have more than max_cells' in capsys.readouterr().err
+    folder = journal(tmp_path / 'long', 300, z=1e300, z_max=1e308)
+    assert process_bag([str(folder), '-o', str(tmp_path / 'b'), '-q']) == 1
+    said = capsys.readouterr().err
+    assert '300 are refused: the cone has millions of cells' in said
+    assert 'Traceback' not in said
+
+
+def test_the_parameters_of_the_node_are_compared(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = journal(tmp_path / 'j', 300, {'resolution': 0.05})
+    assert process_bag([str(folder), '-o', str(tmp_path / 'a'), '-q']) == 0
+    assert 'the node that kept drive_0001.journal mapped with resolution=0.05' in capsys.readouterr().err
+    assert process_bag([str(folder), '-o', str(tmp_path / 'b'), '-q', '--set', 'resolution=0.05']) == 0
+    assert 'mapped with' not in capsys.readouterr().err
+
+
+def test_a_journal_of_the_previous_format(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / 'drive_0001.journal').write_bytes(Previous.file(300))
+    assert process_bag([str(tmp_path), '-o', str(tmp_path / 'a'), '-q']) == 0
+    assert 'has the format of the previous version, which the next version will not read' in capsys.readouterr().err
+
+
+def test_a_database_of_another_program(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    other = sqlite3.connect(tmp_path / 'drive_0001.journal')
+    other.execute('CREATE VIEW readings AS WITH RECURSIVE n(i) AS (SELECT 0 UNION ALL SELECT i FROM n) SELECT i FROM n')
+    other.close()
+    assert process_bag([str(tmp_path), '-o', str(tmp_path / 'a'), '-q']) == 1
+    said = capsys.readouterr().err
+    assert 'is not a journal' in said
+    assert 'Traceback' not in said

@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from ..common.constants import arc_depth
 from ..common.parameters import Parameters
-from ..common.readings import Readings
+from ..common.readings import Floats, Readings
 from ..sensor.density import CUT
 from .message_types import Pose2
 from .rep117 import Measurement
@@ -25,10 +30,27 @@ def possible(pose: Pose2) -> bool:
 
 def reach_of(measured: Measurement, parameters: Parameters) -> float:
     """Return how far from the sensor the maps take note of a reading, and two cells more, in metres."""
-    p = parameters
-    cell = p.grid.resolution
-    explained = measured.z + CUT * max(measured.sigma or p.model.sigma, cell / 2)
-    return max(min(explained, measured.z_max), measured.z + arc_depth(cell)) + 2 * cell
+    sigma = measured.sigma or parameters.model.sigma
+    return float(_reach(measured.z, measured.z_max, sigma, parameters, max, min))
+
+
+def _reach(
+    z: Any, z_max: Any, sigma: Any, parameters: Parameters, highest: Callable[..., Any], lowest: Callable[..., Any]
+) -> Any:
+    """Return `reach_of` for numbers or for arrays, of which `highest` and `lowest` take the greater and the smaller."""
+    cell = parameters.grid.resolution
+    evaluated = z + CUT * highest(sigma, cell / 2)
+    return highest(lowest(evaluated, z_max), z + arc_depth(cell)) + 2 * cell
+
+
+Box = tuple[float, float, float, float]
+"""Left, right, bottom, top; metres."""
+
+
+def _fits(box: Box, parameters: Parameters) -> bool:
+    """Return whether the map may be as large as a box."""
+    cell = parameters.grid.resolution
+    return ((box[1] - box[0]) / cell + 1) * ((box[3] - box[2]) / cell + 1) <= parameters.grid.max_cells
 
 
 class MapExtent:
@@ -41,16 +63,46 @@ class MapExtent:
         """Begin with an empty map."""
         self._box = (math.inf, -math.inf, math.inf, -math.inf)
 
-    def restore(self, readings: Readings) -> None:
-        """Grow to hold readings that were admitted before; there is at least one."""
-        left, right, bottom, top = self._box
-        reach = float(readings.z.max())
-        self._box = (
-            min(left, float(readings.x.min()) - reach),
-            max(right, float(readings.x.max()) + reach),
-            min(bottom, float(readings.y.min()) - reach),
-            max(top, float(readings.y.max()) + reach),
-        )
+    def restore(self, readings: Readings, parameters: Parameters) -> dict[str, NDArray[np.bool_]]:
+        """Grow to hold readings that an earlier run admitted, perhaps with other parameters.
+
+        Returns
+        -------
+        dict of str → bool, shape (N,)
+            The readings that the map cannot hold, by the reason (`rep117.REASONS`).
+        """
+        r = readings
+        sigma = np.where(r.sigma > 0, r.sigma, parameters.model.sigma)
+        reach = _reach(r.z, r.z_max, sigma, parameters, np.maximum, np.minimum)
+        with np.errstate(over='ignore'):
+            large = ~(r.half_angle * (reach / parameters.grid.resolution) ** 2 <= LARGEST_CONE)
+        far = np.zeros(len(r), bool)
+        rest = np.flatnonzero(~large)
+        if len(rest):
+            x, y, reach = r.x[rest], r.y[rest], reach[rest]
+            sides = (x - reach).min(), (x + reach).max(), (y - reach).min(), (y + reach).max()
+            box = self._grown(*map(float, sides))
+            if _fits(box, parameters):
+                self._box = box
+            else:
+                far[rest] = self._too_far(x, y, reach, parameters)
+        return {'large_cone': large, 'too_far_away': far}
+
+    def _too_far(self, x: Floats, y: Floats, reach: Floats, parameters: Parameters) -> NDArray[np.bool_]:
+        """Grow by readings one after the other; return the mask of those with which the map would be too large."""
+        far = np.zeros(len(x), bool)
+        for number, (px, py, around) in enumerate(zip(x.tolist(), y.tolist(), reach.tolist(), strict=True)):
+            box = self._grown(px - around, px + around, py - around, py + around)
+            if _fits(box, parameters):
+                self._box = box
+            else:
+                far[number] = True
+        return far
+
+    def _grown(self, left: float, right: float, bottom: float, top: float) -> Box:
+        """Return the box, and another, in one."""
+        mine = self._box
+        return min(mine[0], left), max(mine[1], right), min(mine[2], bottom), max(mine[3], top)
 
     def admit(self, sensor: Pose2, measured: Measurement, parameters: Parameters) -> str:
         """Grow to hold a reading and return '', or return the reason (`rep117.REASONS`) why the map cannot."""
@@ -63,13 +115,8 @@ class MapExtent:
             away = max(left - sensor.x, sensor.x - right, bottom - sensor.y, sensor.y - top)
             if away > parameters.association.max_jump:
                 return 'far_from_map'
-        box = (
-            min(left, sensor.x - reach),
-            max(right, sensor.x + reach),
-            min(bottom, sensor.y - reach),
-            max(top, sensor.y + reach),
-        )
-        if not ((box[1] - box[0]) / cell + 1) * ((box[3] - box[2]) / cell + 1) <= parameters.grid.max_cells:
+        box = self._grown(sensor.x - reach, sensor.x + reach, sensor.y - reach, sensor.y + reach)
+        if not _fits(box, parameters):
             return 'too_far_away'
         if measured.half_angle * (reach / cell) ** 2 > LARGEST_CONE:
             return 'large_cone'

@@ -11,6 +11,8 @@ import time
 from collections import Counter
 from collections.abc import Callable
 
+import numpy as np
+
 from ..common.parameters import Parameters
 from ..common.readings import Readings
 from .limit_watch import LimitWatch
@@ -207,13 +209,25 @@ class PoseAssociator:
             self._reject_unknown(measured)
         self._held.clear()
 
-    def restore(self, readings: Readings) -> None:
-        """Take readings that an earlier run accepted, as received and accepted."""
-        if not len(readings):
-            return
+    def restore(self, readings: Readings) -> int:
+        """Take readings that an earlier run accepted, as received, and as accepted where the map can hold them.
+
+        Returns
+        -------
+        int
+            How many it cannot hold; they are rejected.
+        """
         self.received += len(readings)
-        self._extent.restore(readings)
-        self.buffer.extend(readings)
+        rejected = self._extent.restore(readings, self._all)
+        admitted = np.ones(len(readings), bool)
+        for reason, mask in rejected.items():
+            if count := int(np.count_nonzero(mask)):
+                self.rejected[reason] += count
+                admitted &= ~mask
+        count = int(np.count_nonzero(admitted))
+        if count:
+            self.buffer.extend(readings if count == len(readings) else readings.select(admitted))
+        return len(readings) - count
 
     def extend_path(self, point: tuple[float, float]) -> None:
         """Add a point to the robot's path, if it lies far enough from the last one."""

@@ -1,0 +1,349 @@
+"""The journal file that is being written: made whole, written in transactions, and looked after.
+
+SQLite keeps the file locked, and its index of the log in its own memory instead of in a file that is mapped
+(`locking_mode=EXCLUSIVE`): nobody else can make it wait, or cut off a file under its feet. Whoever reads meanwhile
+takes a copy, see `journal_reader`.
+"""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import os
+import re
+import sqlite3
+from collections.abc import Iterable, Iterator
+from contextlib import closing, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ..core.common.errors import BagError, OutputError
+from ..core.common.readings import Readings
+from .journal_format import APPLICATION, ROW, TABLES, VERSION, Contents
+from .journal_reader import check, connect, extent, log_of, one_line, readings, unbounded
+
+DRIVE = re.compile(r'drive_(\d{4,})\.journal')
+
+PARTIAL = '.new.journal'
+"""Name of a file before it is whole; one that is left over is overwritten."""
+
+INSERT = {
+    'drive': 'INSERT OR REPLACE INTO drive VALUES (?, ?, ?, ?)',
+    'sensors': 'INSERT OR IGNORE INTO sensors VALUES (?, ?)',
+    'path': 'INSERT OR IGNORE INTO path VALUES (?, ?)',
+    'readings': 'INSERT OR IGNORE INTO readings VALUES (?, ?)',
+}
+"""A row that is there already is not written again, so that a commit whose outcome is unknown may be repeated."""
+
+FULL = 'database or disk is full'
+"""What SQLite says of a full disk; a transaction that failed so may be tried again with the same connection."""
+
+Insert = tuple[str, tuple[Any, ...]]
+"""A table, and the values of a row."""
+
+
+@dataclass
+class Drive:
+    """A drive and its file.
+
+    Attributes
+    ----------
+    path : Path
+        The file; until it is made, another number may be taken if this one is not free.
+    made : bool
+        Whether the file was made, and therefore has to be there.
+    gone : bool
+        Whether it vanished or was damaged since.
+    next : int
+        Number of the reading that follows those which were committed.
+    """
+
+    path: Path
+    made: bool = False
+    gone: bool = False
+    next: int = 0
+
+
+class GoneError(Exception):
+    """The file of a drive is not what was written to it; says why."""
+
+    def __init__(self, drive: Drive, why: str) -> None:
+        super().__init__(why)
+        self.drive = drive
+
+
+def number_of(path: Path) -> int:
+    """Return the number in the name of a journal file."""
+    match = DRIVE.fullmatch(path.name)
+    return int(match[1]) if match else 0
+
+
+def following(path: Path) -> Path:
+    """Return the name of the journal file that comes after `path`."""
+    return path.with_name(f'drive_{number_of(path) + 1:04d}.journal')
+
+
+class FolderLock:
+    """The lock by which one process at a time writes into a journal's folder."""
+
+    def __init__(self, folder: Path) -> None:
+        """Take the lock.
+
+        Raises
+        ------
+        OutputError
+            If another process has it.
+        OSError
+            If the folder cannot be written.
+        """
+        self._folder = folder
+        self._file = self._take()
+
+    def renew(self) -> None:
+        """Make the folder and take its lock again where they were removed.
+
+        Raises
+        ------
+        OutputError
+            If another process has taken it meanwhile.
+        OSError
+            If the folder cannot be made or written.
+        """
+        self._folder.mkdir(parents=True, exist_ok=True)
+        with suppress(FileNotFoundError):
+            if os.path.samestat((self._folder / 'lock').stat(), os.fstat(self._file)):
+                return
+        taken = self._take()
+        os.close(self._file)
+        self._file = taken
+
+    def release(self) -> None:
+        """Let another process have it."""
+        os.close(self._file)
+
+    def _take(self) -> int:
+        file = os.open(self._folder / 'lock', os.O_RDWR | os.O_CREAT | os.O_NONBLOCK | os.O_CLOEXEC, 0o644)
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BaseException as error:
+            os.close(file)
+            if isinstance(error, BlockingIOError):
+                raise OutputError(
+                    f'{self._folder} is the journal of another node that runs; give each its own'
+                ) from None
+            raise
+        return file
+
+
+class DriveWriter:
+    """Writes rows into the file of a drive, and makes sure that the file stays what it is. One thread at a time.
+
+    Attributes
+    ----------
+    drive : Drive or None
+        The one whose file is open.
+    """
+
+    def __init__(self, lock: FolderLock) -> None:
+        self._lock = lock
+        self.drive: Drive | None = None
+        self._database: sqlite3.Connection | None = None
+        self._size = 0
+        self._files: dict[Path, os.stat_result] = {}
+        self._forsaken: list[sqlite3.Connection] = []
+
+    def resume(self, drive: Drive) -> bool:
+        """Open a file of an earlier run to go on in it; return whether it is sound throughout.
+
+        Raises
+        ------
+        OutputError
+            If another program has it open.
+        """
+        if drive.path.with_name(drive.path.name + '-journal').exists():
+            # SQLite would play it back, whoever wrote it
+            return False
+        try:
+            self._connect(drive)
+            contents = Contents()
+            for _ in self.readings(contents):
+                pass
+            drive.next = contents.next
+            if not contents.harm:
+                return True
+        except sqlite3.OperationalError as error:
+            if 'locked' in str(error):
+                self.close()
+                raise OutputError(f'{drive.path} is open in another program; close that first') from error
+        except (sqlite3.Error, MemoryError, OSError, BagError, GoneError):
+            # reading it anew tells what it is
+            pass
+        self.close()
+        return False
+
+    def readings(self, contents: Contents) -> Iterator[Readings]:
+        """Yield the readings of the file that is open; fills `contents` on the way."""
+        assert self._database is not None and self.drive is not None
+        yield from readings(self._database, self._size, contents)
+
+    def write(self, drive: Drive, rows: Iterable[Insert], following: int) -> Path:
+        """Commit rows to the file of a drive, which is made if need be; return SQLite's log, which now holds them.
+
+        Parameters
+        ----------
+        drive : Drive
+        rows : iterable of (table, values)
+        following : int
+            Number of the reading that comes after them.
+
+        Raises
+        ------
+        GoneError
+            If the file is not what was written to it.
+        sqlite3.Error, OSError, OutputError
+            If nothing can be written at the moment; nothing was.
+        """
+        try:
+            self._open(drive)
+            self._look()
+            assert self._database is not None
+            self._database.execute('BEGIN IMMEDIATE')
+            for table, values in rows:
+                self._database.execute(INSERT[table], values)
+            self._database.execute('COMMIT')
+            drive.next = max(drive.next, following)
+            self._remember()
+        except sqlite3.Error as error:
+            if FULL not in str(error) or not self._rolled_back():
+                # opened anew at the next try, and compared with what was committed
+                self.close()
+            if drive.made and (type(error) is sqlite3.DatabaseError or 'readonly' in str(error)):
+                raise GoneError(drive, one_line(error)) from error
+            raise
+        except BaseException:
+            self.close()
+            raise
+        return log_of(drive.path)
+
+    def look(self) -> None:
+        """Make sure that the open file and its log are there, and as long as they were.
+
+        Raises
+        ------
+        GoneError
+            If they are not.
+        OSError
+            If that cannot be told.
+        """
+        try:
+            self._look()
+        except GoneError:
+            self.close()
+            raise
+
+    def close(self) -> None:
+        """Let go of the file; SQLite then moves its log into it."""
+        database, files = self._database, self._files
+        self.drive, self._database, self._files = None, None, {}
+        if database is None:
+            return
+        for path, before in files.items():
+            with suppress(OSError):
+                if not os.path.samestat(before, path.stat()):
+                    # SQLite would delete the log by its name, whoever's it is now
+                    self._forsaken.append(database)
+                    return
+        with suppress(sqlite3.Error):
+            database.close()
+
+    def _open(self, drive: Drive) -> None:
+        if self._database is None or self.drive is not drive:
+            self.close()
+            if not drive.made:
+                self._make(drive)
+            if not drive.path.exists():
+                raise GoneError(drive, 'it was deleted or moved')
+            try:
+                self._connect(drive)
+            except BagError as error:
+                raise GoneError(drive, str(error)) from error
+            if self._next() < drive.next:
+                raise GoneError(drive, 'it holds less than was written to it')
+        assert self._database is not None
+        unbounded(self._database)
+
+    def _connect(self, drive: Drive) -> None:
+        self._size = extent(drive.path)
+        database = connect(drive.path, 'mode=rw', self._size)
+        try:
+            database.execute('PRAGMA synchronous=NORMAL')
+            check(database, drive.path)
+        except BaseException:
+            database.close()
+            raise
+        self._database, self.drive = database, drive
+        self._remember()
+
+    def _next(self) -> int:
+        """Return the number of the reading that comes after those in the file."""
+        assert self._database is not None
+        query = 'SELECT number, length(rows) FROM readings ORDER BY number DESC LIMIT 1'
+        number, size = self._database.execute(query).fetchone() or (0, 0)
+        return int(number) + int(size or 0) // ROW.itemsize
+
+    def _rolled_back(self) -> bool:
+        """Undo a transaction that failed; return whether the connection can go on."""
+        if self._database is None:
+            return False
+        with suppress(sqlite3.Error):
+            if self._database.in_transaction:
+                self._database.execute('ROLLBACK')
+            return True
+        return False
+
+    def _make(self, drive: Drive) -> None:
+        """Make the file of a drive under a hidden name, so that it is a journal from the moment that it has its own."""
+        self._lock.renew()
+        partial = [drive.path.with_name(PARTIAL + suffix) for suffix in ('', '-wal', '-journal')]
+        for path in partial:
+            path.unlink(missing_ok=True)
+        with closing(connect(partial[0], 'mode=rwc', 0)) as database:
+            database.execute('BEGIN IMMEDIATE')
+            for sql in TABLES.values():
+                database.execute(sql)
+            database.execute(f'PRAGMA application_id={APPLICATION}')
+            database.execute(f'PRAGMA user_version={VERSION}')
+            database.execute('COMMIT')
+            # kept in the file; all who open it later use a log
+            database.execute('PRAGMA journal_mode=WAL')
+        if any(path.exists() for path in partial[1:]):
+            raise OSError(errno.EIO, 'a new file could not be made whole')
+        while os.path.lexists(drive.path):
+            drive.path = following(drive.path)
+        partial[0].rename(drive.path)
+        drive.made = True
+
+    def _remember(self) -> None:
+        """Note what the open file and its log are, to know them again."""
+        assert self.drive is not None
+        path = self.drive.path
+        try:
+            self._files = {path: path.stat()}
+            with suppress(FileNotFoundError):
+                # there from the first transaction on
+                self._files[log_of(path)] = log_of(path).stat()
+        except FileNotFoundError:
+            raise GoneError(self.drive, f'{path.name} was deleted or moved') from None
+
+    def _look(self) -> None:
+        for path, before in self._files.items():
+            assert self.drive is not None
+            try:
+                now = path.stat()
+            except FileNotFoundError:
+                raise GoneError(self.drive, f'{path.name} was deleted or moved') from None
+            if not os.path.samestat(before, now):
+                raise GoneError(self.drive, f'{path.name} was replaced by another file')
+            if now.st_size < before.st_size:
+                raise GoneError(self.drive, f'{path.name} was cut off')

@@ -1,0 +1,367 @@
+"""Reads a journal file, whoever wrote it and whoever writes it at the moment.
+
+Nothing in the file is trusted: it must have the tables of a journal and no others, so that no view or trigger runs; the
+work and the length of each value are bounded by the size of the file; and what is read passes the checks of
+`journal_format`. What is damaged costs itself, or what comes after it.
+
+The node holds its file locked and keeps the latest readings in the log beside it (`-wal`). A reader therefore takes a
+copy of both, and reads that. It never writes into the journal's folder, and maps no file into memory, so that a file
+that is cut off meanwhile is an error and not a signal.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import sqlite3
+import stat
+import sys
+import tempfile
+from collections.abc import Iterator
+from contextlib import closing, contextmanager, suppress
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core.common.errors import BagError
+from ..core.common.readings import Readings
+from . import journal_previous
+from .journal_format import (
+    APPLICATION,
+    LONGEST,
+    ROW,
+    SQLITE,
+    TABLES,
+    VERSION,
+    Contents,
+    in_chunks,
+)
+
+APPLICATION_AT = 68
+"""Offset of the application id in the header of an SQLite database."""
+
+PAGES_AT = 28
+"""Offset of the count of pages in that header."""
+
+LOG_HEAD = 32
+"""Bytes of the header of the log. They change each time the log begins anew."""
+
+TRIES = 20
+"""Copies that are taken until one is whole; the log begins anew about once a minute."""
+
+MOST_ROWS = 1 << 40
+"""Numbers of rows: a reading a microsecond for twelve days."""
+
+STEPS = 10_000
+"""Steps of SQLite's virtual machine between two looks at how many there were."""
+
+LEAST_BYTES = 64 << 20
+"""Bytes of content that are granted to a file of any size."""
+
+MOST_PACKED = 64
+"""How many times more content than room on the disk a file may have: file systems compress, and files have holes."""
+
+LEAST_STEPS = 1_000_000
+"""Steps that are granted to a file of any size; a hundredth of a second."""
+
+STEPS_A_BYTE = 4
+"""Steps that are granted for each byte of the file: a row takes some 15, and has 10 bytes or more."""
+
+MOST_MEMORY = 256 << 20
+"""Bytes that SQLite may use where Python (3.10) cannot bound the length of a value; a hundred times what it needs."""
+
+
+def is_journal(path: Path) -> bool:
+    """Return whether a file is a journal, by its first bytes.
+
+    Raises
+    ------
+    OSError
+        If it cannot be read, or is no regular file.
+    """
+    head = _head(path, APPLICATION_AT + 4)
+    ours = head.startswith(SQLITE) and head[APPLICATION_AT:] == APPLICATION.to_bytes(4, 'big')
+    return ours or head.startswith(journal_previous.MAGIC)
+
+
+def log_of(path: Path) -> Path:
+    """Return the log beside a journal file, where SQLite keeps what was written last."""
+    return path.with_name(path.name + '-wal')
+
+
+def read(path: Path, contents: Contents) -> Iterator[Readings]:
+    """Yield the readings of a journal file, some ten thousand at a time; fills `contents` on the way.
+
+    Raises
+    ------
+    BagError
+        If the file cannot be read, or is no journal.
+    """
+    try:
+        if _head(path, len(journal_previous.MAGIC)) == journal_previous.MAGIC:
+            yield from journal_previous.read(path, contents)
+            return
+        with _for_reading(path) as (database, size):
+            check(database, path)
+            yield from readings(database, size, contents)
+    except OSError as error:
+        raise BagError(f'{path} cannot be read: {error.strerror or error}') from error
+    except (sqlite3.Error, MemoryError) as error:
+        raise BagError(f'{path} cannot be read: {one_line(error)}') from error
+
+
+def extent(path: Path) -> int:
+    """Return how many bytes a journal and its log may hold.
+
+    Raises
+    ------
+    OSError
+        If there is no such file, or one of them is no regular file: SQLite would wait for a pipe.
+    """
+    found = [path.stat()]
+    with suppress(FileNotFoundError):
+        found.append(log_of(path).stat())
+    if not all(stat.S_ISREG(status.st_mode) for status in found):
+        raise OSError(errno.EINVAL, 'it is not a regular file')
+    return sum(min(status.st_size, LEAST_BYTES + MOST_PACKED * 512 * status.st_blocks) for status in found)
+
+
+def connect(path: Path, options: str, size: int) -> sqlite3.Connection:
+    """Open a database that may hold anything; `size` bytes bound the work until `unbounded` is called."""
+    # a path of any bytes, which SQLite unquotes
+    name = f'file:{quote(os.fsencode(path.absolute()))}?{options}'
+    database = sqlite3.connect(name, uri=True, timeout=0.0, isolation_level=None, check_same_thread=False)
+    left = [LEAST_STEPS + STEPS_A_BYTE * size]
+
+    def step() -> bool:
+        left[0] -= STEPS
+        return left[0] < 0
+
+    try:
+        database.set_progress_handler(step, STEPS)
+        if sys.version_info >= (3, 11):
+            database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, LONGEST)
+        else:
+            database.execute(f'PRAGMA hard_heap_limit={MOST_MEMORY}')
+        # exclusive: without memory that is shared with others, who could cut it off
+        for pragma in (
+            *('mmap_size=0', 'trusted_schema=OFF', 'cell_size_check=ON', 'temp_store=MEMORY'),
+            'locking_mode=EXCLUSIVE',
+        ):
+            database.execute(f'PRAGMA {pragma}')
+    except BaseException:
+        database.close()
+        raise
+    return database
+
+
+def unbounded(database: sqlite3.Connection) -> None:
+    """Let a connection work without a bound, now that its file is known to be a journal."""
+    database.set_progress_handler(None, 0)
+
+
+def check(database: sqlite3.Connection, path: Path) -> None:
+    """Make sure that a database has the tables of a journal, and nothing else.
+
+    Raises
+    ------
+    BagError
+        If it is no journal, or one of another version.
+    sqlite3.Error
+        If it is damaged, or another program holds it.
+    """
+    application = database.execute('PRAGMA application_id').fetchone()[0]
+    version = database.execute('PRAGMA user_version').fetchone()[0]
+    if application != APPLICATION or version < 1:
+        raise BagError(f'{path} is not a journal')
+    if version != VERSION:
+        raise BagError(f'{path} was written by another version of this program (format {version}, not {VERSION})')
+    query = 'SELECT type, name, tbl_name, sql FROM sqlite_master LIMIT ?'
+    found = set(database.execute(query, (len(TABLES) + 1,)).fetchall())
+    if found != {('table', name, name, sql) for name, sql in TABLES.items()}:
+        raise BagError(f'{path} has other tables than a journal, and is not read')
+
+
+def readings(database: sqlite3.Connection, size: int, contents: Contents) -> Iterator[Readings]:
+    """Yield the readings of a database that passed `check`; fills `contents` on the way.
+
+    What cannot be read is noted in `contents`, and nothing after it is read.
+    """
+    table = _Table(database, size)
+    try:
+        for _, map_frame, base_frame, parameters in table.rows('drive', 'map_frame', 'base_frame', 'parameters'):
+            contents.set_frames(map_frame, base_frame)
+            contents.set_parameters(parameters)
+        for number, name in table.rows('sensors', 'name'):
+            contents.add_sensor(number, name)
+        for number, points in table.rows('path', 'points'):
+            contents.add_path(points)
+            contents.next_points = number + 1
+    except (sqlite3.Error, MemoryError, _DamagedError) as error:
+        contents.fault(f'what it holds besides readings cannot be read: {one_line(error)}')
+    yield from in_chunks(_blocks(table, contents), contents)
+
+
+def _blocks(table: _Table, contents: Contents) -> Iterator[NDArray[np.void]]:
+    try:
+        for number, data in table.rows('readings', 'rows'):
+            if number < contents.next:
+                raise _DamagedError('some of its readings would be there twice')
+            if not isinstance(data, bytes) or not data or len(data) % ROW.itemsize:
+                contents.fault('some of its blocks hold no readings')
+                contents.next = number + 1
+                continue
+            rows = np.frombuffer(data, ROW)
+            contents.next = number + len(rows)
+            yield rows
+    except (sqlite3.Error, MemoryError, _DamagedError) as error:
+        contents.fault(f'it cannot be read to its end: {one_line(error)}')
+
+
+class _DamagedError(Exception):
+    """What is in the database cannot have been written by a node."""
+
+
+class _Table:
+    """Reads tables of a database row by row, and no more bytes than the file has: in a damaged one, rows may share."""
+
+    def __init__(self, database: sqlite3.Connection, size: int) -> None:
+        self._database = database
+        self._left = size
+
+    def rows(self, table: str, *columns: str) -> Iterator[tuple[Any, ...]]:
+        """Yield the key of each row in ascending order, and its values; what is no value of a journal is None.
+
+        Raises
+        ------
+        sqlite3.Error, _DamagedError
+            If the table is damaged.
+        """
+        # typeof and length look at the head of a row only, so that a value of gigabytes is never loaded
+        values = ', '.join(f"CASE WHEN typeof({c})='blob' AND length({c})<={LONGEST} THEN {c} END" for c in columns)
+        last = -1
+        with closing(self._database.execute(f'SELECT number, {values} FROM {table} ORDER BY number')) as cursor:
+            for row in cursor:
+                # a tree whose branches share leaves would never end
+                if not last < row[0] < MOST_ROWS:
+                    raise _DamagedError('its rows are out of order')
+                last = row[0]
+                self._left -= sum(len(value) for value in row[1:] if value is not None)
+                if self._left < 0:
+                    raise _DamagedError('its rows hold more than the file has')
+                yield row
+
+
+def one_line(error: BaseException) -> str:
+    """Return what SQLite says, in words."""
+    text = ' '.join(str(error).split()) or type(error).__name__
+    return 'it is damaged: to read it takes more steps than it has bytes' if text == 'interrupted' else text
+
+
+@contextmanager
+def _for_reading(path: Path) -> Iterator[tuple[sqlite3.Connection, int]]:
+    """Open a journal without writing beside it; gives the connection and the bytes that the file has."""
+    log = log_of(path)
+    with tempfile.TemporaryDirectory(prefix='journal_') as folder:
+        for _ in range(TRIES):
+            head = _log_head(log)
+            cut = _pages_cut_off(path)
+            if not head and not cut:
+                before, size = path.stat(), extent(path)
+                with closing(connect(path, 'mode=ro&immutable=1', size)) as database:
+                    yield database, size
+                after = path.stat()
+                if (before.st_size, before.st_mtime_ns) != (after.st_size, after.st_mtime_ns):
+                    raise BagError(f'{path} was written while it was read; read it again')
+                return
+            copy = Path(folder) / 'copy'
+            size = _copy(path, copy) + (_copy(log, log_of(copy)) if head else 0)
+            if cut:
+                with copy.open('r+b') as file:
+                    # without a count, SQLite counts by itself
+                    file.seek(PAGES_AT)
+                    file.write(bytes(4))
+            # What SQLite moved from the log into the file meanwhile is in the copy of the log as well, unless the log
+            # began anew.
+            if head == _log_head(log) == _log_head(log_of(copy)):
+                with closing(connect(copy, 'mode=rw', size)) as database:
+                    yield database, size
+                return
+    raise BagError(f'{path} changes too fast to be read; stop the node that writes it')
+
+
+def _pages_cut_off(path: Path) -> bool:
+    """Return whether a database is shorter than its header says, which SQLite refuses to read."""
+    head = _head(path, PAGES_AT + 4).ljust(PAGES_AT + 4, b'\0')
+    size, pages = int.from_bytes(head[16:18], 'big'), int.from_bytes(head[PAGES_AT:], 'big')
+    # 1 stands for what 16 bits cannot hold
+    return path.stat().st_size < pages * (size if size > 1 else 1 << 16)
+
+
+@contextmanager
+def opened(path: Path) -> Iterator[int]:
+    """Open a regular file for reading and give its descriptor; a pipe is an error rather than waited for.
+
+    Raises
+    ------
+    OSError
+    """
+    file = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+    try:
+        if not stat.S_ISREG(os.fstat(file).st_mode):
+            raise OSError(errno.EINVAL, 'it is not a regular file')
+        yield file
+    finally:
+        os.close(file)
+
+
+def _head(path: Path, count: int) -> bytes:
+    with opened(path) as file:
+        return os.pread(file, count, 0)
+
+
+def _log_head(log: Path) -> bytes:
+    try:
+        return _head(log, LOG_HEAD)
+    except FileNotFoundError:
+        return b''
+
+
+def _copy(source: Path, target: Path) -> int:
+    """Copy a file without its holes; return how many bytes that took.
+
+    Raises
+    ------
+    BagError
+        If there is no room.
+    OSError
+    """
+    copied = at = 0
+    try:
+        with opened(source) as file, target.open('wb') as out:
+            end = os.fstat(file).st_size
+            out.truncate(end)
+            while at < end:
+                at = os.lseek(file, at, os.SEEK_DATA)
+                hole = os.lseek(file, at, os.SEEK_HOLE)
+                os.lseek(out.fileno(), at, os.SEEK_SET)
+                while at < hole:
+                    sent = os.sendfile(out.fileno(), file, at, hole - at)
+                    if not sent:
+                        # it was cut off meanwhile
+                        return copied
+                    at, copied = at + sent, copied + sent
+    except OSError as error:
+        if error.errno == errno.ENXIO:
+            # nothing but a hole is left
+            return copied
+        if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
+            raise BagError(
+                f'{source} is being written, and {target.parent.parent} has no room for the copy that is read; free '
+                f'some, or name another folder in TMPDIR'
+            ) from error
+        raise
+    return copied

@@ -1,0 +1,100 @@
+"""Journals of the previous format: damage costs what it hits, and sound checksums do not make sense of nonsense."""
+
+from __future__ import annotations
+
+import random
+import struct
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from journal_samples import FRAMES, Previous, made, numbers, rows
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return tmp_path / 'drive_0001.journal'
+
+
+def test_what_the_previous_version_wrote(path: Path) -> None:
+    path.write_bytes(Previous.file(200))
+    found, contents = numbers(path)
+    assert found == list(range(200))
+    assert (contents.map_frame, contents.base_frame) == FRAMES
+    assert contents.path == [(10.0 * k, 0.0) for k in range(20)]
+    assert contents.harm == ''
+    assert 'the previous version' in contents.note
+
+
+def test_an_end_that_is_torn_anywhere(path: Path) -> None:
+    whole = Previous.file(30)
+    last = 0
+    for length in (*range(8, len(whole), 29), len(whole)):
+        path.write_bytes(whole[:length])
+        found, contents = numbers(path)
+        assert found == list(range(len(found)))
+        assert len(found) % 10 == 0
+        assert len(found) >= last
+        assert bool(contents.harm) == ('cut off' in contents.harm)
+        last = len(found)
+    assert last == 30
+    assert contents.harm == ''
+
+
+def test_a_flipped_bit_costs_one_block(path: Path) -> None:
+    whole = Previous.file(200)
+    rng = random.Random(1)
+    for _ in range(200):
+        damaged = bytearray(whole)
+        damaged[rng.randrange(8, len(damaged))] ^= 1 << rng.randrange(8)
+        path.write_bytes(damaged)
+        found, contents = numbers(path)
+        assert len(found) >= 190
+        assert set(found) <= set(range(200))
+        assert contents.harm
+
+
+@pytest.mark.parametrize(
+    ('block', 'said'),
+    [
+        (Previous.block(1, b'{'), 'frames of the drive'),
+        (Previous.block(1, b'\xff'), 'frames of the drive'),
+        (Previous.block(1, b'[' * 100_000), 'frames of the drive'),
+        (Previous.frames([]), 'frames of the drive'),
+        (Previous.frames({}), 'frames of the drive'),
+        (Previous.frames({'map_frame': 1, 'base_frame': None}), 'frames of the drive'),
+        (Previous.frames({'map_frame': 'm' * 2000, 'base_frame': 'b'}), 'frames of the drive'),
+        (Previous.block(2, b'abc'), 'none of a journal'),
+        (Previous.block(2, struct.pack('<I', 5) + b'\xff\xff'), 'name of a sensor'),
+        (Previous.name(5, 'n' * 2000), 'name of a sensor'),
+        (Previous.block(3, b'abc'), 'none of a journal'),
+        (Previous.block(4, b'abc'), 'points of the path'),
+        (Previous.path([(float('nan'), 0.0)]), 'points of the path'),
+        (Previous.path([(1e300, 0.0)]), 'points of the path'),
+        (Previous.block(9, b''), 'none of a journal'),
+        (Previous.block(0, bytes(68)), 'none of a journal'),
+    ],
+)
+def test_sound_checksums_with_bad_content_are_told_in_words(path: Path, block: bytes, said: str) -> None:
+    whole = Previous.file(20)
+    path.write_bytes(whole + block + Previous.readings(rows(made(20, 10))))
+    found, contents = numbers(path)
+    assert found == list(range(30))
+    assert said in contents.harm
+    assert (contents.map_frame, contents.base_frame) == FRAMES
+    assert np.isfinite(contents.path).all()
+
+
+def test_what_costs_time_is_given_up(path: Path) -> None:
+    """Heads that each claim 64 MB, close together, and a hole of a terabyte."""
+    heads = struct.pack('<4sBxxxII', b'\xf5FGM', 3, 1 << 26, 0) * 100_000
+    for tail in (heads, bytes(1 << 20)):
+        path.write_bytes(Previous.file(20) + tail)
+        with path.open('r+b') as file:
+            file.truncate(path.stat().st_size if tail is heads else 1 << 40)
+        begin = time.monotonic()
+        found, contents = numbers(path)
+        assert time.monotonic() - begin < 30.0
+        assert found == list(range(20))
+        assert 'cut off or damaged' in contents.harm
