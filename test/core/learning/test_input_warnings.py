@@ -16,7 +16,7 @@ from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.learning.input_warnings import input_warnings
 from forward_grid_mapper.core.messages.message_types import OdometryMessage, Pose2, RangeMessage
 from forward_grid_mapper.core.messages.pose_association import PoseAssociator
-from forward_grid_mapper.simulation.drive import corridor_drive, door_drive
+from forward_grid_mapper.simulation.drive import building_drive, corridor_drive, door_drive
 from forward_grid_mapper.simulation.sonar import NOISE_FREE, NOISY, SonarArray, front_array, sonar_ring
 
 
@@ -162,6 +162,7 @@ def test_no_alarm_in_the_simulated_worlds(noise: object, sonars: Callable[[], So
         for recording in (
             *(door_drive(seen, noise, seed, sonars()) for seen in (1, 3, 16)),
             corridor_drive(seed, 1 + seed % 2, noise, noise is NOISY, sonars()),
+            *([building_drive(seed, 1, noise, noise is NOISY, sonars())] if not seed else []),
         ):
             assert told(Messages(dict(recording.extrinsics), recording.odometry, recording.ranges)) == []
 
