@@ -135,7 +135,7 @@ def _open_each(files: list[Path], compression: str) -> tuple[list[Source], list[
 
 
 def _open_single(file: Path) -> Source:
-    # only the folder's metadata tell how its files, or the messages in them, are compressed
+    # only the folder's metadata say how its files, or the messages in them, are compressed
     metadata = _read_metadata(file.parent)
     listed = metadata is not None and file.name in metadata.files
     return _open_listed(file, metadata.compression if metadata is not None and listed else '')

@@ -1,6 +1,6 @@
 """Learning of the model together with the map: rounds of map search and updates, and warnings about what came out.
 
-Each round makes the map of the values so far and updates them, on that map, until they stay. The next round's map tells
+Each round makes the map of the values so far and updates them, on that map, until they stay. The next round's map shows
 whether the new values are any good: where it has lost walls that the first map showed, they are refused, and learning
 ends with those of the round before.
 """
@@ -164,7 +164,7 @@ def learn_jointly(
     keep_going : bool
         Accept values although their map loses walls.
     watch : callable
-        Hears of stages and progress, as in `Mapper.run`.
+        Receives stages and progress, as in `Mapper.run`.
 
     Raises
     ------
@@ -223,7 +223,7 @@ def _round(first: MapSet, maps: MapSet, before: MapSet | None) -> Round:
 
 def _quality_warnings(rounds: list[Round], accepted: int, converged: bool) -> list[str]:
     """Say what speaks against the way that learning took."""
-    told = []
+    warnings = []
     start, last = rounds[0], rounds[-1]
     if last.lost:
         longest = last.lost[0]
@@ -240,7 +240,7 @@ def _quality_warnings(rounds: list[Round], accepted: int, converged: bool) -> li
             kept = f'those of round {accepted} are kept'
         else:
             kept = 'the values from the start are kept, and nothing was learned'
-        told.append(
+        warnings.append(
             f'round {len(rounds) - 1} loses walls: {climbed}{last.lost_length:.1f} m of wall in '
             f'{len(last.lost)} stretches that the first map shows are gone, the longest from ({x0:.1f}, {y0:.1f}) to '
             f'({x1:.1f}, {y1:.1f}); {echoes} of their echoes count as random measurements now, and of all echoes '
@@ -250,26 +250,26 @@ def _quality_warnings(rounds: list[Round], accepted: int, converged: bool) -> li
     for number, this in enumerate(rounds):
         drop = this.log_likelihood_before - this.log_likelihood
         if drop > LIKELIHOOD_DROP * this.readings:
-            told.append(
+            warnings.append(
                 f'round {number}: the search ended in a map that is {drop:.0f} nats less likely than the one before, '
                 f'at the same values; it went into another basin'
             )
     if accepted and not converged and accepted == len(rounds) - 1:
-        told.append(f'the values had not come to rest after {accepted} rounds; try more with --rounds')
-    return told
+        warnings.append(f'the values had not come to rest after {accepted} rounds; try more with --rounds')
+    return warnings
 
 
 def _weak(found: dict[str, Estimate], model: ModelParameters) -> list[str]:
     """Say which values are not worth much."""
-    told = []
+    warnings = []
     for name, estimate in found.items():
         if estimate.bound and not (name == 'p_lost' and model.p_lost == 0):
-            told.append(f'{name} = {estimate.value:.3g} has no standard error: {estimate.bound}')
+            warnings.append(f'{name} = {estimate.value:.3g} has no standard error: {estimate.bound}')
         if estimate.readings < FEW_READINGS and not (name == 'p_lost' and model.p_lost == 0):
-            told.append(f'only {estimate.readings:.0f} readings inform {name}; take it as a guess')
+            warnings.append(f'only {estimate.readings:.0f} readings inform {name}; take it as a guess')
     if found and model.p_rand > MUCH_CHANCE:
-        told.append(
+        warnings.append(
             f'p_rand = {model.p_rand:.2f} is more than a sonar makes up by itself: look for a broken sensor, a wrong '
             f'sensor pose, odometry that drifts, or people about the robot'
         )
-    return told
+    return warnings

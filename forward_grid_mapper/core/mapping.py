@@ -1,4 +1,4 @@
-"""From placed readings to the three maps: the one function that the offline tool and the node call."""
+"""From readings in the map frame to the three maps: the one function that the offline tool and the node call."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def _stage(name: str) -> Callable[[Callable[Concatenate[Mapper, P], R]], Callabl
 
 @dataclass(frozen=True)
 class _Given:
-    """What the stages of a run share, made once.
+    """What all stages of a run need, made once.
 
     Attributes
     ----------

@@ -36,10 +36,10 @@ from .search.search import LEAST, Search
 from .sensor.cone_table import effective_sigma, grid_of
 
 SAME_PLACE = 0.5
-"""Cells, and share of the half angle, by which poses may differ."""
+"""Cells, and fraction of the half angle, by which poses may differ."""
 
 SAME_RANGE = 0.5
-"""Share of σ by which ranges may differ."""
+"""Fraction of σ by which ranges may differ."""
 
 MARGIN = 64
 """Cells by which the grid outgrows what is needed, and a quarter of its size more."""
@@ -51,7 +51,7 @@ REFINE_EVERY = 1000
 """Readings after which the map is refined, at most."""
 
 REFINE_SHARE = 0.05
-"""Of the readings kept, how many may come until the map is refined: while they are few, each tells much of surface
+"""Of the readings kept, how many may come until the map is refined: while they are few, each says much about surface
 normals, and it takes little time."""
 
 REFINE_LEAST = 50
@@ -62,7 +62,7 @@ MANY = 5000
 
 
 class _Traversed(NamedTuple):
-    """What new readings tell of the cells that the robot drove over: some of the grid."""
+    """What new readings say about the cells that the robot traversed: some of the grid."""
 
     near: tuple[slice, slice]
     cells: NDArray[np.bool_]
@@ -99,10 +99,10 @@ class OnlineMap:
         return self._count
 
     def add(self, readings: Readings) -> None:
-        """Add placed readings and bring the map up to date.
+        """Add readings and bring the map up to date.
 
-        The readings are taken all or not at all; `taken` tells. In either case the map can go on: what an error leaves
-        undone of the search is done after the next call.
+        The readings are taken all or not at all; `taken` says which. In either case the map can go on: what an error
+        leaves undone of the search is done after the next call.
 
         Raises
         ------
@@ -152,7 +152,7 @@ class OnlineMap:
             raise
 
     def _keys(self, readings: Readings) -> Iterable[tuple[float, ...]]:
-        """Return a key for each reading, which it shares with those that say the same."""
+        """Return a key for each reading, the same for those that say the same."""
         p = self._parameters
         sigma = effective_sigma(readings, p.model, p.grid.resolution)
         place = SAME_PLACE * p.grid.resolution

@@ -20,7 +20,7 @@ NEIGHBOURHOOD = 0.3
 what one wall returns, and hardly anything of the next one."""
 
 WEIGHT_CELL = 0.1
-"""Edge in metres of the cells in which `LEAST_WEIGHT` counts. Smaller cells share what one such cell receives."""
+"""Edge in metres of the cells in which `LEAST_WEIGHT` counts. Smaller cells divide what one such cell receives."""
 
 LEAST_WEIGHT = 3.0
 """Echoes, summed over the cells of `WEIGHT_CELL` in the square, that it takes to know a normal. One echo gives about

@@ -30,7 +30,7 @@ from .tile_index import SHIFT, insert, more_chunks, no_tiles
 from .updates import add_multiplicity, evaluate_all, forget
 
 NO_INCIDENCE_LIMIT = 1.5707
-"""Radians off the normal from where on no reading exceeds_incidence_angle."""
+"""Radians off the normal from where on no reading exceeds the incidence angle."""
 
 FREE, BAND, LARGEST, WORDS, UNSTORED, UNUSED = range(6)
 """Of the totals: pairs in free zones and in bands, cells of the largest cone, words given to readings, readings not
@@ -289,7 +289,7 @@ class Evidence:
         self._reserve(end)
         s = self.state
         s.cones[begin:end], s.reading_states[begin:end] = cones, reading_states
-        # what the first ones tell of normals is known before their pairs are made
+        # what the first ones say about normals is known before their pairs are made
         later = s.cones[begin:end] if begin else s.cones[:0], s.cones[again]
         since = united(self._since, *(box_of(cones, self.grid) for cones in later))
         before = self._index_so_far()
@@ -456,8 +456,8 @@ class Evidence:
         except MemoryError:
             # fewer threads come to the same
             pass
-        shares = zip(own, parts(begin, end, len(own)), strict=True)
-        run_each([partial(work, s, first, last, array) for (s, array), (first, last) in shares])
+        portions = zip(own, parts(begin, end, len(own)), strict=True)
+        run_each([partial(work, s, first, last, array) for (s, array), (first, last) in portions])
         check(self.state.stop)
         for _, array in own[1:]:
             np.add(total, array, out=total)
@@ -515,7 +515,7 @@ class Evidence:
         self.state = self.state._replace(normals=normals)
 
     def _keep_bearings(self, cones: NDArray[np.void]) -> None:
-        """Add what readings tell of surface normals, in a way that cannot fail: on one thread, heedless of `stop`."""
+        """Add what readings say about surface normals, in a way that cannot fail: on one thread, heedless of `stop`."""
         gather(cones, self.grid.shape, (0, len(cones)), self._sums, NEVER)
 
     def _reserve(self, size: int) -> None:

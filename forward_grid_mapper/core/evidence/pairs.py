@@ -39,7 +39,7 @@ class Lattice(NamedTuple):
 
 
 class Pairs(NamedTuple):
-    """The pairs of readings, one array of words under three names; where those of a reading begin, its `Share` says.
+    """The pairs of readings, one array of words under three names; `READING_STATE` says where those of a reading begin.
 
     A reading with r runs and m band pairs has 2 r words for the first and last cells of its runs, each in one row and
     ascending; then, from near to far, m cells, m densities N(z; d, σ) in 1/m, and m logs of the likelihood ratio of

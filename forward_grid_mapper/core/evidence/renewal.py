@@ -1,6 +1,6 @@
 """Renewal of surface normals: the readings whose pairs it changes, and their pairs made anew.
 
-A pair is left out where the reading exceeds the incidence angle of the cell. When more readings tell more of the
+A pair is left out where the reading exceeds the incidence angle of the cell. When more readings say more about the
 normals, some pairs come and some go. What a reading said so far is taken off the evidence, exactly, since all of it is
 whole numbers; then its pairs are made with the new normals, and what it says now is added.
 """
@@ -56,7 +56,7 @@ def _mark_cells(old: SurfaceNormals, new: SurfaceNormals, window: Window, width:
 
 @kernel
 def _changes(s: State, new: SurfaceNormals, t: int, window: Window, differ: Any) -> bool:
-    """Tell whether reading t exceeds the incidence angle at other cells than before; it looks at those of `differ`."""
+    """Return whether reading t exceeds the incidence angle at other cells than before, of those in `differ`."""
     reading = s.cones[t]
     cone = cone_of(reading)
     bottom, top = rows_of(cone, s.lattice.height)

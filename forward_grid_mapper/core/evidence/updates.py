@@ -33,7 +33,7 @@ from .state import Maps, Model, State
 from .tile_index import CHUNK, SHIFT
 
 EDGE = 1e-6
-"""Cells; nearer to a cone's edge than this, it takes the cone's own arithmetic to tell which side a cell is on."""
+"""Cells; nearer to a cone's edge than this, only the cone's own arithmetic decides which side a cell is on."""
 
 LEAST_RATIO = 1e-30
 """What rounding must leave of a likelihood ratio."""

@@ -26,10 +26,10 @@ AT_ONCE = 0.3
 """Part of a sensor's readings that share their stamp with another one of a different range."""
 
 SHARED = 100
-"""Readings of one frame from which on its ranges are searched for a period; in few there is one by chance."""
+"""Readings of one frame from which on its ranges are searched for a period; few may have one at random."""
 
 LONGEST_PERIOD = 32
-"""Sensors that may share one frame; more than any ring of sonars has."""
+"""Sensors that may have one frame; more than any ring of sonars has."""
 
 REPEATS = 0.25
 """A range and the one a whole round of sensors earlier differ by at most this part of what neighbours differ by: at
@@ -77,7 +77,7 @@ ECHOES = 200
 
 
 def input_warnings(readings: Readings) -> list[str]:
-    """Return what is wrong with readings that could be placed; empty if nothing seems to be."""
+    """Return what is wrong with readings that have a pose; empty if nothing seems to be."""
     if len(readings) < ENOUGH:
         return []
     by_time = readings.select(np.argsort(readings.stamp, kind='stable'))

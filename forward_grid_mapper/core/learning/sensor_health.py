@@ -1,6 +1,6 @@
 """The health of each sensor: what its readings are worth, and which sensor stands out from the others.
 
-Shares of a sensor's readings, given the ML map:
+Fractions of a sensor's readings, given the ML map:
 
     random    a random measurement is the likeliest cause (e_* above one half)
     no echo   max-range readings
@@ -8,12 +8,12 @@ Shares of a sensor's readings, given the ML map:
     short     a random echo, nearer than half the way to the first obstacle of the cone, or to max range if none
     same      echoes within the commonest 0.2 m of range, whatever the map
 
-A sensor that hears its own robot repeats itself, and the map may even believe it. So where a sensor repeats a range of
-less than half of what is usual among the others, a live map of the others is asked as well: an echo from where they
+A sensor whose echo is its own robot repeats itself, and the map may even believe it. So where a sensor repeats a range
+of less than half of what is usual among the others, a live map of the others is asked as well: an echo from where they
 see free space is short, too.
 
-A share is held against those of the other sensors, since in a hall of smooth walls all are silent, and in a crowd all
-are random. It is suspect if it is large by itself *and* well above the median of the others.
+A fraction is compared with those of the other sensors, since in a hall of smooth walls all are silent, and in a crowd
+all are random. It is suspect if it is large by itself *and* well above the median of the others.
 """
 
 from __future__ import annotations
@@ -41,22 +41,22 @@ FEW = 30
 FEW_SHARE = 0.1
 """Nor are fewer than this part of the median of the others."""
 SILENT, DEAF = 0.95, 0.2
-"""A sensor that hears nothing has at least the first share of no echo, and the second of missed obstacles."""
+"""A sensor without echoes has at least the first fraction of max-range readings, and the second of missed obstacles."""
 SHORT = 0.5
 RANDOM = 0.5
 SAME, WINDOW = 0.8, 0.2
-"""A sensor that repeats itself has at least this share of its readings in a window of so many metres."""
+"""A sensor that repeats itself has at least this fraction of its readings in a window of so many metres."""
 CLOSE = 0.7
 """If so large a part of the random readings is short, but not always the same, somebody walks there."""
 ABOVE = 0.25
-"""A suspect share exceeds the median of the others by at least so much."""
+"""A suspect fraction exceeds the median of the others by at least so much."""
 FREE = 0.35
 """The live map of the others is free below this probability."""
 
 
 @dataclass(frozen=True)
 class SensorHealth:
-    """One row of the table; shares lie in [0, 1] and are NaN without readings.
+    """One row of the table; fractions lie in [0, 1] and are NaN without readings.
 
     `common` is the middle of the commonest 0.2 m of range, metres. `verdict` is 'ok', 'few readings', 'something moves
     near it', 'never hears anything', 'always short' or 'mostly random'.

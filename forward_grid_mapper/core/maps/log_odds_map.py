@@ -116,7 +116,7 @@ class LogOddsMap:
         self._log_odds: Floats = np.zeros((0, 0))
 
     def add(self, readings: Readings) -> None:
-        """Add placed readings; `grid` grows to hold every cell that they touch.
+        """Add readings; `grid` grows to hold every cell that they touch.
 
         Raises
         ------

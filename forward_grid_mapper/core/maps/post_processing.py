@@ -1,16 +1,16 @@
-"""From the map that the search found to the one that is handed out: walls drawn out, and free told from unknown.
+"""From the map that the search found to the one that is handed out: walls are extended, and unknown cells marked.
 
 The search says of a cell that it is free where nothing makes it occupied. Whether anything went through it is another
-question. Given the map, each reading tells how likely it passed a cell on its way to whatever explains it: for a cell
-at distance d, with A the part of T from occupied cells up to d,
+question. Given the map, each reading says how likely it passed a cell on its way to its cause. For a cell at distance
+d, with A the part of T from occupied cells up to d,
 
     p(passed) = (T − A) / (c + T)
 
-and in the free zone T / (c + T), plus that of chance for an echo: something that the map lacks may have been there.
-Chance counts (1 − p_hit) for each obstacle that it had to get by in the free zone. Here c holds p_lost · N(z; z_max, σ)
-of every reading, so that an echo from nearly z_max frees little more than no echo. A reading counts by the strength of
-its beam at the cell, since what stands at the edge of a cone is easily missed. A cell through which less than about
-one reading passed is not known to be free.
+In the free zone it is T / (c + T). For an echo the probability of a random measurement is added, since something that
+the map lacks may have been there; it counts (1 − p_hit) for each obstacle that it had to pass in the free zone. Here c
+holds p_lost · N(z; z_max, σ) of every reading, so that an echo from nearly z_max frees little more than no echo. A
+reading counts by the strength of its beam at the cell, since what stands at the edge of a cone is easily missed. A cell
+through which less than about one reading passed is not known to be free.
 
 Passing is a count of readings, not of nats, so the likelihood exponent has no part in it. It depends on p_rand and
 p_lost: of readings without echo, (1 − p_rand − p_lost) / (1 − p_rand) count where nothing stood in the way.

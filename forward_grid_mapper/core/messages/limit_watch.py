@@ -1,4 +1,4 @@
-"""What Range messages say of themselves before they are placed: ranges against the limits that come with them.
+"""What Range messages say of themselves before they have a pose: ranges against the limits that come with them.
 
 A range in centimetres beside a max_range in metres is 'no echo' by REP 117, and one below a min_range in centimetres is
 rejected: neither is an error, and both give a wrong map. So the values are looked at as they come.
@@ -64,7 +64,7 @@ class LimitWatch:
         finite = [m for m in self._samples if math.isfinite(m.range) and m.range > 0 and 0 < m.max_range < math.inf]
         if len(finite) < ENOUGH:
             return []
-        # one cause has several symptoms; the first that is told is enough
+        # one cause has several symptoms; the first that is reported is enough
         first = next((text for check in (_beyond, _far, _below) if (text := check(finite))), '')
         return [first] if first else []
 

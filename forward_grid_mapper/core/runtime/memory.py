@@ -45,7 +45,7 @@ def memory_for_pairs(parameters: Parameters) -> float:
 def free_memory() -> int | None:
     """Return the bytes that this process can still take: of the machine, its control group, and its own limit.
 
-    None where none of them is told.
+    None where none of them is known.
     """
     known = [value for value in (_of_the_machine(), _of_the_group(), _of_the_process()) if value is not None]
     return max(min(known), 0) if known else None

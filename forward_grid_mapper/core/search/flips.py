@@ -23,7 +23,7 @@ def gain_of(s: State, prior: Prior, c: int) -> float:
 
 
 WORTH_WAITING = 0.5
-"""Share of the gain it had when the sweep began that a cell must still have to be flipped in the same sweep."""
+"""Fraction of the gain it had when the sweep began that a cell must still have to be flipped in the same sweep."""
 
 
 Least = tuple[float, float]
@@ -64,7 +64,7 @@ def promising(s: State, prior: Prior, least: Least, window: tuple[int, int, int,
 
 @allocating_kernel
 def highest(s: State, cells: NDArray[np.int64], gains: Floats, workspace: Floats) -> NDArray[np.bool_]:
-    """Tell which of `cells` gain more than those of their eight neighbours that gain as well; of equals, the first.
+    """Return which of `cells` gain more than those of their eight neighbours that gain as well; of equals, the first.
 
     `workspace` (float64, shape (cells of the map,)) must be 0, and is left so.
     """

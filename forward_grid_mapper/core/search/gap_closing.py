@@ -37,7 +37,7 @@ from .prior import Prior
 
 @kernel
 def _leaves(pattern: int, dx: int, dy: int) -> bool:
-    """Tell whether direction (dx, dy) leads away from the neighbours of a pattern."""
+    """Return whether direction (dx, dy) leads away from the neighbours of a pattern."""
     x, y = 0.0, 0.0
     for k in range(NEIGHBOURS):
         if pattern >> k & 1:
@@ -50,7 +50,7 @@ def _leaves(pattern: int, dx: int, dy: int) -> bool:
 
 @kernel
 def _may_close(s: State, prior: Prior, c: int, dx: int, dy: int) -> bool:
-    """Tell whether cell c and the one at (dx, dy) from it are ends of walls that lead to each other."""
+    """Return whether cell c and the one at (dx, dy) from it are ends of walls that lead to each other."""
     occupied, pattern = s.maps.occupied, s.maps.pattern
     height, width = s.lattice.height, s.lattice.width
     row, column = c // width + dy, c % width + dx
@@ -64,7 +64,7 @@ def _may_close(s: State, prior: Prior, c: int, dx: int, dy: int) -> bool:
 
 @kernel
 def _path(s: State, c: int, dx: int, dy: int, up: bool, path: Any) -> bool:
-    """Write the cells between c and the cell at (dx, dy) from it; tell whether a wall may stand on them.
+    """Write the cells between c and the cell at (dx, dy) from it; return whether a wall may stand on them.
 
     Where the line passes midway between two cells, `up` takes the one of the larger row and column.
     """
@@ -89,7 +89,7 @@ def _path(s: State, c: int, dx: int, dy: int, up: bool, path: Any) -> bool:
 
 @kernel
 def _midway(dx: int, dy: int) -> bool:
-    """Tell whether the line to (dx, dy) passes midway between two cells anywhere."""
+    """Return whether the line to (dx, dy) passes midway between two cells anywhere."""
     n = max(abs(dx), abs(dy))
     across = min(abs(dx), abs(dy))
     halves = 0

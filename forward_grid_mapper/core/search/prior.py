@@ -46,7 +46,7 @@ class Prior(NamedTuple):
 
 
 def has_walls(parameters: SearchParameters) -> bool:
-    """Tell whether there is a prior of walls; without one, cells are independent, as in the paper."""
+    """Return whether there is a prior of walls; without one, cells are independent, as in the paper."""
     return parameters.end_cost > 0
 
 

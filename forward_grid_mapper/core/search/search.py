@@ -18,7 +18,7 @@ of walls (`prior`). The second part also closes gaps in walls, and removes short
 
 never falls. γ is the likelihood exponent: readings are not independent of each other, so together they say less than
 their sum (a tempered likelihood). At no time are traversed cells occupied. At the end no single flip raises J by more
-than `LEAST_GAIN` and the cell's share of `ROUNDING`.
+than `LEAST_GAIN` and `ROUNDING` for each of the cell's readings.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ FEW = 32
 
 
 LITTLE = 0.005
-"""Share of all that was gained which a round must add for another one to follow."""
+"""Fraction of all gain so far that a parallel update must add for another one to follow."""
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
 Sound that meets a smooth surface at a slant does not come back. So a reading that reaches past a surface contradicts it
 only if it met the surface nearly along its normal. Most of what speaks against walls that are there, in recordings
-of real sonars, comes from readings that graze them.
+of real sonars, comes from readings that exceed the incidence angle.
 
 The normal is estimated before any search, from the echoes alone. Near a surface the bearings of those readings whose
 range agrees gather around its normal; φ and φ + π are one, so 2φ is averaged, over the square of `NEIGHBOURHOOD`
@@ -45,7 +45,7 @@ class SurfaceNormals(NamedTuple):
     before : int32, shape (height, width + 1)
         Number of known cells in each row before a column.
     cos2_limit : float
-        Squared cosine of the angle off the normal above which a reading exceeds_incidence_angle; 0 if none does.
+        Squared cosine of the angle off the normal above which a reading exceeds the incidence angle; 0 if none does.
     """
 
     known: NDArray[np.uint8]
@@ -73,7 +73,7 @@ def on_larger_grid(normals: SurfaceNormals, inner: Grid, outer: Grid) -> Surface
 
 
 def no_normals() -> SurfaceNormals:
-    """Return that no reading exceeds_incidence_angle."""
+    """Return normals at which no reading exceeds the incidence angle."""
     none = np.zeros(0, np.float32)
     return SurfaceNormals(np.zeros(0, np.uint8), none, none, np.zeros((1, 1), np.int32), 0.0)
 
@@ -154,9 +154,13 @@ def _estimate(normals: SurfaceNormals, sums: NDArray[np.int64], grid: Grid, wind
         part = first, min(first + step, top), left, right
         cells = slice(*part[:2]), slice(*part[2:])
         cosine, sine, mass = (_box(values.reshape(shape), grid.resolution, part) for values in sums)
-        told = (mass >= LEAST_WEIGHT) & (np.hypot(cosine, sine) >= LEAST_AGREEMENT * mass)
+        clear = (mass >= LEAST_WEIGHT) & (np.hypot(cosine, sine) >= LEAST_AGREEMENT * mass)
         angle = np.arctan2(sine, cosine) / 2
-        known[cells], x[cells], y[cells] = told, np.where(told, np.cos(angle), 0.0), np.where(told, np.sin(angle), 0.0)
+        known[cells], x[cells], y[cells] = (
+            clear,
+            np.where(clear, np.cos(angle), 0.0),
+            np.where(clear, np.sin(angle), 0.0),
+        )
     np.cumsum(known[bottom:top], axis=1, dtype=np.int32, out=normals.before[bottom:top, 1:])
 
 
@@ -208,7 +212,7 @@ def touched(window: Window, grid: Grid) -> Window:
 
 @kernel
 def exceeds_incidence_angle(normals: SurfaceNormals, reading: Any, c: int, u: float, v: float) -> bool:
-    """Tell whether a reading meets cell c, at (u, v) from its apex, beyond the incidence angle, and goes on."""
+    """Return whether a reading meets cell c, at (u, v) from its apex, beyond the incidence angle, and goes on."""
     if not normals.known[c]:
         return False
     square = u * u + v * v
