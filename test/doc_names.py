@@ -211,7 +211,8 @@ def command_line(text: str, page: Path) -> str:
             return f'{name} is neither topic nor service'
     ours = 'forward_grid_mapper' in text or 'ros2 run' not in text
     for name in re.findall(r'(?:-p|--set) (\w+):?=', text) if ours else ():
-        if name not in PARAMETERS:
+        # NAME stands for any
+        if name not in PARAMETERS and name != 'NAME':
             return f'{name} is no parameter'
     words = text.split('#', maxsplit=1)[0].split()
     for k, word in enumerate(words):

@@ -26,6 +26,10 @@ ALLOWED = {
     'ml_map.pgm': 'a name of a map and an ending',
     'maps_DATE_TIME/': 'a folder that the node makes',
     'drive_NNNN.journal': 'a file that the node makes',
+    'drive_NNNN.journal-wal': 'a file that SQLite makes',
+    '-wal': 'the ending of that file',
+    'synchronous=NORMAL': 'a setting of SQLite',
+    'TMPDIR': 'an environment variable of POSIX',
 }
 """Words in code spans that name nothing in the repository, and why they may stand there."""
 

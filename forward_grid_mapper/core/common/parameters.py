@@ -70,7 +70,8 @@ class AssociationParameters:
     max_range: float = _param(0.0, "Largest range used instead of the messages'; 0 takes theirs.", 'm', 0.0, 1000.0)
     max_jump: float = _param(
         1000.0,
-        'A reading farther than this from all that was mapped before is rejected, lest a wild pose make the map huge.',
+        'A reading farther than this from all that was mapped before is rejected, so that no wild pose makes the map '
+        'huge.',
         'm',
         1.0,
         1e7,
@@ -119,7 +120,7 @@ class ModelParameters:
     p_rand: float = _param(0.4, 'Probability that a reading is random, whatever the map.', 'probability', 1e-4, 0.95)
     p_lost: float = _param(
         0.42,
-        "Probability that no echo is heard, whatever the map, as off smooth walls; 0 is the paper's model.",
+        "Probability that the echo is lost, whatever the map, as off smooth walls; 0 is the paper's model.",
         'probability',
         0.0,
         0.95,
@@ -141,7 +142,8 @@ class ModelParameters:
     )
     grazing_angle: float = _param(
         0.7,
-        'A reading that meets a surface this far off its normal does not contradict it; pi/2 has none of that.',
+        'Incidence angle off the normal of a surface, from which on readings do not contradict the surface; with pi/2 '
+        'all do.',
         'rad',
         0.1,
         1.5708,
@@ -157,7 +159,7 @@ class ModelParameters:
     def __post_init__(self) -> None:
         if self.p_rand + self.p_lost > 0.99:
             raise ParameterError(
-                f'p_rand = {self.p_rand:g} and p_lost = {self.p_lost:g} leave nothing for the map to evaluate; '
+                f'p_rand = {self.p_rand:g} and p_lost = {self.p_lost:g} leave nothing for the map to account for; '
                 f'their sum must not exceed 0.99'
             )
 
@@ -205,8 +207,8 @@ class SearchParameters:
     )
     alpha: float = _param(
         1.0,
-        'Weight of the evidence in the uncertainty map (eq 45). It, neighbour_weight and uncertainty_prior are the '
-        'coefficients of a logistic calibration, fitted to simulated worlds.',
+        'Weight of the evidence in the uncertainty map, (45) of the paper. It, neighbour_weight and uncertainty_prior '
+        'are the coefficients of a logistic calibration, fitted to simulated worlds.',
         '',
         0.0,
         1.0,
@@ -231,7 +233,7 @@ class SearchParameters:
 
 @dataclass(frozen=True)
 class LiveMapParameters:
-    """The standard log-odds map (eq 1-4), updated reading by reading."""
+    """The standard log-odds map ((3), (4), (14)-(16) of the paper), updated reading by reading."""
 
     live_p_occupied: float = _param(
         0.8,

@@ -27,9 +27,9 @@ class MapSet:
     ml : int8
         Maximum likelihood map: 0 free, 1 occupied, -1 not observed.
     uncertainty : float32
-        The α-mixed marginals of eq 45; NaN where `ml` is unknown and the readings say next to nothing.
+        The α-mixed marginals, (45) of the paper; NaN where `ml` is unknown and the readings say next to nothing.
     readings : Readings
-        The readings that the maps evaluate.
+        The readings that the maps were made from.
     unexplained : bool, shape (N,)
         Readings whose most likely cause, given `ml`, is a random measurement (e_* above one half).
     log_likelihood : float
@@ -41,7 +41,7 @@ class MapSet:
         The map that the search found, with the values of `ml`: what another search may start from. `ml` is made of it,
         with walls drawn out and with free cells where readings passed.
     dynamic : float32
-        Echoes that `ml` does not explain and that end in free space: people, say (`dynamic`).
+        Echoes from nothing on `ml` that end in free space: people, say (`dynamic`).
     normals : SurfaceNormals
         The surface normals that the maps were made with.
     statistics : dict

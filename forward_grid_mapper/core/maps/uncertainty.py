@@ -1,4 +1,4 @@
-"""The uncertainty map: leave-one-cell-out marginals of the map found, mixed with the prior (eq 41-45).
+"""The uncertainty map: leave-one-cell-out marginals of the map found, mixed with the prior ((41)-(45) of the paper).
 
 Of a cell that the map does not know, and of which the readings say less than a tenth of a nat, nothing is said at all:
 the prior alone is no observation, and it would pass for rather free.
@@ -19,8 +19,8 @@ from ..sensor.cone_table import Floats
 def marginals(evidence: Floats, neighbours: Floats, parameters: SearchParameters) -> NDArray[np.float32]:
     """Return the occupancy probability of cells from their evidence.
 
-    With Δ = log p(Z | cell occupied, rest of m) − log p(Z | cell free, rest of m), eq 43 is logit q = Δ + h_p, and
-    eq 45 mixes it with the prior: logit q = α (Δ + h_p) + (1 − α) h_p = α Δ + h_p. What the prior says of the cell
+    With Δ = log p(Z | cell occupied, rest of m) − log p(Z | cell free, rest of m), (43) is logit q = Δ + h_p, and
+    (45) mixes it with the prior: logit q = α (Δ + h_p) + (1 − α) h_p = α Δ + h_p. What the prior says of the cell
     given its neighbours in m comes with a weight of its own, since it says too much: logit q = α Δ + β G + h_p.
 
     Parameters
