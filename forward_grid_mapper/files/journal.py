@@ -148,7 +148,7 @@ class Journal:
         self._source = found[-1] if found else None
         self._drive = Drive(self._source or self.folder / 'drive_0001.journal', made=bool(found))
         self._numbers: dict[str, int] = {}
-        self._told: tuple[Any, ...] = ()
+        self._stated: tuple[Any, ...] = ()
         self._next = self._next_points = 0
 
     @property
@@ -182,7 +182,7 @@ class Journal:
             # it was sound a moment ago
             self._drive.gone = bool(contents.harm)
             self._numbers = {name: number for number, name in contents.sensors.items()}
-            self._told = (contents.map_frame, contents.base_frame, contents.parameters)
+            self._stated = (contents.map_frame, contents.base_frame, contents.parameters)
             self._next, self._next_points = contents.next, contents.next_points
             self._work_in_background()
             return
@@ -231,7 +231,7 @@ class Journal:
 
     def begin_drive(self) -> None:
         """Go on in a new file; the old one is kept. Nothing happens if nothing was written yet."""
-        if any(self._told) or self._next:
+        if any(self._stated) or self._next:
             self._begin()
 
     def renew(self, readings: Readings, frames: tuple[str, str], path: Iterable[tuple[float, float]]) -> None:
@@ -267,16 +267,16 @@ class Journal:
                 self._bytes = sum(item.size for item in self._pending)
                 self._unwritten = sum(item.readings for item in self._pending)
             self._drive = Drive(following(self._drive.path))
-        self._numbers, self._told = {}, ()
+        self._numbers, self._stated = {}, ()
         self._next = self._next_points = 0
         self._queue((), 0, 0)
 
     def _head(self, readings: Readings | None, frames: tuple[str, str]) -> list[Insert]:
         """Return the rows that have to be there before those of the readings."""
         rows: list[Insert] = []
-        told = (*frames, self.parameters)
-        if told != self._told:
-            self._told = (*frames, dict(self.parameters))
+        stated = (*frames, self.parameters)
+        if stated != self._stated:
+            self._stated = (*frames, dict(self.parameters))
             rows.append(('drive', (0, *map(encoded, frames), json.dumps(self.parameters).encode())))
         for name in readings.sensor_names if readings is not None else ():
             if name not in self._numbers:
@@ -358,7 +358,7 @@ class Journal:
                 drive.path, drive.made, drive.next = following(drive.path), False, 0
 
     def _failed(self, error: Exception) -> bool:
-        """Tell of a write that failed, and wait before the next try; return whether to give up."""
+        """Report a write that failed, and wait before the next try; return whether to give up."""
         trouble = _words(error)
         if trouble != self.trouble:
             self._warn(f'journal {self.path} cannot be written: {trouble}; mapping goes on without it')

@@ -177,7 +177,7 @@ class DriveWriter:
                 self.close()
                 raise OutputError(f'{drive.path} is open in another program; close that first') from error
         except (sqlite3.Error, MemoryError, OSError, BagError, GoneError):
-            # reading it anew tells what it is
+            # reading it anew shows what it is
             pass
         self.close()
         return False
@@ -234,7 +234,7 @@ class DriveWriter:
         GoneError
             If they are not.
         OSError
-            If that cannot be told.
+            If that cannot be found out.
         """
         try:
             self._look()

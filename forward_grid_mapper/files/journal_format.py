@@ -33,7 +33,7 @@ SQLITE = b'SQLite format 3\0'
 """The first bytes of every SQLite database."""
 
 APPLICATION = 0x46474D4A
-"""`PRAGMA application_id` of a journal: FGMJ in ASCII. It tells a journal from a rosbag2 file."""
+"""`PRAGMA application_id` of a journal: FGMJ in ASCII. It distinguishes a journal from a rosbag2 file."""
 
 VERSION = 1
 """`PRAGMA user_version`: the version of the tables. A file of another version is refused."""
@@ -60,7 +60,7 @@ LONGEST = 1 << 20
 """Bytes of a value in the database. A longer one is damage, and is not even loaded."""
 
 MOST_SENSORS = 10_000
-"""Sensors of a drive; ten times what the node tells apart."""
+"""Sensors of a drive; ten times what the node counts apart."""
 
 LONGEST_NAME = 1020
 """Bytes of a frame's name: 255 characters of four bytes."""
@@ -92,7 +92,7 @@ def encoded(name: str) -> bytes:
 
 
 def stated(parameters: Parameters) -> dict[str, Any]:
-    """Return the parameters that decide about maps and are not the defaults, by name, as a journal tells them."""
+    """Return the parameters that decide about maps and are not the defaults, by name, as a journal has them."""
     values = parameters.flat()
     return {row.name: values[row.name] for row in TABLE if row.group != 'node' and values[row.name] != row.default}
 

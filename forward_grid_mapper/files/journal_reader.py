@@ -62,7 +62,7 @@ LEAST_BYTES = 64 << 20
 """Bytes of content that are granted to a file of any size."""
 
 MOST_PACKED = 64
-"""How many times more content than room on the disk a file may have: file systems compress, and files have holes."""
+"""How many times more content than space on the disk a file may have: file systems compress, and files have holes."""
 
 LEAST_STEPS = 1_000_000
 """Steps that are granted to a file of any size; a hundredth of a second."""
@@ -226,7 +226,7 @@ class _DamagedError(Exception):
 
 
 class _Table:
-    """Reads tables of a database row by row, and no more bytes than the file has: in a damaged one, rows may share."""
+    """Reads tables of a database row by row, and no more bytes than the file has: in a damaged one, rows may overlap."""
 
     def __init__(self, database: sqlite3.Connection, size: int) -> None:
         self._database = database
@@ -245,7 +245,7 @@ class _Table:
         last = -1
         with closing(self._database.execute(f'SELECT number, {values} FROM {table} ORDER BY number')) as cursor:
             for row in cursor:
-                # a tree whose branches share leaves would never end
+                # a tree whose branches have leaves in common would never end
                 if not last < row[0] < MOST_ROWS:
                     raise _DamagedError('its rows are out of order')
                 last = row[0]
@@ -336,7 +336,7 @@ def _copy(source: Path, target: Path) -> int:
     Raises
     ------
     BagError
-        If there is no room.
+        If there is no space.
     OSError
     """
     copied = at = 0
@@ -360,7 +360,7 @@ def _copy(source: Path, target: Path) -> int:
             return copied
         if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
             raise BagError(
-                f'{source} is being written, and {target.parent.parent} has no room for the copy that is read; free '
+                f'{source} is being written, and {target.parent.parent} has no space for the copy that is read; free '
                 f'some, or name another folder in TMPDIR'
             ) from error
         raise

@@ -21,7 +21,7 @@ PERIOD = 0.1
 """Seconds between two looks for new readings."""
 
 NOTICE = 60.0
-"""Seconds for which the status warns of what was found wrong and dealt with; a key tells it for ever."""
+"""Seconds for which the status warns of what was found wrong and dealt with; a key keeps it for ever."""
 
 FULL = (errno.ENOSPC, errno.EDQUOT)
 

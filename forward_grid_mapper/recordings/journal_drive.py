@@ -93,7 +93,7 @@ def _warnings(path: Path, contents: Contents, associator: PoseAssociator, parame
         for row in TABLE
         if row.group != 'node' and contents.parameters.get(row.name, row.default) != ours[row.name]
     }
-    # a file of the previous format tells none
+    # a file of the previous format has none
     if other and not contents.note:
         named = ', '.join(f'{name}={value}' for name, value in list(other.items())[:MOST_NAMED])
         warnings.append(f'the node that kept {path.name} mapped with {named}; --set gives the same here')
