@@ -59,6 +59,11 @@ def test_defaults_are_those_of_the_table(page: Path) -> None:
     assert wrong_defaults(page.read_text(encoding='utf-8')) == []
 
 
+@of_each_page
+def test_no_figure_is_left_to_fill_in(page: Path) -> None:
+    assert re.findall(r'@[A-Z]+@|\b(?:BYTES|TODO|TBD|FIXME|XXX)\b', page.read_text(encoding='utf-8')) == []
+
+
 def test_paths_in_sources_exist() -> None:
     folders = ('forward_grid_mapper', 'benchmarks', 'test', 'config', 'launch', 'scripts')
     wrong = []

@@ -226,7 +226,7 @@ class _DamagedError(Exception):
 
 
 class _Table:
-    """Reads tables of a database row by row, and no more bytes than the file has: in a damaged one, rows may overlap."""
+    """Reads tables of a database row by row, and no more bytes than the file has: damaged rows may overlap."""
 
     def __init__(self, database: sqlite3.Connection, size: int) -> None:
         self._database = database
