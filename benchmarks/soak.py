@@ -162,7 +162,7 @@ def main() -> None:
         soak.node.close()
         if options.journal:
             size = sum(path.stat().st_size for path in (Path(folder) / 'journal').iterdir())
-            print(f'the journal has {size / 1e6:.1f} MB')
+            print(f'the journal has {size / 1e6:.1f} MB, {size / len(associator.buffer):.0f} bytes a reading')
         first = corridor_drive(0, passes=2)
         visible = visible_surface(first.world, first.readings.select(slice(None, None, 20)))
         live = soak.node._live
