@@ -318,6 +318,8 @@ def test_a_call_that_finds_no_memory_takes_nothing_or_all(monkeypatch: pytest.Mo
     at = {'first': 0, 'more': 1, 'grown': 2, 'refined': 2, 'many': 1}[case]
     values = {'threads': 3}
     whole = fed(parts, values)
+    # kernels cannot be compiled while numpy's functions are replaced
+    expected = whole.maps()
     allocations = Allocations(monkeypatch)
     refused = searched_later = 0
     for which in range(1, 10_000):
@@ -343,7 +345,8 @@ def test_a_call_that_finds_no_memory_takes_nothing_or_all(monkeypatch: pytest.Mo
             online.add(part)
         if not accepted or done:
             assert kept_of(online) == kept_of(whole)
-            assert same(online, whole)
+            for told, map_of in zip(online.maps()[1:], expected[1:], strict=True):
+                assert np.array_equal(told, map_of, equal_nan=True)
         assert consistent(online)
         assert online.taken == whole.taken
         assert kept_of(online)[4] == kept_of(whole)[4]
