@@ -86,7 +86,8 @@ def _beyond(messages: list[RangeMessage]) -> str:
 
 
 def _below(messages: list[RangeMessage]) -> str:
-    below = [m for m in messages if m.range < m.min_range]
+    # limits that contradict each other are rejected for that
+    below = [m for m in messages if m.range < m.min_range < m.max_range]
     if len(below) < MANY * len(messages):
         return ''
     ratios = sorted(m.min_range / m.range for m in below)
