@@ -91,11 +91,11 @@ def test_a_search_that_ends_in_another_basin_is_called_so(monkeypatch: pytest.Mo
     runs = []
 
     class SecondEndsPoorly(Mapper):
-        """Its second search takes an occupied cell to be so unlikely that it ends in a map with few of them."""
+        """In its second search walls cost so much that it ends in a map with few of them."""
 
         def __init__(self, parameters: Parameters) -> None:
             runs.append(parameters)
-            poor = dataclasses.replace(parameters, search=dataclasses.replace(parameters.search, prior=0.001))
+            poor = dataclasses.replace(parameters, search=dataclasses.replace(parameters.search, wall_cost=90.0))
             super().__init__(poor if len(runs) == 2 else parameters)
 
     readings = corridor(0).readings
