@@ -43,7 +43,7 @@ OVERRIDES: dict[str, Any] = {
     'sensors.sonar_right.pose': [0.1, -0.1, -1.5],
     'max_cells': 1_000_000,
     'max_readings': 2000,
-    'max_sweeps': 5,
+    'max_iterations': 5,
 }
 
 
@@ -131,7 +131,7 @@ class Fuzz:
         """Set every parameter that may change back to its default."""
         values = {row.name: row.default for row in TABLE if not row.read_only and row.group != 'node'}
         # readings of any variance, in a model of any sigma, make EM slow; it is not what is tried here
-        values['max_sweeps'] = OVERRIDES['max_sweeps']
+        values['max_iterations'] = OVERRIDES['max_iterations']
         defaults = [Parameter(name, value=value) for name, value in values.items()]
         result = self.node.set_parameters_atomically(defaults)
         require(result.successful, f'the defaults were refused: {result.reason}')

@@ -108,11 +108,11 @@ class Steps(Search):
         row[:] = row[0] + time.perf_counter() - begin, row[1] + 1, row[2] + made
         return done
 
-    def _round(self, watch: Any) -> Any:
-        return self._timed('parallel', super()._round, watch)
+    def _update_in_parallel(self, watch: Any) -> Any:
+        return self._timed('parallel', super()._update_in_parallel, watch)
 
-    def _sweep(self, watch: Any) -> Any:
-        return self._timed('sequential', super()._sweep, watch)
+    def _update_in_sequence(self, watch: Any) -> Any:
+        return self._timed('sequential', super()._update_in_sequence, watch)
 
     def _shift(self, watch: Any) -> Any:
         return self._timed('shifts', super()._shift, watch)

@@ -25,7 +25,7 @@ T = TypeVar('T')
 
 PLAIN: dict[str, float] = {
     'surface_offset': 0.0,
-    'grazing_angle': 1.5708,
+    'max_incidence_angle': 1.5708,
     'end_cost': 0.0,
     'least_passed': 0.0,
     'likelihood_exponent': 1.0,

@@ -54,7 +54,7 @@ def main() -> None:
     for width, height, cases in ((4, 3, options.cases), (4, 4, max(1, options.cases // 10))):
         grid = Grid(0.1, 0, 0, width, height)
         for p_hit, prior in ((0.9, 0.5), (0.6, 0.4), (0.3, 0.3)):
-            model = ModelParameters(p_hit=p_hit, p_rand=0.1, p_lost=0.1, sigma=0.06, grazing_angle=math.pi / 2)
+            model = ModelParameters(p_hit=p_hit, p_rand=0.1, p_lost=0.1, sigma=0.06, max_incidence_angle=math.pi / 2)
             logit = math.log(prior / (1 - prior))
             short = []
             for seed in range(cases):

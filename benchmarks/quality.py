@@ -63,14 +63,14 @@ NO_WALLS: dict[str, Any] = {'end_cost': 0.0}
 PLAIN: dict[str, Any] = {
     **NO_WALLS,
     'surface_offset': 0.0,
-    'grazing_angle': 1.5708,
+    'max_incidence_angle': 1.5708,
     'least_passed': 0.0,
 }
 """Flips and shifts, and nothing else, with the default's sensor model."""
 
 ABLATIONS: dict[str, dict[str, Any]] = {
     'surfaces before the centre': {'surface_offset': 0.0},
-    'surface normals': {'grazing_angle': 1.5708},
+    'surface normals': {'max_incidence_angle': 1.5708},
     'prior for walls': NO_WALLS,
     'unknown': {'least_passed': 0.0},
     'lost echoes': {'p_lost': 0.0},
@@ -207,7 +207,7 @@ def print_ablations(groups: dict[str, list[Case]], base: dict[str, Any], whole: 
 def with_true_rest(case: Case, model: dict[str, Any], known: Any) -> float:
     """Return the log loss at the cells `known` of (43) given all other cells of the true map, at its best prior."""
     assert case.world is not None
-    p = Parameters.from_flat({**model, 'grazing_angle': math.pi / 2})
+    p = Parameters.from_flat({**model, 'max_incidence_angle': math.pi / 2})
     grid = grid_of(case.readings, p.model, p.grid)
     walls = on_grid(case.world, grid)
     evidence = Evidence(grid, p.model, start=walls.astype(np.uint8))

@@ -19,7 +19,7 @@ from forward_grid_mapper.core.search.search import Search
 sys.path.insert(0, str(Path(__file__).parent))
 
 PLAIN_MODEL: dict[str, Any] = {
-    'grazing_angle': math.pi / 2,
+    'max_incidence_angle': math.pi / 2,
     'surface_offset': 0.0,
     'likelihood_exponent': 1.0,
 }

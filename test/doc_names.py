@@ -29,7 +29,7 @@ SHOWN = r'(?:benchmarks|config|docs|launch|rviz|scripts|test|core|files|bags|nod
 
 PARAMETERS = {parameter.name: parameter for parameter in table.TABLE}
 
-DEPRECATED = set(getattr(table, 'DEPRECATED', ()))
+DEPRECATED = {*table.DEPRECATED, *table.RENAMED}
 """Former names of parameters, which a page may give only where it says so."""
 
 SAYS_SO = re.compile(r'deprecated|former|was called|old name|until the next version', re.IGNORECASE)

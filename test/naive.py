@@ -107,7 +107,7 @@ def left_out(
         d = math.hypot(dx, dy) - surface(grid, model)
         if normals.known[c] and d < readings.z[t] - THROUGH * sigma_of(readings, t, grid, model):
             along = abs(normals.x[c] * dx + normals.y[c] * dy)
-            if along / math.hypot(dx, dy) < math.cos(model.grazing_angle):
+            if along / math.hypot(dx, dy) < math.cos(model.max_incidence_angle):
                 out.add(c)
     return out
 

@@ -135,7 +135,7 @@ def test_a_page_of_good_names_has_no_wrong_one() -> None:
         ('benchmarks/speed.py', 'benchmarks/sped.py'),
         ('--only live', '--just live'),
         ('# A page\n', '# A page\n\n**Bold** (`p_hit` 0.123).\n'),
-        ('# A page\n', '# A page\n\n| parameter | default |\n|---|---|\n| `max_sweeps` | `123` |\n'),
+        ('# A page\n', '# A page\n\n| parameter | default |\n|---|---|\n| `max_iterations` | `123` |\n'),
         ('# A page\n', '# A page\n\nIn core/finishing.py it is so.\n'),
     ],
 )

@@ -108,11 +108,13 @@ class Ticker:
         self.say(f'reading: {done:,} of {total:,} messages')
 
     def mapping(self, stage: str, progress: Progress | None) -> None:
-        """Report a stage of mapping or a sweep of the search, for `Mapper.run`."""
+        """Report a stage of mapping or an iteration of the search, for `Mapper.run`."""
         if progress is None:
             self.say(stage)
         else:
-            self.say(f'{stage}: sweep {progress.sweeps}, {progress.flips:,} flips, {progress.gain:,.0f} nats gained')
+            self.say(
+                f'{stage}: iteration {progress.iterations}, {progress.flips:,} flips, {progress.gain:,.0f} nats gained'
+            )
 
     def _watch(self) -> None:
         on_screen = self._stream.isatty()

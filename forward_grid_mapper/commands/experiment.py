@@ -43,7 +43,7 @@ PAPER = {
     'sigma': 0.05,
     'surface_offset': 0.0,
     'prior': 0.5,
-    'grazing_angle': math.pi / 2,
+    'max_incidence_angle': math.pi / 2,
     'end_cost': 0.0,
     'least_passed': 0.0,
     'likelihood_exponent': 1.0,

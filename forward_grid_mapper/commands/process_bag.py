@@ -75,7 +75,9 @@ def process(options: argparse.Namespace) -> int:
         if options.learn:
             drive.source['warnings'].append(_learned(maps))
         if not maps.statistics['converged']:
-            drive.source['warnings'].append('the search ended at max_sweeps before it converged; raise max_sweeps')
+            drive.source['warnings'].append(
+                'the search ended at max_iterations before it converged; raise max_iterations'
+            )
         title = readable(Path(*bag.resolve().parts[-2:]))
         report = write_results(folder, maps, drive.source, drive.path_xy, title)
         if options.write_bag:

@@ -31,7 +31,7 @@ from .search.search import Progress, Search, SearchResult
 from .sensor.forward_model import ForwardModel
 
 Watch = Callable[[str, Progress | None], None]
-"""Receives the name of each stage as it begins, and the progress of every sweep of the search."""
+"""Receives the name of each stage as it begins, and the progress of every iteration of the search."""
 
 P = ParamSpec('P')
 R = TypeVar('R')
@@ -198,7 +198,7 @@ class Mapper:
             'searched_objective': evidence.tempered_log_likelihood + found.log_prior,
             'flips': found.progress.flips,
             'shifts': found.progress.shifts,
-            'sweeps': found.progress.sweeps,
+            'iterations': found.progress.iterations,
             'converged': found.converged,
             'seconds': self._seconds,
         }

@@ -44,8 +44,8 @@ SAME_RANGE = 0.5
 MARGIN = 64
 """Cells by which the grid outgrows what is needed, and a quarter of its size more."""
 
-MOST_SWEEPS = 50
-"""Bound on the sweeps after one call; what is left then is done after the next."""
+MOST_UPDATES = 50
+"""Bound on the sequential updates after one call; what is left then is done after the next."""
 
 REFINE_EVERY = 1000
 """Readings after which the map is refined, at most."""
@@ -262,7 +262,7 @@ class OnlineMap:
         prior = self._prior
         room = (window[1] - window[0]) * (window[3] - window[2])
         cells, gains = np.empty(room, np.int64), np.empty(room)
-        for _ in range(MOST_SWEEPS):
+        for _ in range(MOST_UPDATES):
             n = promising(evidence.state, prior, LEAST, window, cells, gains)
             if not n:
                 break

@@ -112,9 +112,9 @@ def _result(data: dict[str, Any]) -> Iterator[str]:
     if (unexplained := result.get('unexplained')) is not None:
         share = _share(unexplained, readings)
         yield from _line('Unexplained', f'{unexplained:,} readings ({share}) are most likely random measurements')
-    work = [f'{statistics[key]:,} {key}' for key in ('pairs', 'sweeps', 'flips', 'shifts') if statistics.get(key)]
+    work = [f'{statistics[key]:,} {key}' for key in ('pairs', 'iterations', 'flips', 'shifts') if statistics.get(key)]
     if (converged := statistics.get('converged')) is not None:
-        work.append('converged' if converged else 'NOT converged: max_sweeps was reached')
+        work.append('converged' if converged else 'NOT converged: max_iterations was reached')
     if work:
         yield from _line('Search', ', '.join(work))
 

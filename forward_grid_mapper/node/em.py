@@ -58,7 +58,8 @@ class Run:
     def __str__(self) -> str:
         text = f'{self.stage} of {len(self.readings)} readings, {self.seconds:.1f} s'
         if self.progress:
-            text += f', sweep {self.progress.sweeps}, {self.progress.flips} flips, {self.progress.gain:.0f} nats gained'
+            p = self.progress
+            text += f', iteration {p.iterations}, {p.flips} flips, {p.gain:.0f} nats gained'
         return text
 
 
@@ -66,7 +67,7 @@ class EmWorker:
     """Runs EM on snapshots of the readings, one at a time."""
 
     def __init__(self, watch: Callable[[Run], None], log: Callable[[str], Any]) -> None:
-        """`watch` is called at every stage and sweep, by the run's thread; `log` takes errors that no user caused."""
+        """`watch` is called at every stage and iteration, in the run's thread; `log` takes errors no user caused."""
         self._watch, self._log = watch, log
         self._lock = threading.Lock()
         self._run: Run | None = None
@@ -135,9 +136,9 @@ def summary(maps: MapSet, seconds: float) -> str:
     """Return a run's result in one line."""
     s = maps.statistics
     return (
-        f'{len(maps.readings)} readings, {s["sweeps"]} iterations, log-likelihood {maps.log_likelihood:.1f}, '
+        f'{len(maps.readings)} readings, {s["iterations"]} iterations, log-likelihood {maps.log_likelihood:.1f}, '
         f'objective {maps.objective:.1f}, {s["flips"]} flips, {s["shifts"]} shifts, {s["occupied"]} occupied cells, '
         f'{seconds:.2f} seconds'
-        + ('' if s['converged'] else ', NOT converged: raise max_sweeps')
+        + ('' if s['converged'] else ', NOT converged: raise max_iterations')
         + (f'; BUT {warning}' if (warning := quality_warning(maps)) else '')
     )

@@ -12,7 +12,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
 
 from ..core.common.errors import ParameterError
-from ..core.common.parameters import DEPRECATED, TABLE, Parameter, Parameters, deprecation
+from ..core.common.parameters import DEPRECATED, RENAMED, TABLE, Parameter, Parameters, deprecation
 from ..core.messages.message_types import Pose2
 
 ROS_OWN = ('use_sim_time', 'start_type_description_service', 'qos_overrides')
@@ -48,12 +48,15 @@ def declare(node: Node) -> tuple[Parameters, dict[str, Pose2], list[str]]:
         If a value has the wrong type or is out of range.
     """
     given = node.get_parameters_by_prefix('')
+    former = {new: old for old, new in RENAMED.items()}
     values = {}
     for row in TABLE:
         value = row.default
-        if row.name in given:
-            value = row.check(given[row.name].value)
-            node.undeclare_parameter(row.name)
+        # the new name wins
+        for name in (former.get(row.name, ''), row.name):
+            if name in given:
+                value = row.check(given[name].value)
+                node.undeclare_parameter(name)
         values[row.name] = value
         stored = list(value) if isinstance(value, tuple) else value
         node.declare_parameter(row.name, stored, descriptor(row), ignore_override=True)
@@ -103,7 +106,7 @@ def _strangers(given: dict[str, RosParameter]) -> list[str]:
         pose = name.startswith('sensors.') and name.endswith('.pose')
         if name in NAMES or pose or name.partition('.')[0] in ROS_OWN:
             continue
-        if name in DEPRECATED:
+        if name in DEPRECATED or name in RENAMED:
             warnings.append(deprecation(name))
             continue
         near = difflib.get_close_matches(name, NAMES, n=1)

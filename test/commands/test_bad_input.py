@@ -368,7 +368,7 @@ def test_a_pose_from_another_planet(tmp_path: Path) -> None:
         (['--set', 'p_hit=nan'], ['p_hit', 'out of range']),
         (['--set', 'phit=0.5'], ["'phit'", 'did you mean p_hit']),
         (['--set', 'p_hit=high'], ['p_hit', "'high' is not a number"]),
-        (['--set', 'max_sweeps=2.5'], ['max_sweeps', 'whole number']),
+        (['--set', 'max_iterations=2.5'], ['max_iterations', 'whole number']),
         (['--set', 'online=maybe'], ['online', 'true or false']),
         (['--set', 'over_range=ignore'], ['over_range', 'no_echo, discard']),
         (['--set', 'p_hit'], ["'p_hit'", 'name=value']),

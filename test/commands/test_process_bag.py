@@ -242,19 +242,19 @@ def test_set_wins_over_the_file(tmp_path: Path, plain: Path) -> None:
     file = tmp_path / 'p.yaml'
     file.write_text('forward_grid_mapper: {ros__parameters: {resolution: 0.2, alpha: 0.25, publish_rate: 5.0}}')
     of_file = mapped(plain / 'bag', tmp_path / 'a', '--params', file)
-    options = ('--params', file, '--set', 'resolution=0.5', '--set', 'max_sweeps=3', '--set', 'resolution=0.25')
+    options = ('--params', file, '--set', 'resolution=0.5', '--set', 'max_iterations=3', '--set', 'resolution=0.25')
     of_both = mapped(plain / 'bag', tmp_path / 'b', *options)
     assert {k: of_file['parameters'][k] for k in ('resolution', 'alpha')} == {'resolution': 0.2, 'alpha': 0.25}
     assert {k: of_both['parameters'][k] for k in ('resolution', 'alpha')} == {'resolution': 0.25, 'alpha': 0.25}
-    assert of_both['parameters']['max_sweeps'] == 3
+    assert of_both['parameters']['max_iterations'] == 3
     assert [read_npz(tmp_path / name / 'maps.npz').grid.resolution for name in 'ab'] == [0.2, 0.25]
     assert 'resolution' in of_both['changed_parameters']
     assert '0.25' in (tmp_path / 'b' / 'report.txt').read_text('utf-8')
 
 
 def test_a_search_cut_short_says_so(tmp_path: Path, plain: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    report = mapped(plain / 'bag', tmp_path / 'maps', '--set', 'max_sweeps=1', '-q')
-    assert any('raise max_sweeps' in warning for warning in report['warnings'])
+    report = mapped(plain / 'bag', tmp_path / 'maps', '--set', 'max_iterations=1', '-q')
+    assert any('raise max_iterations' in warning for warning in report['warnings'])
     assert 'process_bag: warning: ' in capsys.readouterr().err
 
 

@@ -230,7 +230,7 @@ def test_the_map_so_far_is_known_while_the_search_runs() -> None:
     mapper, seen = Mapper(Parameters.from_flat(PLAIN)), []
     assert mapper.so_far() is None
     maps = mapper.run(some(), lambda stage, progress: seen.append(mapper.so_far()) if progress else None)
-    assert len(seen) == maps.statistics['sweeps']
+    assert len(seen) == maps.statistics['iterations']
     for grid, ml in seen:
         assert grid == maps.grid
         assert np.array_equal(ml == -1, maps.ml == -1)

@@ -79,7 +79,7 @@ def survives(read: Callable[[Path], object], path: Path) -> bool:
         'null: 3',
         'p_hit: .nan',
         'p_hit: 1e999',
-        'max_sweeps: 1' + '0' * 5000,
+        'max_iterations: 1' + '0' * 5000,
         'sensors.a.pose: [1' + '0' * 400 + ', 0, 0]',
         'sensors: {a: {pose: [1e400, 0, 0]}}',
         'sensors: {a: {pose: [true, 0, 0]}}',

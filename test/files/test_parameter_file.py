@@ -114,7 +114,7 @@ def test_parameters_of_ros_itself_pass(tmp_path: Path) -> None:
         ('p_hit: often', "p_hit: 'often' is not a number"),
         ('p_hit: 1.5', 'p_hit: 1.5 is out of range'),
         ('p_hit:', 'p_hit: None is not a number'),
-        ('max_sweeps: 1.5', 'max_sweeps: 1.5 is not a whole number'),
+        ('max_iterations: 1.5', 'max_iterations: 1.5 is not a whole number'),
         ('online: 1', 'online: 1 is not true or false'),
         ('over_range: keep', 'not one of no_echo, discard'),
         ('p_hit: 0.3\np_hit: 0.4', 'p_hit is given twice'),
@@ -164,7 +164,7 @@ def test_settings_round_trip(values: dict[str, Any]) -> None:
         ('p_hitt=1', 'did you mean p_hit'),
         ('p_hit=', "'' is not a number"),
         ('p_hit=nan', 'out of range'),
-        ('max_sweeps=1.5', "'1.5' is not a whole number"),
+        ('max_iterations=1.5', "'1.5' is not a whole number"),
         ('online=maybe', 'not true or false'),
     ],
 )

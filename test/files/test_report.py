@@ -35,7 +35,7 @@ STATISTICS: dict[str, Any] = {
     'pairs': np.int64(12345),
     'flips': 321,
     'shifts': 12,
-    'sweeps': 5,
+    'iterations': 5,
     'searched_objective': -151.5,
     'searched_log_likelihood': -125.0,
     'converged': np.bool_(False),

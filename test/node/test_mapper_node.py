@@ -218,7 +218,7 @@ def test_parameters_are_checked(start: Any, robot: Robot, door: Recording) -> No
         ('over_range', 'maybe', 'no_echo'),
         ('resolution', 0.05, 'read-only|read_only'),
         ('p_rand', 0.9, 'p_lost'),
-        ('max_sweeps', 0, 'range'),
+        ('max_iterations', 0, 'range'),
         ('sensors.sonar_00.pose', 'x', 'restart|type'),
     ):
         result = robot.set_parameter(name, value)

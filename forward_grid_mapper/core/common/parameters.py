@@ -140,7 +140,7 @@ class ModelParameters:
         0.001,
         5.0,
     )
-    grazing_angle: float = _param(
+    max_incidence_angle: float = _param(
         0.7,
         'Incidence angle off the normal of a surface, from which on readings do not contradict the surface; with pi/2 '
         'all do.',
@@ -194,8 +194,8 @@ class SearchParameters:
         0.0,
         100.0,
     )
-    max_sweeps: int = _param(
-        200, 'Bound on the sweeps over the map; the report says when it was reached.', 'sweeps', 1, 100_000
+    max_iterations: int = _param(
+        200, 'Bound on the iterations of the search; the report says when it was reached.', 'iterations', 1, 100_000
     )
     threads: int = _param(0, 'Threads of a search, 0 for one a core; the maps do not depend on it.', 'threads', 0, 256)
     max_memory: int = _param(
@@ -367,7 +367,7 @@ class Parameters:
     def from_flat(cls, values: Mapping[str, Any], base: Parameters | None = None) -> Parameters:
         """Return `base` (the defaults, unless given) with the named values changed.
 
-        Names of `DEPRECATED` are left out, with a warning in the log.
+        Names of `DEPRECATED` are left out, and those of `RENAMED` stand for the new ones, with a warning in the log.
 
         Raises
         ------
@@ -376,11 +376,12 @@ class Parameters:
         """
         changes: dict[str, dict[str, Any]] = {}
         for name, value in values.items():
-            if name in DEPRECATED:
+            if name in DEPRECATED or name in RENAMED:
                 LOG.warning('%s', deprecation(name))
+            if name in DEPRECATED:
                 continue
             row = find(name)
-            changes.setdefault(row.group, {})[name] = row.check(value)
+            changes.setdefault(row.group, {})[row.name] = row.check(value)
         base = base or cls()
         return dataclasses.replace(
             base,
@@ -406,8 +407,17 @@ DEPRECATED = {
 """Parameters of the version before: what became of each. They are accepted with a warning and have no effect."""
 
 
+RENAMED = {
+    'grazing_angle': 'max_incidence_angle',
+    'max_sweeps': 'max_iterations',
+}
+"""Parameters of the version before that have another name now. They are accepted with a warning."""
+
+
 def deprecation(name: str) -> str:
-    """Return the warning for a name of `DEPRECATED`."""
+    """Return the warning for a name of `DEPRECATED` or `RENAMED`."""
+    if name in RENAMED:
+        return f'parameter {name} is called {RENAMED[name]} now; the next version does not know the old name'
     return f'parameter {name} is ignored: it is {DEPRECATED[name]}'
 
 
@@ -434,13 +444,14 @@ _BY_NAME = {row.name: row for row in TABLE}
 
 
 def find(name: str) -> Parameter:
-    """Return the row of the table called `name`.
+    """Return the row of the table called `name`, or called so in the version before (`RENAMED`).
 
     Raises
     ------
     ParameterError
         If there is none; names the nearest ones.
     """
+    name = RENAMED.get(name, name)
     if name in _BY_NAME:
         return _BY_NAME[name]
     near = difflib.get_close_matches(name, _BY_NAME, n=3, cutoff=0.5)

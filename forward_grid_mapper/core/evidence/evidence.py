@@ -179,7 +179,7 @@ class Evidence:
         self._words = int(min(memory / WORD, 2.0**60))
         self._totals = np.zeros(6, np.int64)
         self._size = self._indexed = 0
-        learns = model.grazing_angle < NO_INCIDENCE_LIMIT
+        learns = model.max_incidence_angle < NO_INCIDENCE_LIMIT
         self._sums = np.zeros((3, grid.size), np.int64) if learns and renewable else None
         self._since: Window | None = None
         self.state = State(
@@ -294,7 +294,7 @@ class Evidence:
         since = united(self._since, *(box_of(cones, self.grid) for cones in later))
         before = self._index_so_far()
         try:
-            if not begin and self.model.grazing_angle < NO_INCIDENCE_LIMIT:
+            if not begin and self.model.max_incidence_angle < NO_INCIDENCE_LIMIT:
                 self._first_normals(end)
             self._insert(begin, end)
             try:
@@ -511,7 +511,7 @@ class Evidence:
             gather(s.cones, self.grid.shape, (first, last), into, s.stop)
 
         self.summed(0, end, work, sums)
-        normals = normals_of(sums, self.grid, self.model.grazing_angle)
+        normals = normals_of(sums, self.grid, self.model.max_incidence_angle)
         self.state = self.state._replace(normals=normals)
 
     def _keep_bearings(self, cones: NDArray[np.void]) -> None:

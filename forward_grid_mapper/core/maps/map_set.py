@@ -45,7 +45,7 @@ class MapSet:
     normals : SurfaceNormals
         The surface normals that the maps were made with.
     statistics : dict
-        Plain numbers about the run: pairs, flips, shifts, sweeps, converged, seconds by stage. `searched_objective`
+        Plain numbers about the run: pairs, flips, shifts, iterations, converged, seconds by stage. `searched_objective`
         and `searched_log_likelihood` are of the map that the search ended with, before post-processing.
     """
 

@@ -23,7 +23,7 @@ def gain_of(s: State, prior: Prior, c: int) -> float:
 
 
 WORTH_WAITING = 0.5
-"""Fraction of the gain it had when the sweep began that a cell must still have to be flipped in the same sweep."""
+"""Fraction of the gain it had when the update began that a cell must still have to be flipped in the same update."""
 
 
 Least = tuple[float, float]
@@ -86,8 +86,8 @@ def highest(s: State, cells: NDArray[np.int64], gains: Floats, workspace: Floats
 def flip_in_order(s: State, prior: Prior, least: Least, cells: NDArray[np.int64], gains: Floats) -> tuple[int, float]:
     """Flip those of `cells`, in order, that still gain enough; return their number and total gain.
 
-    `gains` is what they gained when the sweep began. A cell that lost much of that since, to the flip of another one,
-    waits for the next sweep, where it may find itself behind a better one.
+    `gains` is what they gained when the update began. A cell that lost much of that since, to the flip of another one,
+    waits for the next update, where it may find itself behind a better one.
     """
     flips, total = 0, 0.0
     for i in range(len(cells)):

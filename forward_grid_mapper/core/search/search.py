@@ -52,7 +52,7 @@ search cannot go round, not even where ten thousand readings are off to the same
 LEAST = (LEAST_GAIN, ROUNDING)
 
 FEW = 32
-"""Flips in a round below which sweeps are faster."""
+"""Flips of a parallel update below which sequential ones are faster."""
 
 
 LITTLE = 0.005
@@ -61,9 +61,9 @@ LITTLE = 0.005
 
 @dataclass(frozen=True)
 class Progress:
-    """Where a search stands: sweeps done, flips and moves made so far, gain in nats since the start."""
+    """Where a search stands: iterations done, flips and moves made so far, gain in nats since the start."""
 
-    sweeps: int
+    iterations: int
     flips: int
     shifts: int
     gain: float
@@ -86,7 +86,7 @@ class SearchResult:
         That of the map, up to a constant.
     progress : Progress
     converged : bool
-        False when `max_sweeps` ended the search.
+        False when `max_iterations` ended the search.
     """
 
     occupied: NDArray[np.uint8]
@@ -138,20 +138,20 @@ class Search:
     def _advance(self, flips: int, shifts: int, gain: float, watch: Watch) -> None:
         check(self.evidence.state.stop)
         p = self.progress
-        self.progress = Progress(p.sweeps + 1, p.flips + flips, p.shifts + shifts, p.gain + gain)
+        self.progress = Progress(p.iterations + 1, p.flips + flips, p.shifts + shifts, p.gain + gain)
         watch(self.progress)
 
     def _more(self) -> bool:
-        return self.progress.sweeps < self._parameters.max_sweeps
+        return self.progress.iterations < self._parameters.max_iterations
 
     def _objective(self) -> float:
         maps = self.evidence.state.maps
         return self.evidence.tempered_log_likelihood + log_prior(self._prior, maps.occupied, maps.pattern)
 
     def run(self, watch: Watch = lambda progress: None) -> SearchResult:
-        """Search until no flip and no move gains; `watch` is called after every sweep.
+        """Search until no flip and no move gains; `watch` is called after every iteration.
 
-        A start map that no flip and no move improves is the result: the rounds would lead from one maximum to another.
+        A start map that no flip and no move improves is the result: parallel updates would lead to another maximum.
 
         Raises
         ------
@@ -165,12 +165,12 @@ class Search:
                 return self._result(converged)
             self._prior = independent
             self._settled[:] = 0
-        while self._more() and self._round(watch):
+        while self._more() and self._update_in_parallel(watch):
             pass
         return self.refine(watch)
 
     def refine(self, watch: Watch = lambda progress: None) -> SearchResult:
-        """Do as `run` does, but without the rounds at the beginning."""
+        """Do as `run` does, but without the parallel updates at the beginning."""
         converged = self._climb(watch)
         if has_walls(self._parameters):
             self._prior = self._of_walls
@@ -193,7 +193,7 @@ class Search:
         """Make moves of all kinds until nothing gains; return whether that was reached."""
         walls = self._prior is self._of_walls and has_walls(self._parameters)
         while self._more():
-            if self._sweep(watch) or self._shift(watch):
+            if self._update_in_sequence(watch) or self._shift(watch):
                 continue
             if walls and (self._close_gaps(watch) or self._remove_short_walls(watch)):
                 continue
@@ -216,7 +216,7 @@ class Search:
         order = np.argsort(-gains[:n], kind='stable')
         return cells[order], gains[order]
 
-    def _round(self, watch: Watch) -> bool:
+    def _update_in_parallel(self, watch: Watch) -> bool:
         """Flip all that gain more than their neighbours at once; return whether that helped."""
         maps = self.evidence.state.maps
         cells, gains = self._promising()
@@ -234,7 +234,7 @@ class Search:
         self._advance(len(cells), 0, gain, watch)
         return gain > LITTLE * self.progress.gain
 
-    def _sweep(self, watch: Watch) -> int:
+    def _update_in_sequence(self, watch: Watch) -> int:
         cells, gains = self._promising()
         if not len(cells):
             return 0
@@ -270,7 +270,7 @@ class Search:
         return shifts
 
     def _free(self, watch: Watch) -> int:
-        """Free cells that nothing needs, as rounds leave them where the prior does not speak against them."""
+        """Free cells that nothing needs, as parallel updates leave them where the prior does not speak against them."""
         cells = self._occupied()
         flips, gain = free_unneeded(self.evidence.state, self._prior, LEAST, cells)
         if flips:

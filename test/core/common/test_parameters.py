@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from forward_grid_mapper.core.common.errors import ParameterError
-from forward_grid_mapper.core.common.parameters import DEPRECATED, TABLE, Parameters, deprecation, find
+from forward_grid_mapper.core.common.parameters import DEPRECATED, RENAMED, TABLE, Parameters, deprecation, find
 
 
 @pytest.mark.parametrize('row', TABLE, ids=lambda row: row.name)
@@ -52,3 +52,12 @@ def test_names_of_the_version_before_are_left_out_with_a_warning(name: str, capl
     assert Parameters.from_flat({name: 3, 'p_rand': 0.1}, base=base) == Parameters.from_flat({'p_rand': 0.1}, base=base)
     assert caplog.messages == [deprecation(name)]
     assert name in deprecation(name)
+
+
+@pytest.mark.parametrize(('old', 'new'), RENAMED.items())
+def test_former_names_are_taken_with_a_warning(old: str, new: str, caplog: pytest.LogCaptureFixture) -> None:
+    assert old not in {row.name for row in TABLE}
+    value = find(new).low
+    assert Parameters.from_flat({old: value}) == Parameters.from_flat({new: value})
+    assert caplog.messages == [deprecation(old)]
+    assert new in deprecation(old)

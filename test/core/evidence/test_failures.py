@@ -43,7 +43,7 @@ def case(seed: int) -> tuple[Readings, Any, np.ndarray]:
     # enough echoes from about the same place for normals to be known
     readings.x[:30], readings.y[:30] = readings.x[0], readings.y[0]
     readings.z[:30] = np.minimum(readings.z[0], 0.5 * readings.z_max[:30])
-    return readings, dataclasses.replace(model, grazing_angle=0.5), occupied
+    return readings, dataclasses.replace(model, max_incidence_angle=0.5), occupied
 
 
 def steps(readings: Readings) -> dict[str, tuple[list[Step], Step]]:

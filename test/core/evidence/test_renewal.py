@@ -17,7 +17,7 @@ from forward_grid_mapper.core.evidence.evidence import UNUSED, Evidence
 from forward_grid_mapper.core.evidence.updates import find_observing, flip
 
 GRID = Grid(0.1, -7, 12, 25, 20)
-MODEL = ModelParameters(sigma=0.06, p_hit=0.6, p_rand=0.1, p_lost=0.1, grazing_angle=0.7)
+MODEL = ModelParameters(sigma=0.06, p_hit=0.6, p_rand=0.1, p_lost=0.1, max_incidence_angle=0.7)
 
 
 def along_wall(count: int, seed: int = 0) -> Readings:

@@ -78,7 +78,7 @@ def test_the_map_asked_about_may_be_another_and_weights_count() -> None:
 def test_neither_threads_nor_what_is_grazed_change_who_passed(monkeypatch: pytest.MonkeyPatch) -> None:
     readings = random_readings(np.random.default_rng(5), GRID, 300)
     occupied = (np.random.default_rng(1).random(GRID.size) < 0.1).astype(np.uint8)
-    whole, slanted = plain_model(), plain_model(grazing_angle=0.5)
+    whole, slanted = plain_model(), plain_model(max_incidence_angle=0.5)
     one = expected_passes(made(readings, whole, occupied), occupied)
     monkeypatch.setattr(threads, 'LEAST_PART', 20)
     assert np.array_equal(expected_passes(made(readings, whole, occupied, threads=3), occupied), one)

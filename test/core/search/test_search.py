@@ -103,7 +103,7 @@ def test_the_objective_never_falls_and_ends_at_an_optimum(seed: int, prior: floa
         assert now() - last == pytest.approx(progress.gain - before.gain, abs=1e-4 + rounding)
         assert now() == pytest.approx(start + progress.gain, abs=1e-3)
         assert progress.gain >= before.gain
-        assert progress.sweeps == before.sweeps + 1
+        assert progress.iterations == before.iterations + 1
         last, before = now(), progress
 
     result = search.run(watch)
@@ -133,7 +133,7 @@ def test_rounds_flip_many_cells_at_once_and_the_gain_told_is_theirs(seed: int) -
         heights.append(objective(readings, search.evidence.state.maps.occupied, MODEL, 0.4, AREA))
         steps.append(progress)
 
-    while search._round(watch):
+    while search._update_in_parallel(watch):
         pass
     assert len(steps) > 2
     for k in range(1, len(steps)):
@@ -148,7 +148,7 @@ def test_a_round_that_does_not_help_is_taken_back(monkeypatch: pytest.MonkeyPatc
     search = make(readings, AREA, model=plain_model(p_hit=0.98, p_rand=0.001, p_lost=0.0, sigma=0.3))
     before = search.evidence.state.maps.evidence.copy()
     monkeypatch.setattr(search_module, 'highest', lambda state, cells, gains, room: np.ones(len(cells), bool))
-    assert not search._round(lambda progress: None)
+    assert not search._update_in_parallel(lambda progress: None)
     assert search.progress == Progress(0, 0, 0, 0.0)
     assert not search.evidence.state.maps.occupied.any()
     assert np.array_equal(search.evidence.state.maps.evidence, before)
@@ -260,7 +260,7 @@ def test_many_readings_that_round_alike_do_not_make_the_search_go_round() -> Non
 
 def test_a_search_can_be_cancelled_before_it_begins_and_at_every_step() -> None:
     readings = random_readings(np.random.default_rng(0), AREA, 400, z_max=2.0)
-    steps = make(readings, AREA).run().progress.sweeps
+    steps = make(readings, AREA).run().progress.iterations
     assert steps > 4
     for last in range(steps):
         stop = np.zeros(1, np.uint8)
@@ -268,11 +268,11 @@ def test_a_search_can_be_cancelled_before_it_begins_and_at_every_step() -> None:
         stop[0] = last == 0
 
         def watch(progress: Progress) -> None:
-            stop[0] = progress.sweeps >= last  # noqa: B023
+            stop[0] = progress.iterations >= last  # noqa: B023
 
         with pytest.raises(Cancelled):
             search.run(watch)
-        assert search.progress.sweeps == last
+        assert search.progress.iterations == last
 
 
 def test_an_empty_map_of_readings_without_echo_is_the_best_at_once() -> None:
@@ -295,16 +295,16 @@ def test_a_search_goes_on_from_the_map_that_it_is_given() -> None:
 
 
 def test_max_sweeps_ends_the_search_and_says_so() -> None:
-    result = make(random_readings(np.random.default_rng(0), GRID, 200), max_sweeps=1).run()
+    result = make(random_readings(np.random.default_rng(0), GRID, 200), max_iterations=1).run()
     assert not result.converged
-    assert result.progress.sweeps == 1
+    assert result.progress.iterations == 1
 
 
 @pytest.mark.parametrize('most', [1, 2, 3, 5])
 def test_max_sweeps_bounds_rounds_sweeps_and_shifts_together(most: int) -> None:
     readings = random_readings(np.random.default_rng(0), AREA, 400, z_max=2.0)
-    result = make(readings, AREA, max_sweeps=most).run()
-    assert result.progress.sweeps == most
+    result = make(readings, AREA, max_iterations=most).run()
+    assert result.progress.iterations == most
     assert not result.converged
 
 

@@ -51,7 +51,7 @@ def test_no_reading_says_more_on_any_map(model: ModelParameters, seed: int) -> N
 
 @pytest.mark.parametrize('model', MODELS)
 def test_the_bounds_are_reached(model: ModelParameters) -> None:
-    model = dataclasses.replace(model, surface_offset=0.0, grazing_angle=math.pi / 2)
+    model = dataclasses.replace(model, surface_offset=0.0, max_incidence_angle=math.pi / 2)
     bounds = reading_bounds(model, GRID.resolution, 2.9)
     cell = 10 * GRID.width + 15
     far = 10 * GRID.width + 25

@@ -56,10 +56,10 @@ def test_with_normals_it_is_that_of_all_correspondences_with_surfaces_that_answe
         rng = np.random.default_rng(400 + seed)
         readings, model = (
             random_readings(rng, GRID, 80),
-            dataclasses.replace(random_model(rng), grazing_angle=0.6, sigma=0.05),
+            dataclasses.replace(random_model(rng), max_incidence_angle=0.6, sigma=0.05),
         )
         readings.sigma[:] *= 0.3
-        normals = random_normals(rng, GRID, model.grazing_angle)
+        normals = random_normals(rng, GRID, model.max_incidence_angle)
         occupied = (rng.random(GRID.shape) < 0.7).astype(np.int8)
         told = expectations(readings, GRID, occupied, model, normals)
         for t in range(len(readings)):
@@ -79,7 +79,7 @@ def test_other_values_of_the_model_leave_the_choice_of_surfaces_as_it_is() -> No
     rng = np.random.default_rng(9)
     readings = random_readings(rng, GRID, 200)
     readings.sigma[:] = 0
-    model = ModelParameters(sigma=0.06, grazing_angle=0.6, p_lost=0.0)
+    model = ModelParameters(sigma=0.06, max_incidence_angle=0.6, p_lost=0.0)
     forward = ForwardModel(readings, GRID, model, random_normals(rng, GRID, 0.6))
     occupied = (rng.random(GRID.shape) < 0.7).astype(np.int8)
     wider = dataclasses.replace(model, sigma=0.3)

@@ -30,7 +30,7 @@ from forward_grid_mapper.core.sensor.surface_normals import (
 )
 
 GRID = Grid(0.1, -7, 12, 25, 20)
-MODEL = ModelParameters(sigma=0.06, p_hit=0.6, p_rand=0.1, p_lost=0.1, grazing_angle=0.7)
+MODEL = ModelParameters(sigma=0.06, p_hit=0.6, p_rand=0.1, p_lost=0.1, max_incidence_angle=0.7)
 
 
 def along_wall(count: int = 150, seed: int = 0) -> Readings:
@@ -132,7 +132,7 @@ def test_readings_without_echo_tell_no_normal() -> None:
 def test_a_straight_angle_leaves_out_nothing() -> None:
     readings = along_wall()
     for angle in (math.pi / 2, 1.5708):
-        evidence = made(readings, dataclasses.replace(MODEL, grazing_angle=angle))
+        evidence = made(readings, dataclasses.replace(MODEL, max_incidence_angle=angle))
         assert evidence.state.normals.cos2_limit == no_normals().cos2_limit == 0.0
     # all surfaces graze nobody where the angle has hardly any cosine
     sums = sums_of(evidence, (0, len(readings)))
@@ -142,7 +142,7 @@ def test_a_straight_angle_leaves_out_nothing() -> None:
 @pytest.mark.parametrize('readings', [along_wall(), random_readings(np.random.default_rng(2), GRID, 120)])
 def test_pairs_are_those_of_the_cone_without_what_is_grazed(readings: Readings) -> None:
     model = MODEL
-    evidence, plain = made(readings, model), made(readings, dataclasses.replace(model, grazing_angle=math.pi / 2))
+    evidence, plain = made(readings, model), made(readings, dataclasses.replace(model, max_incidence_angle=math.pi / 2))
     s = evidence.state
     found: list[dict[int, int]] = [{} for _ in range(GRID.size)]
     total = cut = 0
