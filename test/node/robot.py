@@ -115,7 +115,7 @@ class Robot:
         while time.monotonic() < end:
             self.executor.spin_once(timeout_sec=0.02)
 
-    def until(self, condition: Callable[[], Any], seconds: float = 15.0, what: str = '') -> Any:
+    def until(self, condition: Callable[[], Any], seconds: float = 60.0, what: str = '') -> Any:
         end = time.monotonic() + seconds
         while not (value := condition()):
             assert time.monotonic() < end, f'it did not happen: {what or condition}'
