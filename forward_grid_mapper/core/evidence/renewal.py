@@ -134,11 +134,13 @@ def renew(s: State, new: SurfaceNormals, readings: Any, limits: tuple[int, int],
         Those of the evidence.
     """
     workspace, words = s.workspace, limits[1]
+    # of one type, so that what is called is compiled once
+    start: Any = np.int64(0)
     for i in range(limits[0], len(readings)):
         t = readings[i]
         reading_state = s.reading_states[t]
         if reading_state.stored:
-            runs, bands = make(s.cones, s.lattice, new, t, workspace.pairs, 0, workspace)
+            runs, bands = make(s.cones, s.lattice, new, t, workspace.pairs, start, workspace)
             size = WORDS_PER_RUN * runs + WORDS_PER_BAND_PAIR * bands
             if size > reading_state.room and len(s.pairs.cell) < totals[WORDS] + size <= words:
                 return i
@@ -147,9 +149,9 @@ def renew(s: State, new: SurfaceNormals, readings: Any, limits: tuple[int, int],
                 _move(reading_state, size, words, totals)
         else:
             take_off(s, t)
-            runs, bands = make(s.cones, s.lattice, new, t, workspace.pairs, 0, workspace)
+            runs, bands = make(s.cones, s.lattice, new, t, workspace.pairs, start, workspace)
         reading_state.runs, reading_state.bands = runs, bands
-        pairs, at = workspace.pairs, 0
+        pairs, at = workspace.pairs, start
         if reading_state.stored:
             pairs, at = s.pairs, reading_state.at
             for k in range(WORDS_PER_RUN * runs + 2 * bands):
