@@ -183,7 +183,7 @@ def test_shows_longer_work() -> None:
         time.sleep(1.4)
     shown = {name: stream.getvalue() for name, stream in streams.items()}
     assert shown['quiet'] == shown['idle'] == ''
-    reading, searching = 'reading: 1,000 of 12,345 messages', 'search: sweep 3, 1,234 flips, 679 nats gained'
+    reading, searching = 'reading: 1,000 of 12,345 messages', 'search: iteration 3, 1,234 flips, 679 nats gained'
     assert re.fullmatch(rf' +\d s  {reading}\n +\d s  {searching}\n', shown['log'])
     parts = shown['screen'].split('\r\033[K')
     assert parts[0] == '' and parts[-1] == '', 'the line is cleared at the end'

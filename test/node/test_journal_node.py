@@ -44,7 +44,9 @@ def until_accepted(robot: Robot, count: int) -> None:
     robot.until(lambda: robot.diagnostics['journal']['readings to be written'] == '0')
 
 
-def test_a_node_that_is_killed_goes_on_where_it_was(start: Any, domain: int, tmp_path: Path) -> None:
+def test_a_node_that_is_killed_goes_on_where_it_was(
+    start: Any, domain: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     folder = tmp_path / 'the journal'
     options = (*OPTIONS, '-p', f'journal:={folder}', '-p', f'save_directory:={tmp_path}/maps')
     sent = 0
@@ -103,7 +105,10 @@ def test_a_node_that_is_killed_goes_on_where_it_was(start: Any, domain: int, tmp
     first = folder / 'drive_0001.journal'
     assert process_bag([str(first), '-o', str(tmp_path / 'old'), '-q']) == 0
     first.write_bytes(first.read_bytes()[: first.stat().st_size * 2 // 3])
-    assert process_bag([str(first), '-o', str(tmp_path / 'torn'), '-q']) == 0
+    # which pages are gone depends on when the node wrote: either some readings are left, or it says why none is
+    capsys.readouterr()
+    left = process_bag([str(first), '-o', str(tmp_path / 'torn'), '-q']) == 0
+    assert left or 'cannot be read to its end' in capsys.readouterr().err
 
 
 def test_node_and_offline_keep_the_same_readings(start: Any, robot: Robot, tmp_path: Path) -> None:
@@ -139,7 +144,9 @@ def journal_status(robot: Robot) -> dict[str, Any]:
     return dict(robot.diagnostics.get('journal', {}))
 
 
-def test_a_journal_that_is_deleted_or_hostile_is_begun_anew(start: Any, robot: Robot, tmp_path: Path) -> None:
+def test_a_journal_that_is_deleted_or_hostile_is_begun_anew(
+    start: Any, domain: int, robot: Robot, tmp_path: Path
+) -> None:
     folder = tmp_path / 'journal'
     options = (*OPTIONS, '-p', f'journal:={folder}')
     node = start(*options)
@@ -165,9 +172,13 @@ def test_a_journal_that_is_deleted_or_hostile_is_begun_anew(start: Any, robot: R
     node = start(*options)
     assert 'the journal goes on in drive_0003.journal' in node.output
     assert '0 readings of an earlier run are back' in node.output
-    robot.sent = 0
-    robot.meet()
-    robot.play(drive(400, 100))
-    until_accepted(robot, 100)
+    # another one, since the first still counts the node that was killed among its subscribers
+    other = Robot(domain)
+    try:
+        other.meet()
+        other.play(drive(400, 100))
+        until_accepted(other, 100)
+    finally:
+        other.close()
     assert 'Traceback' not in node.output
     assert node.stop() == 0

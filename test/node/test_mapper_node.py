@@ -203,7 +203,7 @@ def test_services_during_em_and_reset(start: Any, robot: Robot) -> None:
     assert not save.success
     # a run that is under way does not keep the node from ending
     robot.sent = 0
-    robot.play(messages[: len(messages) // 2], rate=2500.0)
+    robot.play(messages[: len(messages) // 2], rate=1000.0)
     robot.ask('run_em')
     robot.until(lambda: robot.diagnostics['EM']['state'] != 'idle', what='EM runs again')
     assert node.stop(signal.SIGTERM) == 0
