@@ -37,6 +37,7 @@ def by_bag(quaternion: XYZW, x: float = 1.0) -> Pose2 | None:
 
 
 def by_tf(quaternion: XYZW, x: float = 1.0) -> Pose2 | None:
+    pytest.importorskip('rclpy', reason='the transforms of the node need rclpy')
     translation, rotation = given(quaternion, x)
     found = SimpleNamespace(transform=SimpleNamespace(translation=translation, rotation=rotation))
     buffer = SimpleNamespace(lookup_transform=lambda *names: found)
