@@ -96,8 +96,8 @@ class PoseAssociator:
             do not depend on how the two streams interleave.
         clock : callable
             Returns seconds. A reading times out when `pose_timeout` has passed both by the stamps that came after it
-            and by this clock: so neither a bag that is replayed fast nor a simulation that stands still loses any. While
-            odometry keeps coming, no reading times out that only overtook it.
+            and by this clock: so neither a bag that is replayed fast nor a simulation that stands still loses any.
+            While odometry keeps coming, no reading times out that only overtook it.
         at_once : int
             Readings that one call places or rejects at the most, so that odometry that comes after a long silence
             holds up nobody; 0 is no bound.
