@@ -12,9 +12,14 @@ half a minute to two minutes the first time, some seconds if all is there. To be
 user who will run the node, or with NUMBA_CACHE_DIR set to a folder that this user can write."""
 
 
+def parser() -> argparse.ArgumentParser:
+    """Return the parser of the command line."""
+    return argparse.ArgumentParser(prog='warm_up', description=DESCRIPTION)
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; return its exit code."""
-    argparse.ArgumentParser(prog='warm_up', description=DESCRIPTION).parse_args(arguments)
+    parser().parse_args(arguments)
     from ..core import warm_up
     from ..core.runtime import compiling, jit
 

@@ -165,10 +165,10 @@ class PoseAssociator:
         self._newest_range = max(message.stamp, self._newest_range or message.stamp)
         self._settle()
 
-    def reject(self, message: RangeMessage, reason: str) -> None:
-        """Take one Range message and reject it for a reason that is not its own."""
-        self.received += 1
-        self._reject(message.frame_id, reason)
+    def reject(self, message: RangeMessage, reason: str, count: int = 1) -> None:
+        """Take one Range message, or several like it, and reject it for a reason that is not its own."""
+        self.received += count
+        self._reject(message.frame_id, reason, count)
 
     def clear(self, parameters: Parameters | None = None) -> None:
         """Forget readings, counts and path; odometry is kept, so that the next reading gets a pose.

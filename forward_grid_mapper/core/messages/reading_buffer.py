@@ -23,10 +23,10 @@ STEP = 1024
 
 
 class _Thinned(NamedTuple):
-    """The columns that stay of the first `size` readings, `count` of them, in the buffer's state `version`."""
+    """The columns that stay of the first `size` readings, `stay` of them, in the buffer's state `version`."""
 
     columns: Columns
-    count: int
+    stay: int
     size: int
     version: int
 
@@ -58,6 +58,7 @@ class ReadingBuffer:
         self.before_thinning: list[Callable[[], None]] = []
         self.aside: Callable[[Callable[[], _Thinned], Callable[[_Thinned | None], None]], None] | None = None
         self._version = 0
+        self._larger: Columns | None = None
         # held while columns are replaced, so that a snapshot never mixes old and new ones
         self._lock = threading.Lock()
         self.clear()
@@ -119,7 +120,7 @@ class ReadingBuffer:
 
     def counts(self) -> dict[str, tuple[int, int]]:
         """Return, for each sensor, how many readings were ever appended, and how many of them were without echo."""
-        return dict(zip(self._names, zip(self._counts, self._silent, strict=True), strict=True))
+        return dict(zip(list(self._names), zip(self._counts, self._silent, strict=False), strict=False))
 
     def _number_of(self, sensor: str) -> int:
         number = self._names.setdefault(sensor, len(self._names))
@@ -141,10 +142,7 @@ class ReadingBuffer:
 
     def bounded(self) -> Readings:
         """Return the readings to map from: all that is held, thinned to `bound`."""
-        readings = self.snapshot()
-        if not self.bound or len(readings) <= self.bound:
-            return readings
-        return readings.select(kept(readings, self.bound))
+        return bounded(self.snapshot(), self.bound)
 
     def _reserve(self, count: int) -> None:
         size = len(self._columns['z'])
@@ -176,8 +174,7 @@ class ReadingBuffer:
     def _begin_anew(self) -> None:
         """Forget what was made of columns that are no longer those of the buffer."""
         self._version += 1
-        self._larger: Columns | None = None
-        self._moved = 0
+        self._larger, self._moved = None, 0
         self._thinning, self._failed_at = False, 0
 
     def _thin(self) -> None:
@@ -214,14 +211,19 @@ class ReadingBuffer:
         for look in self.before_thinning:
             look()
         columns, tail = thinned.columns, slice(thinned.size, self._size)
-        size = thinned.count + self._size - thinned.size
+        size = thinned.stay + self._size - thinned.size
         if size > len(columns['z']):
-            columns = _grown(columns, thinned.count, 2 * size)
+            columns = _grown(columns, thinned.stay, 2 * size)
         for name, column in self._columns.items():
-            columns[name][thinned.count : size] = column[tail]
+            columns[name][thinned.stay : size] = column[tail]
         with self._lock:
             self._columns, self._size = columns, size
         self._begin_anew()
+
+
+def bounded(readings: Readings, bound: int) -> Readings:
+    """Return the readings thinned to `bound`; 0 is no bound."""
+    return readings if not bound or len(readings) <= bound else readings.select(kept(readings, bound))
 
 
 def _empty(like: Columns, size: int) -> Columns:
