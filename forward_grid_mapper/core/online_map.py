@@ -94,6 +94,12 @@ class OnlineMap:
         """Give the map up: calls end soon, with `Cancelled`; may be called from any thread."""
         self._stop[0] = 1
 
+    def dismantle(self) -> None:
+        """Free the memory of a map that nobody needs any more, bit by bit: at once, it would keep the GIL for long."""
+        self._evidence = None
+        while self._kept:
+            self._kept.popitem()
+
     def __len__(self) -> int:
         """Return the number of readings kept."""
         return 0 if self._evidence is None else len(self._evidence)

@@ -85,6 +85,7 @@ class OnlineWorker:
         It is called in the worker's thread.
         """
         self._map.cancel()
+        self.worker.put(self._map.dismantle)
         self.epoch += 1
         self._parameters = parameters
         wanted = self._map = OnlineMap(parameters)
