@@ -6,9 +6,10 @@ usage: executor.py [--readings 500000] [--rate 500] [--seconds 30] [--cold] [--m
 Starts a node in a process of its own, with the online map on and a journal of so many readings of the simulated
 corridor to restart from, publishes Range and odometry to it all the while, and calls every service: EM runs, maps are
 fetched and saved, parameters change, and at last everything is forgotten. A timer of 2 ms in the node's own executor
-measures how late it is called: `late` is the longest delay, and what the executor's thread itself computed meanwhile is
-`own`; the rest is other threads that held the GIL, and other processes. With --cold, the kernels are compiled first.
-Needs rclpy.
+measures how late it is called: `late` is the longest delay, of which the executor's own thread computed for `own` ms.
+`most own` is the longest that it computed between two calls. The rest of a delay is other threads that held the GIL,
+and the machine: `machine` is how late a process that does nothing else was woken at the worst. With --cold, the kernels
+are compiled first. Needs rclpy.
 """
 
 from __future__ import annotations
@@ -54,6 +55,19 @@ class Probe:
             print(f'probe {now:.4f} {self._late:.5f} {self._own:.5f}', flush=True)
             self._begin, self._late, self._own = now, 0.0, 0.0
         self._last, self._cpu = now, cpu
+
+
+def run_control() -> None:
+    """Measure how late a process is woken that does nothing else."""
+    late, begin = 0.0, time.monotonic()
+    while True:
+        last = time.monotonic()
+        time.sleep(PERIOD)
+        now = time.monotonic()
+        late = max(late, now - last - PERIOD)
+        if now > begin + SAMPLE:
+            print(f'probe {now:.4f} {late:.5f} 0', flush=True)
+            late, begin = 0.0, now
 
 
 def run_node(arguments: list[str]) -> int:
@@ -112,25 +126,26 @@ class Account:
         """Return whether the node has said so."""
         return any(text in line for line in self.lines)
 
-    def row(self, name: str, begin: float, end: float) -> str:
-        """Return a line of the table: the longest delay in this time, the executor's own part of it, and the 99 %."""
+    def row(self, begin: float, end: float) -> str:
+        """Return what was measured in this time: the longest delay, the executor's own part of it, the most, 99 %."""
         within = [(late, own) for now, late, own in self.samples if begin < now <= end + SAMPLE]
         late, own = max(within, default=(math.nan, math.nan))
         usual = np.percentile([late for late, _ in within], 99) if within else math.nan
         most = max((own for _, own in within), default=math.nan)
-        return f'{name:42s}{end - begin:8.1f}{1e3 * late:10.1f}{1e3 * own:10.1f}{1e3 * most:10.1f}{1e3 * usual:10.1f}'
+        return f'{1e3 * late:10.1f}{1e3 * own:10.1f}{1e3 * most:10.1f}{1e3 * usual:10.1f}'
 
 
 class Load:
     """A robot that goes on driving to and fro, and calls services."""
 
-    def __init__(self, rate: float, first: int) -> None:
+    def __init__(self, process: subprocess.Popen[str], rate: float, first: int) -> None:
         import rclpy
         from nav_msgs.msg import Odometry
         from rclpy.qos import QoSProfile, ReliabilityPolicy
         from sensor_msgs.msg import Range
 
         rclpy.init()
+        self._process = process
         self.node = rclpy.create_node('load')
         quality = QoSProfile(depth=5000, reliability=ReliabilityPolicy.RELIABLE)
         self._ranges = self.node.create_publisher(Range, 'sonar', quality)
@@ -174,6 +189,8 @@ class Load:
         while not condition():
             if time.monotonic() > end:
                 raise TimeoutError('the node does not answer')
+            if self._process.poll() is not None:
+                raise RuntimeError('the node ended')
             if self.met():
                 self.send()
             rclpy.spin_once(self.node, timeout_sec=0.001)
@@ -220,16 +237,20 @@ def measure(options: argparse.Namespace, folder: Path) -> None:
     process = subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, bufsize=1, env=environment
     )
-    account, begin = Account(process), time.monotonic()
-    load = Load(options.rate, int(readings.stamp.max()) + 10_000_000_000)
-    print(f'{"":42s}{"s":>8s}{"late ms":>10s}{"own ms":>10s}{"most own":>10s}{"99 % late":>10s}', flush=True)
+    control = subprocess.Popen([sys.executable, __file__, '--control'], stdout=subprocess.PIPE, text=True, bufsize=1)
+    account, machine, begin = Account(process), Account(control), time.monotonic()
+    load = Load(process, options.rate, int(readings.stamp.max()) + 10_000_000_000)
+    print(
+        f'{"":42s}{"s":>8s}{"late ms":>10s}{"own ms":>10s}{"most own":>10s}{"99 % late":>10s}{"machine":>10s}',
+        flush=True,
+    )
 
     def phase(name: str, work: Callable[[], object]) -> None:
         nonlocal begin
         work()
         end = time.monotonic()
         time.sleep(2 * SAMPLE)
-        print(account.row(name, begin, end), flush=True)
+        print(f'{name:42s}{end - begin:8.1f}{account.row(begin, end)}{machine.row(begin, end)[:10]}', flush=True)
         begin = time.monotonic()
 
     def wait(seconds: float) -> Callable[[], None]:
@@ -254,6 +275,7 @@ def measure(options: argparse.Namespace, folder: Path) -> None:
         phase('driving on after it', wait(5.0))
     finally:
         process.terminate()
+        control.kill()
         process.wait(20)
     print(f'{load.sent} ranges sent')
     print('\n'.join(answers))
@@ -276,4 +298,6 @@ def main() -> None:
 if __name__ == '__main__':
     if sys.argv[1:2] == ['--node']:
         sys.exit(run_node(sys.argv[2:]))
+    if sys.argv[1:2] == ['--control']:
+        run_control()
     main()

@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+import os
+import sys
 import threading
 from collections import deque
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any, NamedTuple, TypeVar
 
 from ..core.common.errors import MapperError
 
 T = TypeVar('T')
+
+NICE = 10
+"""What workers give way by (nice), so that the executor gets a core at once when a message comes."""
 
 AT_ONCE = 20
 """Results that the executor takes in one turn; the others wait for the next."""
@@ -127,6 +133,10 @@ class Worker:
                 self._fail(task, error)
 
     def _run(self) -> None:
+        # Linux has a priority for each thread, which the threads that it starts inherit
+        if sys.platform == 'linux':
+            with suppress(OSError):
+                os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), NICE)
         while True:
             with self._wake:
                 while not self._tasks and not self._closed:

@@ -14,7 +14,7 @@ from typing import Any
 MOST_STREAMS = 256
 """Publishers, or sensors, of a topic that are told apart."""
 
-STRANGE = 1000
+STRANGE = 100
 """Messages missing at once from which on a publisher that was not known is the likelier cause, if there is one."""
 
 LASTING = 10.0
