@@ -23,7 +23,7 @@ QUEUE = 2000
 """Messages that may wait for the node in the middleware, so that a pause of a second loses none."""
 
 AT_ONCE = 200
-"""Messages, or readings, that one turn of the executor takes at the most: two milliseconds or so."""
+"""Messages, or readings, after which the executor gets its turn: two milliseconds or so."""
 
 
 class Intake:
@@ -174,13 +174,13 @@ class Intake:
         """Go on with what is left to do, a portion of it; called by the executor."""
         if not self._ready:
             return
+        done = self._associator.settled + AT_ONCE
         for _ in range(AT_ONCE):
+            if self._associator.settled >= done or not self.busy:
+                break
             if self._associator.behind:
-                # as much work as all that is allowed
                 self._associator.settle()
-                break
-            if not self._held:
-                break
+                continue
             message, sent, paused = self._held.popleft()
             self._ranges_held -= isinstance(message, RangeMessage)
             self._take(message, sent, paused)

@@ -167,13 +167,20 @@ class MapperNode(Node):
             self.journal.begin(self._steady)
             self.create_timer(FEED_PERIOD, self._feed, clock=self._steady)
             self.intake.begin()
-            self.mapping = True
-            for work in self._when_ready:
-                work()
-            self._when_ready.clear()
+            self._map()
         self._lacks.discard(what)
         if not self._lacks:
             self.get_logger().info('ready: the live map follows the readings')
+
+    def _map(self) -> None:
+        """Answer those who waited, once what was held back is taken."""
+        if self.intake.busy:
+            self.inbox.put(self._map)
+            return
+        self.mapping = True
+        for work in self._when_ready:
+            work()
+        self._when_ready.clear()
 
     def _when(self, handler: Callable[[Reply], None], reply: Reply) -> None:
         """Have a service answered, once the earlier readings are back."""
@@ -208,6 +215,8 @@ class MapperNode(Node):
                 self._when_ready.append(self._restart_online)
         if parameters.node.publish_rate != before.node.publish_rate:
             self._live_timer.timer_period_ns = round(NANOSECONDS / parameters.node.publish_rate)
+            # or else the old period has to pass first
+            self._live_timer.reset()
 
     # maps
 

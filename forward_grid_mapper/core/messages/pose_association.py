@@ -72,6 +72,8 @@ class PoseAssociator:
         How often odometry's clock jumped back.
     behind : bool
         Whether more readings than `at_once` can be placed now: call `settle` before the next message is added.
+    settled : int
+        Readings placed, rejected or looked at again so far: how much work there was.
     limits : LimitWatch
         Warns of ranges and limits in different units.
     """
@@ -127,6 +129,7 @@ class PoseAssociator:
         self._at_once = at_once or sys.maxsize
         self._odometry_arrival = self._odometry_sent = 0.0
         self.behind = False
+        self.settled = 0
         self._other_frame = False
 
     @property
@@ -291,7 +294,9 @@ class PoseAssociator:
             # odometry may be late by up to JUMP, and a file can wait for it
             left = self._settle_up_to(newest - JUMP if self._patient else newest, left)
         if not self._patient:
-            self.behind = left <= 0 or self._time_out(newest, left) <= 0
+            left = self._time_out(newest, left) if left else 0
+            self.behind = not left
+            self.settled += self._at_once - left
 
     def _time_out(self, newest: int | None, left: int) -> int:
         """Reject readings that have waited too long, ask for poses again; return how much of `left` is left."""

@@ -219,6 +219,8 @@ class ReadingBuffer:
         with self._lock:
             self._columns, self._size = columns, size
         self._begin_anew()
+        # so much may have come meanwhile that it is time again
+        self._thin()
 
 
 def bounded(readings: Readings, bound: int) -> Readings:
