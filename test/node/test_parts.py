@@ -239,7 +239,7 @@ class Gate:
         self.inside = self.most = 0
         self._lock = threading.Lock()
         self._original = getattr(owner, name)
-        monkeypatch.setattr(owner, name, lambda *arguments, **options: self._pass(*arguments, **options))
+        monkeypatch.setattr(owner, name, self._pass)
 
     def _pass(self, *arguments: Any, **options: Any) -> Any:
         with self._lock:
