@@ -49,17 +49,20 @@ def _leaves(pattern: int, dx: int, dy: int) -> bool:
 
 
 @kernel
+def _is_end(s: State, prior: Prior, c: int) -> bool:
+    """Return whether cell c is occupied and no wall goes through it."""
+    return bool(s.maps.occupied[c] and prior.shape[s.maps.pattern[c]] < prior.shape[255])
+
+
+@kernel
 def _may_close(s: State, prior: Prior, c: int, dx: int, dy: int) -> bool:
-    """Return whether cell c and the one at (dx, dy) from it are ends of walls that lead to each other."""
-    occupied, pattern = s.maps.occupied, s.maps.pattern
-    height, width = s.lattice.height, s.lattice.width
+    """Return whether end c and the cell at (dx, dy) from it are ends of walls that lead to each other."""
+    pattern, width = s.maps.pattern, s.lattice.width
     row, column = c // width + dy, c % width + dx
-    if not (0 <= row < height and 0 <= column < width):
+    if not (0 <= row < s.lattice.height and 0 <= column < width):
         return False
-    o, through = row * width + column, prior.shape[255]
-    if not occupied[c] or not occupied[o] or prior.shape[pattern[c]] >= through or prior.shape[pattern[o]] >= through:
-        return False
-    return bool(_leaves(pattern[c], dx, dy) and _leaves(pattern[o], -dx, -dy))
+    o = row * width + column
+    return bool(_is_end(s, prior, o) and _leaves(pattern[c], dx, dy) and _leaves(pattern[o], -dx, -dy))
 
 
 @kernel
@@ -125,6 +128,8 @@ def _list_gaps(
     for c in cells:
         if s.stop[0]:
             break
+        if not _is_end(s, prior, c):
+            continue
         # each pair once
         for dy in range(n + 1):
             for dx in range(-n, n + 1, 1 if dy == n else 2 * n):
@@ -164,7 +169,7 @@ def close_gaps(s: State, prior: Prior, least: Least, cells: NDArray[np.int64], l
         m = _list_gaps(s, prior, least, cells, n, path, gaps, gains)
         for k in np.argsort(-gains[:m], kind='mergesort'):
             c, dx, dy, up = gaps[k, 0], gaps[k, 1], gaps[k, 2], gaps[k, 3]
-            if _may_close(s, prior, c, dx, dy) and _path(s, c, dx, dy, up == 1, path):
+            if _is_end(s, prior, c) and _may_close(s, prior, c, dx, dy) and _path(s, c, dx, dy, up == 1, path):
                 gain = _flip_all(s, prior, least, path, n - 1)
                 if gain > 0.0:
                     flips += n - 1
