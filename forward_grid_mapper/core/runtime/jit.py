@@ -76,7 +76,10 @@ _remove_unused(Path(CACHE))
 def _compiled(function: F, **options: Any) -> F:
     before, config.CACHE_DIR = config.CACHE_DIR, CACHE
     try:
-        compiled: Any = numba.njit(cache=True, nogil=True, error_model='numpy', **options)(function)
+        # nothing calls a kernel from C
+        compiled: Any = numba.njit(cache=True, nogil=True, error_model='numpy', no_cfunc_wrapper=True, **options)(
+            function
+        )
     finally:
         config.CACHE_DIR = before
     return cast(F, compiled)
