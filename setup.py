@@ -6,7 +6,7 @@ from setuptools import find_packages, setup
 
 NAME = 'forward_grid_mapper'
 SHARE = f'share/{NAME}'
-COMMANDS = ('mapper', 'process_bag', 'learn', 'replay_bag', 'simulate', 'experiment', 'demo')
+COMMANDS = ('mapper', 'process_bag', 'explain', 'learn', 'replay_bag', 'simulate', 'experiment', 'demo')
 
 
 def shared(folder):

@@ -15,6 +15,7 @@ from .commands import signals
 COMMANDS = {
     'mapper': ('node.main', 'the ROS 2 node: map while driving'),
     'process_bag': ('commands.process_bag', 'map a recorded drive'),
+    'explain': ('commands.explain', 'say why a cell of a map is what it is'),
     'learn': ('commands.learn', 'learn the sensor model from a recorded drive'),
     'replay_bag': ('commands.replay_bag', 'play a recorded drive to the node'),
     'simulate': ('commands.simulate', 'record a drive through a small world with a known map'),
@@ -62,6 +63,11 @@ def mapper() -> int:
 def process_bag() -> int:
     """Run `process_bag`; return its exit code."""
     return run('process_bag')
+
+
+def explain() -> int:
+    """Run `explain`; return its exit code."""
+    return run('explain')
 
 
 def learn() -> int:
