@@ -5,9 +5,11 @@ Signals get their handlers before the commands' modules are imported, which take
 
 from __future__ import annotations
 
+import difflib
 import importlib
 import sys
 from collections.abc import Sequence
+from pathlib import Path
 
 from . import __version__
 from .commands import signals
@@ -97,16 +99,23 @@ def demo() -> int:
 
 def main() -> int:
     """Run the command named by the first argument."""
-    if len(sys.argv) > 1 and sys.argv[1] in COMMANDS:
-        return run(sys.argv[1], sys.argv[2:])
-    if len(sys.argv) > 1 and sys.argv[1] == '--version':
+    given = sys.argv[1] if len(sys.argv) > 1 else ''
+    if given in COMMANDS:
+        return run(given, sys.argv[2:])
+    if given == '--version':
         print(__version__)
         return 0
-    lines = '\n'.join(f'  {name:12s} {text}' for name, (_, text) in COMMANDS.items())
-    usage = f'usage: python3 -m forward_grid_mapper COMMAND …\n\n{lines}\n\nCOMMAND --help tells more.'
-    if len(sys.argv) > 1 and sys.argv[1] in ('-h', '--help'):
+    name = Path(sys.argv[0]).name
+    program = 'python3 -m forward_grid_mapper' if name == '__main__.py' else name
+    lines = '\n'.join(f'  {command:12s} {text}' for command, (_, text) in COMMANDS.items())
+    usage = f'usage: {program} COMMAND …\n\n{lines}\n\nCOMMAND --help tells more.'
+    if given in ('-h', '--help'):
         print(usage)
         return 0
+    if given:
+        near = difflib.get_close_matches(given, COMMANDS, n=1)
+        hint = f'; did you mean {near[0]}?' if near else ''
+        print(f'{program}: error: there is no command {given!r}{hint}\n', file=sys.stderr)
     print(usage, file=sys.stderr)
     return 2
 
