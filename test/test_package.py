@@ -117,6 +117,12 @@ def test_every_command_can_be_started(setup: dict[str, Any]) -> None:
         assert callable(importlib.import_module(f'{NAME}.{module}').main)
 
 
+def test_the_citation_and_the_changes_are_of_this_version() -> None:
+    version = forward_grid_mapper.__version__
+    assert yaml.safe_load((ROOT / 'CITATION.cff').read_text())['version'] == version
+    assert re.search(rf'^## {re.escape(version)}\b', (ROOT / 'CHANGELOG.md').read_text(), re.MULTILINE)
+
+
 @pytest.mark.parametrize('build', ['dist_info', 'bdist_wheel', 'editable_wheel'])
 def test_pip_puts_one_command_on_the_path(build: str) -> None:
     made = given_to_setuptools(build)['entry_points']['console_scripts']
