@@ -42,6 +42,27 @@ def test_reasons_why_there_is_no_pose() -> None:
     assert isinstance(made.at(round(3.15 * SECOND), 9.0), Pose2), '10.9 m in 0.1 s: a drive and one correction'
 
 
+def test_a_wild_pose_gives_no_reading_a_place_not_even_one_of_its_own_stamp() -> None:
+    made = history((1.0, Pose2(0, 0, 0)), (1.1, Pose2(600, 400, 0)), (1.2, Pose2(0.1, 0, 0)), (1.3, Pose2(0.2, 0, 0)))
+    assert made.at(round(1.1 * SECOND), 1.0) == 'pose_jump'
+    assert made.at(round(1.15 * SECOND), 1.0) == 'pose_jump'
+    assert made.at(round(1.2 * SECOND), 1.0) == Pose2(0.1, 0, 0), 'back where it was before'
+    assert made.at(round(1.3 * SECOND), 1.0) == Pose2(0.2, 0, 0)
+
+
+def test_a_correction_costs_the_readings_of_one_stamp() -> None:
+    made = history(*((0.1 * k, Pose2(0.1 * k + (50.0 if k >= 5 else 0.0), 0, 0)) for k in range(10)))
+    found = [made.at(round(0.1 * k * SECOND), 1.0) for k in range(10)]
+    assert [k for k, pose in enumerate(found) if pose == 'pose_jump'] == [5]
+
+
+def test_the_first_pose_is_taken_as_it_is() -> None:
+    made = history((1.0, Pose2(600, 0, 0)), (1.1, Pose2(0, 0, 0)), (1.2, Pose2(0.1, 0, 0)))
+    assert made.at(SECOND, 1.0) == Pose2(600, 0, 0)
+    assert made.at(round(1.1 * SECOND), 1.0) == 'pose_jump'
+    assert made.at(round(1.2 * SECOND), 1.0) == Pose2(0.1, 0, 0)
+
+
 def test_old_poses_go() -> None:
     made = PoseHistory()
     for k in range(MOST_POSES + 1):
