@@ -1,12 +1,12 @@
-"""Poses that contradict the readings: extrinsics or odometry mirrored, turned or out of scale, stamps late.
+"""What contradicts the readings: extrinsics or odometry mirrored, turned or out of scale, cones too wide, stamps late.
 
 Such input gives a map without any error, only a wrong one. But each of these faults can be undone: mirrored sensors
 are mirrored back, stamps are shifted back. So a small map is made of a stretch of the drive for each assumed fault,
 with the fault undone, and all are compared with the map of the readings as they are. Of a sound drive, no map with a
 fault undone explains the readings better.
 
-Only poses are changed, never ranges, so the likelihoods of all these maps can be compared. Ranges that are too large by
-a factor look like odometry that is too small by it.
+Poses and cones are changed, never ranges, so the likelihoods of all these maps can be compared. Ranges that are too
+large by a factor look like odometry that is too small by it.
 
 The cost is that of some twenty maps of at most `MOST` readings each, whatever the length of the drive.
 """
@@ -54,6 +54,12 @@ SHIFTS = (LEAST_SHIFT, 0.5, 1.0)
 
 FACTORS = (0.3048, 0.5, 2.0, 3.281)
 """Scales of odometry: feet, and a wheel's radius taken for its diameter, both ways."""
+
+WIDTHS = (0.25, 0.5, 2.0, 3.0)
+"""By how much the field of view is wider than stated."""
+
+WIDEST = 1.5
+"""Radians of half a field of view, at most."""
 
 STEP = 0.05
 """Metres of driving in which the direction of travel is measured."""
@@ -105,7 +111,7 @@ class _Drive:
 def consistency_warnings(
     readings: Readings, extrinsics: Mapping[str, Pose2], parameters: Parameters | None = None
 ) -> list[str]:
-    """Return what is wrong with the poses or stamps of readings; empty if nothing seems to be.
+    """Return what is wrong with poses, stamps or cones of readings; empty if nothing seems to be.
 
     Parameters
     ----------
@@ -204,6 +210,14 @@ def _faults(drive: _Drive) -> Iterator[_Fault]:
             f'by the readings the robot drives {much} odometry says; are odometry or ranges in feet, or is the radius '
             f'of the wheels wrong? Correct the driver: messages must state metres',
             drive.placed(robot=np.stack([factor * x, factor * y, yaw])),
+        )
+    for width in WIDTHS:
+        half = np.minimum(width * drive.readings.half_angle, WIDEST)
+        stated, fitting = (round(math.degrees(2 * float(np.median(h)))) for h in (drive.readings.half_angle, half))
+        yield _Fault(
+            f'the field of view is stated as {stated} degrees, and the readings look as if it were about {fitting}; '
+            f'is it half of the angle, or twice? Correct the driver, or set the parameter field_of_view',
+            replace(drive.readings, half_angle=half),
         )
     for shift in SHIFTS:
         for sign, word in ((-1, 'late'), (1, 'early')):

@@ -47,6 +47,9 @@ class Messages(NamedTuple):
         by = round(seconds * NANOSECONDS)
         return self._replace(ranges=[m._replace(stamp=m.stamp + by) for m in self.ranges])
 
+    def wide(self, factor: float) -> Messages:
+        return self._replace(ranges=[m._replace(field_of_view=factor * m.field_of_view) for m in self.ranges])
+
     def in_feet(self) -> Messages:
         def feet(m: RangeMessage) -> RangeMessage:
             return m._replace(range=3.281 * m.range, min_range=3.281 * m.min_range, max_range=3.281 * m.max_range)
@@ -124,6 +127,14 @@ SCENARIOS: dict[str, tuple[Callable[[Messages], Messages], str]] = {
     'odometry a second late': (
         lambda m: m.late(-1.0),
         r'seem to be about 1 s early against those of',
+    ),
+    'cones of 60 degrees for 15': (
+        lambda m: m.wide(4.0),
+        r'field of view is stated as 60 degrees.*as if it were about 15;.*set the parameter field_of_view',
+    ),
+    'cones of 7 degrees for 15': (
+        lambda m: m.wide(0.5),
+        r'field of view is stated as 8 degrees.*as if it were about 15',
     ),
     'odometry in feet': (
         lambda m: m.driven(lambda p: Pose2(3.281 * p.x, 3.281 * p.y, p.yaw)),
