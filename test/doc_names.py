@@ -251,6 +251,18 @@ def is_spoken(name: str) -> bool:
     return name in keys | texts_in('files') or name.split(': ', maxsplit=1)[0] in keys
 
 
+@cache
+def library_names() -> frozenset[str]:
+    """What programs of others import and use: functions of the library, their arguments, and what its results have."""
+    found = {'grid.shape', 'grid.extent'}
+    for node in ast.walk(tree_of(PACKAGE / 'library.py')):
+        if isinstance(node, ast.FunctionDef):
+            found |= {node.name} | {arg.arg for arg in node.args.args}
+    for path in (PACKAGE / 'library.py', PACKAGE / 'core' / 'maps' / 'map_set.py'):
+        found |= {name.rpartition('.')[2] for name in names_in(path)}
+    return frozenset(found)
+
+
 def exists(name: str, page: Path) -> bool:
     """Whether anything in the repository has this name."""
     first = name.split(maxsplit=1)[0] if name.split() else ''
@@ -268,6 +280,7 @@ def exists(name: str, page: Path) -> bool:
         or is_member(name)
         or f'{name}.py' in sources()
         or is_spoken(name)
+        or (page.name in ('README.md', 'library.md') and re.split(r'[=(]', name)[0] in library_names())
     )
 
 

@@ -202,4 +202,6 @@ def _nothing_associated(
     for reason, count in associator.odometry_rejected.most_common():
         reasons += f'; {count} odometry messages were rejected too: {ODOMETRY_REASONS[reason]}'
     hints = ''.join(f'; {warning}' for warning in associator.limits.warnings())
+    if associator.unknown_frames:
+        hints += f'; {lookup.advice(associator.base_frame, sorted(associator.unknown_frames))}'
     return InputError(f'all {associator.received} readings were rejected: {reasons}{hints}')
