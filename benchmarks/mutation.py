@@ -33,8 +33,8 @@ MODULES = {
     'core/messages/pose_history': ('core/messages/test_pose_history',),
     'core/messages/quaternions': ('test_orientations',),
     'core/messages/rep117': ('core/messages/test_pose_association',),
-    'core/messages/thinning': ('core/messages/test_thinning',),
-    'bags/salvage': ('bags/test_salvage', 'bags/test_damaged_bags'),
+    'core/messages/robot_path': ('core/messages/test_robot_path',),
+    'bags/choice': ('bags/test_topic_choice',),
     'bags/scan_mcap': ('bags/test_salvage', 'bags/test_damaged_bags'),
     'bags/static_transforms': ('bags/test_static_transforms',),
 }
