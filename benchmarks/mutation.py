@@ -3,10 +3,10 @@
 
 usage: mutation.py [--only NAME ...] [--survivors]
 
-The changes are made by cosmic-ray (`pip install cosmic-ray`) in a copy of the checkout: operators, comparisons, numbers
-and constants are replaced, loops and exceptions left out, and so on. The tests of a module are run after each change,
-without compiling kernels. The score is the part of the changes with which a test fails; changes that mean the same as
-before, as in messages that no test spells out, count against it. `--survivors` prints the others.
+The changes are made by cosmic-ray 8 (`pip install cosmic-ray`, in an environment of its own if that is on the path), in
+a copy of the checkout: operators, comparisons, numbers and constants are replaced, loops and exceptions left out, and
+so on. The tests of a module are run after each change, without compiling kernels. The score is the part of the changes
+with which a test fails; changes that mean the same as before count against it. `--survivors` prints the others.
 
 Left out are changes of `|`, nearly all of which are in annotations that are never evaluated, and those of an operator
 into one of bits, modulo or powers, which any test notices.
@@ -120,7 +120,7 @@ def main() -> None:
     parser.add_argument('--survivors', action='store_true', help='print the changes that no test noticed')
     options = parser.parse_args()
     if shutil.which('cosmic-ray') is None:
-        raise SystemExit('cosmic-ray is not on the path: pip install cosmic-ray, and run this in its environment')
+        raise SystemExit('cosmic-ray is not on the path: pip install cosmic-ray')
     print(f'{"module":34s}{"changes":>9s}{"noticed":>9s}{"score":>8s}{"seconds":>9s}')
     total = noticed = 0
     with tempfile.TemporaryDirectory() as name:

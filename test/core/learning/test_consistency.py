@@ -132,10 +132,7 @@ SCENARIOS: dict[str, tuple[Callable[[Messages], Messages], str]] = {
         lambda m: m.wide(4.0),
         r'field of view is stated as 60 degrees.*as if it were about 15;.*set the parameter field_of_view',
     ),
-    'cones of 7 degrees for 15': (
-        lambda m: m.wide(0.5),
-        r'field of view is stated as 8 degrees.*as if it were about 15',
-    ),
+    'half of the field of view': (lambda m: m.wide(0.5), r'field of view is stated as 7 degrees.*if it were about 15'),
     'odometry in feet': (
         lambda m: m.driven(lambda p: Pose2(3.281 * p.x, 3.281 * p.y, p.yaw)),
         r'the robot drives 1/3\.28 as far as odometry says.*in feet.*must state metres',
