@@ -24,15 +24,34 @@ COMMANDS = {
 """Module and help of each command."""
 
 
+EXTRAS = {'rosbags': 'offline', 'matplotlib': 'offline', 'rclpy': 'ros'}
+"""The extra of the installation that brings a package which not every command needs."""
+
+
 def run(command: str, arguments: Sequence[str] | None = None) -> int:
     """Import a command and run it; return its exit code. `arguments` are those of the process unless given."""
     signals.leave_at_once(command)
     signals.end_with_parent()
     module, _ = COMMANDS[command]
     try:
-        return int(importlib.import_module(f'.{module}', __package__).main(arguments))
+        main = importlib.import_module(f'.{module}', __package__).main
+    except ModuleNotFoundError as error:
+        if error.name is None or (package := error.name.partition('.')[0]) not in EXTRAS:
+            raise
+        print(f'{command}: error: {_what_brings(package)}', file=sys.stderr)
+        return 1
+    try:
+        return int(main(arguments))
     finally:
         signals.leave_silently()
+
+
+def _what_brings(package: str) -> str:
+    """Say how a package that is not installed can be."""
+    extra = f'pip install "forward_grid_mapper[{EXTRAS[package]}]", or .[{EXTRAS[package]}] in a checkout'
+    if package == 'rclpy':
+        return f"{package} is not installed: source ROS 2's setup.bash, or {extra}"
+    return f'{package} is not installed: {extra}; pip install {package} will do as well'
 
 
 def mapper() -> int:

@@ -127,13 +127,15 @@ def topics() -> frozenset[str]:
 
 @cache
 def launch_arguments() -> frozenset[str]:
-    """The arguments of the launch files."""
-    return frozenset(
-        node.args[0].value
-        for path in (ROOT / 'launch').glob('*.py')
-        for node in ast.walk(tree_of(path))
-        if isinstance(node, ast.Call) and getattr(node.func, 'id', '') == 'DeclareLaunchArgument'
-    )
+    """The arguments of the launch files: those declared by name, and the parameters that are arguments as well."""
+    found = set()
+    for path in (ROOT / 'launch').glob('*.py'):
+        for node in ast.walk(tree_of(path)):
+            if isinstance(node, ast.Call) and getattr(node.func, 'id', '') == 'DeclareLaunchArgument':
+                found |= {arg.value for arg in node.args if isinstance(arg, ast.Constant)}
+            if isinstance(node, ast.Assign) and isinstance(node.value, ast.Dict) and 'PARAMETERS' in _targets(node):
+                found |= {key.value for key in node.value.keys if isinstance(key, ast.Constant)}
+    return frozenset(found)
 
 
 def is_value(name: str) -> bool:
