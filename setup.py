@@ -7,7 +7,7 @@ from setuptools import find_packages, setup
 
 NAME = 'forward_grid_mapper'
 SHARE = f'share/{NAME}'
-COMMANDS = ('mapper', 'process_bag', 'explain', 'learn', 'replay_bag', 'simulate', 'experiment', 'demo')
+COMMANDS = ('mapper', 'process_bag', 'explain', 'learn', 'replay_bag', 'simulate', 'experiment', 'warm_up', 'demo')
 
 # ros2 run finds one executable for each command; pip, which puts them on everybody's PATH, installs one for all
 FOR_PIP = {'sdist', 'dist_info', 'bdist_wheel', 'editable_wheel'} & set(sys.argv)

@@ -22,6 +22,7 @@ COMMANDS = {
     'replay_bag': ('commands.replay_bag', 'play a recorded drive to the node'),
     'simulate': ('commands.simulate', 'record a drive through a small world with a known map'),
     'experiment': ('commands.experiment', "repeat the paper's experiments: a table and a figure"),
+    'warm_up': ('commands.warm_up', 'compile all kernels once, for a node that starts fast'),
     'demo': ('commands.demo', 'simulate, map, score: the whole way in one command'),
 }
 """Module and help of each command."""
@@ -90,6 +91,11 @@ def simulate() -> int:
 def experiment() -> int:
     """Run `experiment`; return its exit code."""
     return run('experiment')
+
+
+def warm_up() -> int:
+    """Run `warm_up`; return its exit code."""
+    return run('warm_up')
 
 
 def demo() -> int:
