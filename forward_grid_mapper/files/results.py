@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from ..core.common.errors import OutputError
 from ..core.common.grid import Grid
+from ..core.learning.consistency import consistency_warnings
 from ..core.learning.input_warnings import input_warnings
 from ..core.maps.map_set import MapSet
 from .map_archive import write_npz
@@ -67,6 +68,7 @@ def write_results(
         warnings = [
             *(source.get('warnings') or []),
             *input_warnings(maps.readings),
+            *consistency_warnings(maps.readings, source.get('extrinsics') or {}, maps.parameters),
             *filter(None, [quality_warning(maps)]),
         ]
         try:
