@@ -263,8 +263,7 @@ def measure(options: argparse.Namespace, folder: Path) -> None:
 
     answers: list[str] = []
     try:
-        phase('subscribed', lambda: load.until(load.met))
-        phase(f'restart from {len(readings)} readings', lambda: load.until(lambda: account.says('ready:')))
+        phase(f'start with {len(readings)} readings', lambda: load.until(lambda: load.met() and account.says('ready:')))
         phase('online map catches up', wait(options.seconds))
         phase('EM', lambda: answers.append(load.call(Trigger, 'run_em').message))
         phase('50 maps', lambda: [load.call(GetMap, f'get_{name}') for name in ['live_map', 'ml_map'] * 25])

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import gc
+import importlib
 import threading
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from functools import partial
 
 from ..core import warm_up
@@ -76,6 +78,9 @@ class Kernels:
 
     def _end(self) -> None:
         self.stage = ''
+        # what a picture needs is a hundred thousand objects more, and there as well by now
+        with suppress(ImportError):
+            importlib.import_module('..files.drawing', __package__)
         # what is there by now stays; the collector need not look at it again
         gc.freeze()
         gc.enable()

@@ -362,6 +362,7 @@ def test_thinning_without_memory_is_tried_again(inside: Callable[..., Inside], m
     monkeypatch.setattr(reading_buffer, 'kept', fail)
     robot.drive(0, 91)
     robot.until(lambda: any(worker.trouble for worker in robot.node.workers))
+    robot.until(lambda: not robot.node.associator.buffer._thinning)
     monkeypatch.setattr(reading_buffer, 'kept', original)
     robot.drive(91, 40)
     robot.until(lambda: robot.node.associator.buffer.held < 100)
