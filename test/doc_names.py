@@ -19,7 +19,7 @@ from forward_grid_mapper.core.messages.rep117 import ODOMETRY_REASONS, REASONS
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / 'forward_grid_mapper'
-PAGES = [ROOT / 'README.md', *sorted((ROOT / 'docs').glob('*.md'))]
+PAGES = [ROOT / 'README.md', ROOT / 'CONTRIBUTING.md', *sorted((ROOT / 'docs').glob('*.md'))]
 
 FOLDERS = (ROOT, PACKAGE, PACKAGE / 'core', ROOT / 'test')
 """Where a path in a page may begin, beside the page's own folder."""

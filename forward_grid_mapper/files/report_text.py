@@ -61,7 +61,12 @@ def _counts(data: dict[str, Any]) -> Iterator[str]:
     received = counts.get('received')
     if received is None:
         received = accepted + sum(rejected.values())
-    yield from _line('Readings', f'{received:,} received, {accepted:,} accepted ({_share(accepted, received)})')
+    waiting = f', {counts["waiting"]:,} waiting' if counts.get('waiting') else ''
+    yield from _line(
+        'Readings', f'{received:,} received, {accepted:,} accepted ({_share(accepted, received)}){waiting}'
+    )
+    if counts.get('lost') is not None:
+        yield from _line('Lost', f'{counts["lost"]:,} before they were received (estimated)')
     if rejected:
         yield '  rejected'
     by_frame = (data.get('input') or {}).get('rejected_by_frame') or {}

@@ -18,6 +18,7 @@ from .map_archive import write_npz
 from .map_files import write_raw, write_trinary
 from .output_folder import output_errors, output_folder
 from .quality_warning import quality_warning
+from .reading_archive import write_readings
 from .report import report_data, write_report
 
 
@@ -63,6 +64,7 @@ def write_results(
         write_trinary(folder / 'ml_map', maps.grid, maps.ml)
         write_raw(folder / 'uncertainty_map', maps.grid, maps.uncertainty)
         write_npz(folder / 'maps.npz', maps)
+        write_readings(folder / 'readings.npz', maps)
         warnings = [
             *(source.get('warnings') or []),
             *input_warnings(maps.readings),

@@ -17,6 +17,9 @@ PATIENCE = 0.2
 MOST_HELD = 10_000
 """Odometry messages that wait for a transform at the most."""
 
+LOOKUPS = 100
+"""Transforms that one odometry message asks for at the most, so that a transform that comes late holds up nobody."""
+
 MOST_MISSING = 1000
 """Frames whose absence is remembered, so that names that strangers make up cost no memory."""
 
@@ -91,16 +94,27 @@ class Extrinsics:
 
 
 class MapFrame:
-    """Gives odometry in another map frame, by the transform that TF has at its stamp; holds it back until TF does."""
+    """Gives odometry in another map frame, by the transform that TF has at its stamp; holds it back until TF does.
+
+    Attributes
+    ----------
+    timeout : float
+        Seconds, by stamps, for which it is held back; it may change.
+    dropped : int
+        Messages for which TF had no transform in time.
+    """
 
     def __init__(self, map_frame: str, transforms: Transforms, timeout: float) -> None:
         self._map_frame, self._transforms = map_frame, transforms
-        self._timeout = round(timeout * NANOSECONDS)
+        self.timeout = timeout
         self._held: deque[OdometryMessage] = deque()
         self.dropped = 0
 
     def convert(self, message: OdometryMessage) -> list[OdometryMessage]:
-        """Take an odometry message; return those whose pose in the map frame is known now, in order."""
+        """Take an odometry message; return those whose pose in the map frame is known now, `LOOKUPS` of them, in order.
+
+        Others wait for the next call.
+        """
         if not self._map_frame or message.frame_id.lstrip('/') == self._map_frame.lstrip('/'):
             return [message]
         # the associator sorts in what only overtook
@@ -113,7 +127,7 @@ class MapFrame:
             self._held.popleft()
             self.dropped += 1
         ready = []
-        while self._held:
+        for _ in range(min(len(self._held), LOOKUPS)):
             first = self._held[0]
             transform = self._transforms.lookup(self._map_frame, first.frame_id, first.stamp)
             pose = planar_pose(transform.translation, transform.rotation) if transform is not None else None
@@ -121,7 +135,7 @@ class MapFrame:
                 ready.append(first._replace(frame_id=self._map_frame, pose=pose.compose(first.pose)))
             elif first.pose is None:
                 ready.append(first)
-            elif message.stamp - first.stamp <= self._timeout:
+            elif message.stamp - first.stamp <= self.timeout * NANOSECONDS:
                 break
             else:
                 self.dropped += 1

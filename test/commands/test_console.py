@@ -45,9 +45,12 @@ def test_usage() -> None:
     helped = shell('--help')
     assert (helped.returncode, helped.stderr) == (0, '')
     assert all(re.search(rf'^  {name} ', helped.stdout, re.MULTILINE) for name in COMMANDS)
-    for arguments in ((), ('map_bag',)):
-        refused = shell(*arguments)
-        assert (refused.returncode, refused.stdout, refused.stderr) == (2, '', helped.stdout)
+    refused = shell()
+    assert (refused.returncode, refused.stdout, refused.stderr) == (2, '', helped.stdout)
+    refused = shell('procces_bag')
+    assert (refused.returncode, refused.stdout) == (2, '')
+    assert "no command 'procces_bag'; did you mean process_bag?" in refused.stderr
+    assert refused.stderr.endswith(helped.stdout)
     assert shell('--version').stdout == f'{__version__}\n'
 
 
