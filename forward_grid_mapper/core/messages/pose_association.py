@@ -12,6 +12,7 @@ from collections import Counter
 from collections.abc import Callable
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..common.parameters import Parameters
 from ..common.readings import Readings
@@ -128,6 +129,11 @@ class PoseAssociator:
     def readings(self) -> Readings:
         """The readings to map from: all that were accepted, or `max_readings` of them."""
         return self.buffer.bounded()
+
+    @property
+    def odometry(self) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """The poses of odometry that are held: stamps in ns, shape (M,), and x, y, yaw, shape (M, 3)."""
+        return self._history.held()
 
     def add_range(self, message: RangeMessage) -> None:
         """Take one Range message."""
