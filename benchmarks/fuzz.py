@@ -91,6 +91,7 @@ class Fuzz:
         self.node.start()
         while not self.node.mapping:
             self.work()
+            time.sleep(0.01)
 
     @property
     def associator(self) -> Any:

@@ -93,6 +93,7 @@ class Soak:
         self.node.start()
         while not (self.node.mapping and self.node.kernels.has('EM')):
             self.node.inbox.work()
+            time.sleep(0.01)
         self.message: list[float] = []
         self.update: list[float] = []
         self.live: list[float] = []

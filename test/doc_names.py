@@ -113,7 +113,7 @@ def topics() -> frozenset[str]:
     texts = texts_in('node')
     maps = next(
         ast.literal_eval(node.value)
-        for node in tree_of(PACKAGE / 'node' / 'mapper_node.py').body
+        for node in tree_of(PACKAGE / 'node' / 'map_publishers.py').body
         if isinstance(node, ast.Assign) and 'MAPS' in _targets(node)
     )
     # a text that ends so is completed by the name of a map

@@ -68,6 +68,7 @@ class MapperNode(Node):
         self.parameters, self._given_extrinsics, warnings = ros_parameters.declare(self)
         for warning in warnings:
             self.get_logger().warning(warning)
+        self.add_pre_set_parameters_callback(ros_parameters.with_points)
         self.add_on_set_parameters_callback(ros_parameters.validator(lambda: self.parameters, self._accept))
         self.failure = ''
         self.when_failed: Callable[[], object] = lambda: None
@@ -120,11 +121,11 @@ class MapperNode(Node):
             self.workers,
         )
         for name, handler in (
-            ('run_em', self.em.run_em),
-            ('save_maps', self.saver.save_maps),
-            ('reset', self.reset),
+            ('~/run_em', self.em.run_em),
+            ('~/save_maps', self.saver.save_maps),
+            ('~/reset', self.reset),
         ):
-            DeferredService(self, Trigger, f'~/{name}', partial(self._when, handler))
+            DeferredService(self, Trigger, name, partial(self._when, handler))
         DeferredService(self, SetBool, '~/pause', self.pause)
         self.create_timer(1.0, self.reporter.report, clock=self._steady)
         self._live_timer = self.create_timer(1.0 / node.publish_rate, self.publish_live, clock=self._steady)
