@@ -32,10 +32,9 @@ MODULES = {
     'core/messages/map_extent': ('core/messages/test_map_extent',),
     'core/messages/pose_history': ('core/messages/test_pose_history',),
     'core/messages/quaternions': ('core/messages/test_quaternions',),
-    'core/messages/rep117': ('core/messages/test_pose_association',),
+    'core/messages/rep117': ('core/messages/test_rep117', 'core/messages/test_pose_association'),
     'core/messages/robot_path': ('core/messages/test_robot_path',),
     'bags/choice': ('bags/test_topic_choice',),
-    'bags/scan_mcap': ('bags/test_salvage', 'bags/test_damaged_bags'),
     'bags/static_transforms': ('bags/test_static_transforms',),
 }
 """Modules, and the tests that must notice their changes; each takes seconds."""

@@ -22,11 +22,11 @@ BELOW = {
 }
 """The packages that each package may import from, beside itself."""
 
-CORE = ('common', 'runtime', 'sensor', 'messages', 'evidence', 'search', 'maps', 'learning')
+CORE = ('common', 'runtime', 'sensor', 'messages', 'evidence', 'search', 'maps', 'learning', 'trajectory')
 """The layers of the core, from the bottom up; the modules beside them are above all."""
 
 OUTSIDE = {
-    'core': {'numpy', 'numba'},
+    'core': {'numpy', 'numba', 'scipy'},
     'files': {'numpy', 'yaml', 'matplotlib'},
     # rosbags brings the decompressors
     'bags': {'numpy', 'rosbags', 'lz4', 'backports'},

@@ -29,9 +29,10 @@ DEPENDENCIES = {
         *('diagnostic_msgs', 'geometry_msgs', 'launch', 'launch_ros', 'nav_msgs', 'rclpy'),
         *('rosgraph_msgs', 'sensor_msgs', 'std_srvs', 'tf2_msgs', 'tf2_ros_py'),
         *('builtin_interfaces', 'rcl_interfaces', 'rviz2'),
-        *('python3-matplotlib', 'python3-numba', 'python3-numpy', 'python3-rosbags-pip', 'python3-yaml'),
+        *('python3-matplotlib', 'python3-numba', 'python3-numpy', 'python3-rosbags-pip', 'python3-scipy'),
+        'python3-yaml',
     },
-    'test_depend': {'python3-hypothesis', 'python3-pil', 'python3-pytest', 'python3-scipy'},
+    'test_depend': {'python3-hypothesis', 'python3-pil', 'python3-pytest'},
 }
 """Names of ROS packages, and keys of rosdep for the rest."""
 

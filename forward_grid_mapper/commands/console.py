@@ -109,6 +109,10 @@ class Ticker:
         """Report messages read, for `Bag.messages`."""
         self.say(f'reading: {done:,} of {total:,} messages')
 
+    def refining(self, stage: str, part: float) -> None:
+        """Report a stage of refining the trajectory, for `Refiner.run`."""
+        self.say(f'trajectory: {stage}, {part:.0%}' if part else f'trajectory: {stage}')
+
     def mapping(self, stage: str, progress: Progress | None) -> None:
         """Report a stage of mapping or an iteration of the search, for `Mapper.run`."""
         if progress is None:

@@ -9,13 +9,17 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from ..core.common.errors import ParameterError
+from ..core.common.parameters import Parameters
 from ..core.joint_learning import map_and_learn
 from ..core.maps.map_set import MapSet
+from ..core.trajectory.refinement import Refinement, Refiner
+from ..core.trajectory.windows import Odometry
 from ..files.map_files import occupancy_values
 from ..files.output_folder import free_name, output_folder, readable
 from ..files.parameter_file import parse_sensor
 from ..files.report_text import report_text
 from ..files.results import write_results
+from ..files.trajectory_text import trajectory_data, tum_text
 from ..recordings.drive import Drive
 from ..recordings.read_drive import read_drive
 from .console import Ticker, run
@@ -40,6 +44,12 @@ def parser() -> argparse.ArgumentParser:
         default=0,
         metavar='ROUNDS',
         help='learn p_hit, p_rand, p_lost and sigma in that many rounds; p_hit comes out too high, check the maps',
+    )
+    made.add_argument(
+        '--refine-poses',
+        action='store_true',
+        help="take the drift out of wheel odometry: find the trajectory together with the map; kept as odometry's "
+        'where readings that were held out do not speak for it',
     )
     made.add_argument('--bag', dest='write_bag', action='store_true', help='also write the maps as a bag (mcap)')
     made.add_argument('-q', '--quiet', action='store_true', help='print nothing but errors and the folder')
@@ -68,9 +78,16 @@ def process(options: argparse.Namespace) -> int:
         )
         drive.source['warnings'] += ignored
         read = time.perf_counter() - begin
-        maps = map_and_learn(drive.associator.readings, parameters, options.learn, ticker.mapping)
-        maps = drive.live.on(maps)
-        maps.statistics['seconds'] = {'reading the bag': read, **maps.statistics['seconds']}
+        refined = refine(drive, parameters, ticker) if options.refine_poses else None
+        seconds = {'reading the bag': read}
+        if refined is not None:
+            seconds['trajectory'] = time.perf_counter() - begin - read
+        moved = refined is not None and refined.accepted
+        readings = refined.readings if refined is not None else drive.associator.readings
+        maps = map_and_learn(readings, parameters, options.learn, ticker.mapping)
+        if not moved:
+            maps = drive.live.on(maps)
+        maps.statistics['seconds'] = {**seconds, **maps.statistics['seconds']}
         ticker.say('writing')
         if options.learn:
             drive.source['warnings'].append(_learned(maps))
@@ -79,7 +96,12 @@ def process(options: argparse.Namespace) -> int:
                 'the search ended at max_iterations before it converged; raise max_iterations'
             )
         title = readable(Path(*bag.resolve().parts[-2:]))
-        report = write_results(folder, maps, drive.source, drive.path_xy, title)
+        path, extras, before = drive.path_xy, {}, None
+        if refined is not None and moved:
+            path, before = refined.trajectory.pose[:, :2], drive.path_xy
+            odometry = Odometry.of(*drive.associator.odometry)
+            extras = {'trajectory.tum': tum_text(refined.trajectory), 'odometry.tum': tum_text(odometry)}
+        report = write_results(folder, maps, drive.source, path, title, extras=extras, odometry_xy=before)
         if options.write_bag:
             _write_bag(folder / 'maps.mcap_bag', maps, drive)
     if not options.quiet:
@@ -89,6 +111,14 @@ def process(options: argparse.Namespace) -> int:
             print(f'{COMMAND}: warning: {warning}', file=sys.stderr)
     print(f'maps are in {output}')
     return 0
+
+
+def refine(drive: Drive, parameters: Parameters, ticker: Ticker) -> Refinement:
+    """Return what becomes of the drive's trajectory, and note it in the drive's report."""
+    odometry = Odometry.of(*drive.associator.odometry)
+    refined = Refiner(parameters).run(drive.associator.readings, odometry, ticker.refining)
+    drive.source['trajectory'] = trajectory_data(refined)
+    return refined
 
 
 def _learned(maps: MapSet) -> str:

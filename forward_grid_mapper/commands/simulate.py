@@ -14,6 +14,7 @@ from ..core.common.shell import command_line
 from ..core.messages.message_types import OdometryMessage, RangeMessage
 from ..files.map_files import write_trinary
 from ..files.output_folder import output_errors, output_folder
+from ..simulation.drift import LEVELS, with_drift
 from ..simulation.drive import BASE_FRAME, START, Recording, corridor_drive, door_drive
 from ..simulation.sonar import NOISE_FREE, NOISY, SonarArray, front_array, sonar_ring
 from .console import Ticker, run
@@ -40,6 +41,11 @@ def parser() -> argparse.ArgumentParser:
     made.add_argument('--seen', type=int, default=3, metavar='N', help='door: sweeps taken in front of it (default 3)')
     made.add_argument('--passes', type=int, default=1, metavar='N', help='corridor: times along it (default 1)')
     made.add_argument('--noise-free', action='store_true', help='no random readings, no noise, nobody walking')
+    made.add_argument(
+        '--drift',
+        choices=tuple(LEVELS),
+        help='let odometry drift: low, middle, high, or as wheels of old robots do (default: it is exact)',
+    )
     made.add_argument('--sonars', choices=sorted(SONARS), default='ring', help='ring of 24 or front array of 8')
     made.add_argument(
         '--topics', choices=('one', 'each'), default='one', help='all sonars on /sonar, or one topic each'
@@ -116,12 +122,15 @@ def simulate(options: argparse.Namespace) -> int:
                 options.seed,
                 SONARS[options.sonars](),
             )
+            if options.drift:
+                recording = with_drift(recording, LEVELS[options.drift], options.seed)
             ticker.say('writing')
             bag = write_recording(folder, recording, options.format, options.topics == 'each').name
     if not options.quiet:
         print(f'{len(recording.ranges):,} readings and {len(recording.odometry):,} odometry messages')
         print(f'bag, reference.yaml and trajectory.csv are in {options.output}; map it with')
-        print(f'  {command_line("process_bag", Path(options.output) / bag)}')
+        refine = ['--refine-poses'] if options.drift else []
+        print(f'  {command_line("process_bag", Path(options.output) / bag, *refine)}')
     return 0
 
 

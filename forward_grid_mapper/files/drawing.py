@@ -24,9 +24,10 @@ from matplotlib.transforms import Affine2D
 from .panels import Picture, Tile
 
 # Free is white and unknown a cool tint, so that they differ to every eye; in between runs a warm scale, so that an
-# uncertain cell looks like neither. Path and dots are blue and vermilion of the Okabe-Ito palette.
+# uncertain cell looks like neither. Path, dots and the path by odometry are blue, vermilion and purple of
+# the Okabe-Ito palette.
 _FREE, _OCCUPIED, _UNKNOWN = '#ffffff', '#14171c', '#cfd9e4'
-_PATH, _DOT = '#0072b2', '#d55e00'
+_PATH, _DOT, _BEFORE = '#0072b2', '#d55e00', '#cc79a7'
 _INK, _FRAME = '#22262b', '#8b96a3'
 _PROBABILITY = LinearSegmentedColormap.from_list(
     'occupancy', [(0.0, _FREE), (0.2, '#fdf0d2'), (0.5, '#eeb04d'), (0.78, '#8a4a1c'), (1.0, _OCCUPIED)]
@@ -140,6 +141,9 @@ def _draw_overlay(axes: Axes, picture: Picture) -> None:
         axes.scatter(dots[:, 0], dots[:, 1], s=size, color=_DOT, linewidths=0, alpha=0.85, zorder=3)
     if not len(path):
         return
+    before = picture.odometry_xy
+    if len(before):
+        axes.plot(before[:, 0], before[:, 1], color=_BEFORE, linewidth=1.1, linestyle=(0, (4, 2)), zorder=3.5)
     halo = [patheffects.withStroke(linewidth=2.4, foreground='white', alpha=0.9)]
     axes.plot(path[:, 0], path[:, 1], color=_PATH, linewidth=1.4, path_effects=halo, solid_joinstyle='round', zorder=4)
     for marker, xy in zip(_path_markers(_heading(path)), (path[0], path[-1]), strict=True):
@@ -202,6 +206,8 @@ def _foot(figure: Figure, picture: Picture) -> None:
             _marker_line(start, 0, 0, label='start'),
             _marker_line(end, 0, 0, label='end'),
         ]
+    if len(picture.odometry_xy):
+        handles.append(Line2D([], [], color=_BEFORE, linewidth=1.3, linestyle=(0, (4, 2)), label='by odometry'))
     if count := len(picture.unexplained_xy):
         label = f'unexplained reading ({count:,})'
         handles.append(Line2D([], [], linestyle='none', marker='o', markersize=4, color=_DOT, mew=0, label=label))

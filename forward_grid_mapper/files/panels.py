@@ -30,7 +30,10 @@ class Panel(NamedTuple):
 
 
 class Picture(NamedTuple):
-    """What is drawn. `view` is the box shown; points are in metres; `overlay` is the panel that bears them."""
+    """What is drawn. `view` is the box shown; points are in metres; `overlay` is the panel that bears them.
+
+    `odometry_xy` is the path that odometry gives, where it is another one than `path_xy`.
+    """
 
     title: str
     figures: str
@@ -39,3 +42,4 @@ class Picture(NamedTuple):
     overlay: int
     path_xy: NDArray[np.float64]
     unexplained_xy: NDArray[np.float64]
+    odometry_xy: NDArray[np.float64] = np.zeros((0, 2))

@@ -18,6 +18,8 @@ from .panels import Box, Panel, Picture
 _MAX_SIDE = 2400
 _MARGIN = 0.03
 
+NOWHERE = np.zeros((0, 2))
+
 
 def write_picture(
     path: Path | str,
@@ -25,6 +27,7 @@ def write_picture(
     path_xy: NDArray[np.float64],
     title: str,
     reference: tuple[Grid, NDArray[np.int8]] | None = None,
+    odometry_xy: NDArray[np.float64] = NOWHERE,
 ) -> None:
     """Draw the maps into an image file (`.png`, or what else matplotlib knows).
 
@@ -37,6 +40,8 @@ def write_picture(
     title : str
     reference : (Grid, int8 array), optional
         The true map, −1 unknown, 0 free, 1 occupied, drawn as one more panel.
+    odometry_xy : float64, shape (Q, 2)
+        The path that odometry gives, metres, where the robot was elsewhere.
 
     Raises
     ------
@@ -51,7 +56,7 @@ def write_picture(
             '"apt install python3-matplotlib"'
         ) from error
     path = Path(path)
-    picture = compose(maps, np.asarray(path_xy, np.float64).reshape(-1, 2), title, reference)
+    picture = compose(maps, np.asarray(path_xy, np.float64).reshape(-1, 2), title, reference, odometry_xy)
     with output_errors(path):
         drawing.draw(path, picture)
 
@@ -61,6 +66,7 @@ def compose(
     path_xy: NDArray[np.float64],
     title: str,
     reference: tuple[Grid, NDArray[np.int8]] | None,
+    odometry_xy: NDArray[np.float64] = NOWHERE,
 ) -> Picture:
     """Choose what the picture shows; the parameters are those of `write_picture`."""
     path_xy = path_xy[np.isfinite(path_xy).all(axis=1)]
@@ -73,9 +79,9 @@ def compose(
     if reference is not None:
         named.append(('Reference', reference[0], _probability(reference[1])))
     known = (maps.ml != UNKNOWN) | np.isfinite(maps.live)
-    view = _view(maps.grid, known, path_xy)
+    view = _view(maps.grid, known, np.concatenate([path_xy, odometry_xy]))
     panels = [Panel(name, *_crop(grid, values, view)) for name, grid, values in named]
-    return Picture(title, _figures(maps), panels, view, 1, path_xy, _unexplained_ends(maps))
+    return Picture(title, _figures(maps), panels, view, 1, path_xy, _unexplained_ends(maps), odometry_xy)
 
 
 def _probability(cells: NDArray[np.int8]) -> NDArray[np.float32]:

@@ -14,7 +14,7 @@ _SHOWN = 6
 
 def report_text(data: dict[str, Any]) -> str:
     """Return the text of a report made by `report_data`; what is absent is left out."""
-    sections = (_warnings, _input, _counts, _sensors, _map, _result, _seconds, _parameters)
+    sections = (_warnings, _input, _trajectory, _counts, _sensors, _map, _result, _seconds, _parameters)
     title = f'Sonar maps by forward_grid_mapper {data.get("version") or ""}'.rstrip()
     parts = [f'{title}\n{"=" * len(title)}']
     for section in sections:
@@ -53,6 +53,23 @@ def _input(data: dict[str, Any]) -> Iterator[str]:
         drive.append(f'from {start}')
     if drive:
         yield from _line('Drive', ' '.join(drive))
+
+
+def _trajectory(data: dict[str, Any]) -> Iterator[str]:
+    found = (data.get('input') or {}).get('trajectory')
+    if not found:
+        return
+    if not found.get('refined'):
+        yield from _line('Trajectory', f"odometry's, not refined: {found.get('reason')}")
+        return
+    places = found.get('places_recognised') or 0
+    yield from _line(
+        'Trajectory',
+        f'refined: odometry was off by {found["odometry_off_m"]:.2f} m and {found["odometry_off_deg"]:.1f}° in the '
+        f'root mean square; {places} {"place" if places == 1 else "places"} recognised; {found["reason"]}',
+    )
+    if words := found.get('odometry'):
+        yield from _line('Wheels', words)
 
 
 def _counts(data: dict[str, Any]) -> Iterator[str]:

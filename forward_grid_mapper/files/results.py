@@ -30,6 +30,7 @@ def write_results(
     title: str,
     reference: tuple[Grid, NDArray[np.int8]] | None = None,
     extras: Mapping[str, str] | None = None,
+    odometry_xy: NDArray[np.float64] | None = None,
 ) -> dict[str, Any]:
     """Write maps, archive, picture and report into a new folder; nothing is left if any of them fails.
 
@@ -48,6 +49,8 @@ def write_results(
         The true map, for the picture.
     extras : mapping of str to str, optional
         More text files, by name.
+    odometry_xy : float64, shape (Q, 2), optional
+        The path that odometry gives, metres, where the robot was elsewhere.
 
     Returns
     -------
@@ -72,9 +75,10 @@ def write_results(
             *filter(None, [quality_warning(maps)]),
         ]
         try:
-            from .picture import write_picture
+            from .picture import NOWHERE, write_picture
 
-            write_picture(folder / 'maps.png', maps, path_xy, title, reference)
+            before = NOWHERE if odometry_xy is None else odometry_xy
+            write_picture(folder / 'maps.png', maps, path_xy, title, reference, before)
         except OutputError as error:
             warnings.append(f'no picture was drawn: {error}')
         report = report_data(maps, {**source, 'warnings': warnings})

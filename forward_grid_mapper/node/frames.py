@@ -31,6 +31,7 @@ class Transforms:
         """`buffer` is a `tf2_ros.Buffer`, `error` the base of its exceptions."""
         self._buffer, self._error = buffer, error
         self._missing: dict[tuple[str, str], float] = {}
+        self._newest: int | None = None
 
     @classmethod
     def of(cls, node: Any) -> Transforms:
@@ -48,6 +49,19 @@ class Transforms:
     def available(self) -> bool:
         """Whether there is any TF to ask."""
         return self._buffer is not None
+
+    def heed(self, stamp: int) -> None:
+        """Take the stamp of a message in nanoseconds; where the clock jumped back, forget the transforms of before.
+
+        TF refuses transforms that are much older than those it has, and joins others with those of the time before the
+        jump. Static transforms stay: tf2 never forgets them.
+        """
+        if self._newest is not None and stamp < self._newest - JUMP:
+            self._newest = stamp
+            self._missing.clear()
+            if self._buffer is not None:
+                self._buffer.clear()
+        self._newest = stamp if self._newest is None else max(stamp, self._newest)
 
     def lookup(self, target: str, source: str, stamp: int) -> Any | None:
         """Return the `geometry_msgs/Transform` of `source` in `target` at `stamp` in nanoseconds, or None."""
@@ -115,6 +129,7 @@ class MapFrame:
 
         Others wait for the next call.
         """
+        self._transforms.heed(message.stamp)
         if not self._map_frame or message.frame_id.lstrip('/') == self._map_frame.lstrip('/'):
             return [message]
         # the associator sorts in what only overtook

@@ -68,6 +68,7 @@ class MapperNode(Node):
         self.parameters, self._given_extrinsics, warnings = ros_parameters.declare(self)
         for warning in warnings:
             self.get_logger().warning(warning)
+        self.add_pre_set_parameters_callback(ros_parameters.with_points)
         self.add_on_set_parameters_callback(ros_parameters.validator(lambda: self.parameters, self._accept))
         self.failure = ''
         self.when_failed: Callable[[], object] = lambda: None

@@ -13,6 +13,7 @@ from collections import Counter, deque
 from collections.abc import Callable
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..common.parameters import Parameters
 from ..common.readings import Readings
@@ -150,6 +151,11 @@ class PoseAssociator:
     def change(self, parameters: Parameters) -> None:
         """Use other parameters from here on; those of the grid and of the buffer must be the same."""
         self.parameters, self._all = parameters.association, parameters
+
+    @property
+    def odometry(self) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """The poses of odometry that are held: stamps in ns, shape (M,), and x, y, yaw, shape (M, 3)."""
+        return self._history.held()
 
     def add_range(self, message: RangeMessage, sent: int = 0) -> None:
         """Take one Range message; `sent` is when it was published, nanoseconds of the system's clock, 0 if unknown."""

@@ -5,6 +5,9 @@ from __future__ import annotations
 import math
 from bisect import bisect_left
 
+import numpy as np
+from numpy.typing import NDArray
+
 from .message_types import NANOSECONDS, Pose2
 
 HISTORY = 600 * NANOSECONDS
@@ -48,6 +51,10 @@ class PoseHistory:
     def newest(self) -> int | None:
         """The latest stamp; None while there is none."""
         return self._stamps[-1] if self._stamps else None
+
+    def held(self) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """Return the stamps that are held, shape (M,), and the poses x, y, yaw, shape (M, 3)."""
+        return np.array(self._stamps, np.int64), np.array(self._poses, np.float64).reshape(-1, 3)
 
     def clear(self) -> None:
         """Forget every pose."""

@@ -1,0 +1,255 @@
+"""The heading of the robot over the drive, from walls that mostly stand at right angles to each other.
+
+A hidden Markov model: the state is δ, what the yaw of odometry must be corrected by so that walls lie along the axes of
+the map. It moves as odometry drifts,
+
+    δ' = δ + bias · travel + turn_scale · turn + noise
+
+and the votes of walls say how likely it is at each place. All values of δ are followed at once, so the heading is not
+lost in a hall or a slip. Bias, turn scale and the noise are those with the largest likelihood of all votes; for them δ
+is followed modulo 90°, as walls know it. Then it is followed around the full circle, where votes count less and noise
+more, since echoes of one wall vote many times: so the model says by itself where a right angle may have been lost.
+
+Buildings whose walls stand at any angle have votes that agree on nothing, and then nothing is said.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .poses import Floats
+from .walls import DIRECTIONS
+from .windows import Windows
+
+STATES = 2 * DIRECTIONS
+"""States of δ, half a degree each."""
+
+STEP = math.radians(90.0 / STATES)
+
+DOUBT = 0.3
+"""Weight of a vote that says nothing: boxes and people have directions too."""
+
+SLIPS = 0.03
+"""Part of the motions whose noise is three times larger."""
+
+TURN_NOISE = math.radians(2.0)
+"""Noise of a turn, radians a √radian."""
+
+LEAST_NOISE = math.radians(0.3)
+
+NOISES = tuple(math.radians(v) for v in (0.5, 1.0, 2.0, 4.0))
+"""Noise of yaw that is tried, radians a √metre."""
+
+BIASES = np.radians(np.arange(-4.0, 4.01, 0.25))
+TURN_SCALES = np.arange(-0.08, 0.081, 0.02)
+"""Calibrations that are tried, radians a metre, and parts."""
+
+BIAS_SIGMA, TURN_SCALE_SIGMA = math.radians(1.5), 0.03
+
+NEAR = 8
+"""Degrees around the heading in which a vote is taken for one of it."""
+
+TEMPER, WIDER = 0.5, 1.5
+"""What a vote counts, and how many times larger the noise is, where δ is followed around the full circle."""
+
+LEAST_GAIN = 0.12
+"""Nats a vote that the best heading must be likelier than chance for it to be believed."""
+
+
+FEWEST_VOTES = 4
+
+TINY = 1e-300
+
+
+class Drifts(NamedTuple):
+    """How the yaw of odometry drifts: radians a metre, parts, and radians a √metre. The signs are those of δ."""
+
+    bias: float
+    turn_scale: float
+    noise: float
+
+
+@dataclass(frozen=True)
+class Heading:
+    """What walls say about the yaw.
+
+    Attributes
+    ----------
+    at : int64, shape (B,)
+        Nodes with votes.
+    correction : float64, shape (B,)
+        Of the yaw of odometry, radians, without jumps.
+    measured : float64, shape (B,)
+        The same from the votes of this place alone, near `correction`.
+    information : float64, shape (B,)
+        Of `measured`, in 1/rad²; 0 where the votes say nothing.
+    drifts : Drifts
+    gain : float
+        Nats a vote, over votes that agree on nothing.
+    certainty : float
+        Least probability, over the drive, that no right angle was lost.
+    over_odometry : float
+        Nats by which all votes are likelier than if odometry had no error of yaw.
+    """
+
+    at: NDArray[np.int64]
+    correction: Floats
+    measured: Floats
+    information: Floats
+    drifts: Drifts
+    gain: float
+    certainty: float
+    over_odometry: float
+
+
+class _Chain:
+    """The votes along a drive, and how likely they are given how odometry drifts.
+
+    Parameters
+    ----------
+    around : int
+        Right angles that the states of δ go around: 1 or 4.
+    temper, wider : float
+        What a vote counts, and what the noise is multiplied with.
+    """
+
+    def __init__(
+        self,
+        windows: Windows,
+        at: NDArray[np.int64],
+        votes: Floats,
+        around: int = 1,
+        temper: float = 1.0,
+        wider: float = 1.0,
+    ) -> None:
+        yaw = windows.node[at, 2]
+        self.length, self.turned = np.diff(windows.travel[at]), np.diff(windows.turn[at])
+        self.turn = np.diff(yaw)
+        self.states, self._wider = around * STATES, wider
+        self.grid = np.arange(self.states) * STEP
+        # a wall along an axis has the direction −(yaw + δ) in the frame of the node
+        seen = np.degrees(-(yaw[:, None] + self.grid)) % DIRECTIONS
+        ends = np.column_stack([votes, votes[:, :1]])
+        places = np.arange(DIRECTIONS + 1)
+        rows = np.stack([np.interp(place, places, row) for place, row in zip(seen, ends, strict=True)])
+        self.likelihood: Floats = (DOUBT + (1.0 - DOUBT) * rows) ** temper
+
+    def drift(self, drifts: Drifts) -> Floats:
+        """Return by how much δ changes without noise from place to place."""
+        out: Floats = drifts.bias * self.length + drifts.turn_scale * self.turn
+        return out
+
+    def off(self, value: Any) -> Floats:
+        """Return how far the states lie from a value, the shorter way around."""
+        period = self.states * STEP
+        out: Floats = (self.grid - value + period / 2) % period - period / 2
+        return out
+
+    def _moves(self, drifts: Drifts) -> NDArray[np.complex128]:
+        """Return the transforms of the densities that δ moves with from place to place."""
+        noise = self._wider * drifts.noise
+        sigma = np.sqrt(noise**2 * self.length + TURN_NOISE**2 * self.turned + LEAST_NOISE**2)[:, None]
+        x = self.off(self.drift(drifts)[:, None])
+        density = (1 - SLIPS) * np.exp(-0.5 * (x / sigma) ** 2) + SLIPS / 3 * np.exp(-0.5 * (x / sigma / 3) ** 2)
+        return np.fft.rfft(density / density.sum(1, keepdims=True), axis=1)
+
+    def forward(self, drifts: Drifts, start: Floats | None = None) -> tuple[float, list[Floats]]:
+        """Return the log-likelihood of all votes, and what those so far say of δ at each place."""
+        belief = self.likelihood[0] * (np.full(self.states, 1 / self.states) if start is None else start)
+        total, beliefs = math.log(belief.sum()), [belief / belief.sum()]
+        for move, likelihood in zip(self._moves(drifts), self.likelihood[1:], strict=True):
+            moved = np.fft.irfft(np.fft.rfft(beliefs[-1]) * move, self.states)
+            belief = np.maximum(moved, TINY) * likelihood
+            total += math.log(belief.sum())
+            beliefs.append(belief / belief.sum())
+        return total, beliefs
+
+    def smooth(self, drifts: Drifts, start: Floats | None = None) -> Floats:
+        """Return what all votes say of δ at each place, shape (B, states)."""
+        moves, (_, beliefs) = self._moves(drifts), self.forward(drifts, start)
+        later, out = np.ones(self.states), [beliefs[-1]]
+        for k in range(len(moves) - 1, -1, -1):
+            later = np.fft.irfft(np.fft.rfft(later * self.likelihood[k + 1]) * np.conj(moves[k]), self.states)
+            later = np.maximum(later, TINY) / later.sum()
+            both = beliefs[k] * later
+            out.append(both / both.sum())
+        return np.array(out[::-1])
+
+    def without_drift(self) -> float:
+        """Return the log-likelihood of all votes if δ is the same everywhere."""
+        each = np.log(self.likelihood).sum(0)
+        return float(each.max() + math.log(np.exp(each - each.max()).mean()))
+
+
+def _followed(chain: _Chain, belief: Floats) -> tuple[Floats, Floats]:
+    """Return the most probable right angle's mean δ at each place, without jumps, and its probability."""
+    half = (np.abs(chain.off(0.0)) < math.pi / 4).astype(np.float64)
+    masses = np.fft.irfft(np.fft.rfft(belief, axis=1) * np.conj(np.fft.rfft(half)), chain.states, axis=1)
+    middle = chain.grid[masses.argmax(1)]
+    off = chain.off(middle[:, None])
+    inside = belief * (np.abs(off) < math.pi / 4)
+    mass = inside.sum(1)
+    return np.unwrap(middle + (inside * off).sum(1) / mass), mass
+
+
+def _measured(votes: Floats, yaw: Floats, correction: Floats) -> tuple[Floats, Floats]:
+    """Return the correction that the votes of each place say by themselves near `correction`, and its information."""
+    off = np.arange(-NEAR, NEAR + 1)
+    seen = np.degrees(-(yaw + correction))[:, None] - off
+    places = np.arange(DIRECTIONS + 1)
+    ends = np.column_stack([votes, votes[:, :1]])
+    rows = np.stack([np.interp(place % DIRECTIONS, places, row) for place, row in zip(seen, ends, strict=True)])
+    excess = np.maximum(rows - 1.0, 0.0)
+    mass = excess.sum(1)
+    mean = (excess * off).sum(1) / np.maximum(mass, 1e-9)
+    spread = (excess * (off - mean[:, None]) ** 2).sum(1) / np.maximum(mass, 1e-9)
+    # a wall is told from chance where votes for it are several times the mean
+    weight = np.clip((rows.max(1) - 1.5) / 1.5, 0.0, 1.0)
+    information = weight / np.radians(np.sqrt(spread + 2.0)) ** 2
+    return correction + np.radians(mean), np.where(mass > 0, information, 0.0)
+
+
+def heading(windows: Windows, at: NDArray[np.int64], votes: Floats) -> Heading | None:
+    """Return what walls say about the yaw; None where they agree on nothing.
+
+    Parameters
+    ----------
+    windows : Windows
+    at, votes
+        Those of `wall_votes`.
+    """
+    if len(at) < FEWEST_VOTES:
+        return None
+    chain = _Chain(windows, at, votes)
+
+    def likelihood(drifts: Drifts) -> float:
+        prior = (drifts.bias / BIAS_SIGMA) ** 2 + (drifts.turn_scale / TURN_SCALE_SIGMA) ** 2
+        return chain.forward(drifts)[0] - 0.5 * prior
+
+    best = Drifts(0.0, 0.0, NOISES[2])
+    for name, values in (('bias', BIASES), ('turn_scale', TURN_SCALES), ('noise', NOISES)):
+        best = max((best._replace(**{name: float(value)}) for value in values), key=likelihood)
+    total = chain.forward(best)[0]
+    if total < LEAST_GAIN * len(at):
+        return None
+    circle = _Chain(windows, at, votes, 4, TEMPER, WIDER)
+    # where the drive begins any right angle will do
+    first = chain.grid[int(chain.smooth(best)[0].argmax())]
+    start = (np.abs(circle.off(first)) < math.pi / 4).astype(np.float64)
+    correction, certain = _followed(circle, circle.smooth(best, start))
+    measured, information = _measured(votes, windows.node[at, 2], correction)
+    return Heading(
+        at,
+        correction,
+        measured,
+        information,
+        best,
+        total / len(at),
+        float(certain.min()),
+        total - chain.without_drift(),
+    )

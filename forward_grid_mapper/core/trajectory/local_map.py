@@ -1,0 +1,101 @@
+"""Local maps: the maximum likelihood map of some windows' readings, as probabilities that a scan is matched with.
+
+The map is that of the core's search, with its prior of walls and its surface normals. A standard occupancy grid would
+not do: it is biased where cones overlap, and a scan matched with it comes out several centimetres off.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..common.grid import Grid
+from ..common.parameters import ModelParameters, Parameters
+from ..common.readings import Readings
+from ..evidence.evidence import Evidence
+from ..maps.traversed import traversed_cells
+from ..search.search import Search
+from ..sensor.cone_table import grid_of
+from ..sensor.density import hit_probability
+from .poses import Floats
+
+OCCUPIED, FREE = 1 / (1 + math.exp(-3.0)), 1 / (1 + math.exp(4.0))
+"""Probabilities of cells that a local map shows as occupied, and as free."""
+
+UNKNOWN = 0.06
+"""Probability of cells that it does not know: the usual fraction of occupied cells."""
+
+
+class LocalMap(NamedTuple):
+    """Probabilities of a local map; what lies outside is unknown.
+
+    Attributes
+    ----------
+    column, row : float
+        Lattice indices of the lower left cell.
+    resolution : float
+        Metres.
+    hit : float32, shape (height, width)
+        Probability that a cell returns the echo of a reading that reaches it.
+    normal_x, normal_y : float32, shape (height, width)
+        Unit vector along the normal of the surface; 0 where it is not known.
+    cos2_limit : float
+        As in `surface_normals.SurfaceNormals`.
+    unknown : float
+        `hit` of unknown cells.
+    """
+
+    column: float
+    row: float
+    resolution: float
+    hit: NDArray[np.float32]
+    normal_x: NDArray[np.float32]
+    normal_y: NDArray[np.float32]
+    cos2_limit: float
+    unknown: float
+
+
+def at_poses(readings: Readings, poses: Floats) -> Readings:
+    """Return the readings with sensors at other poses, shape (N, 3)."""
+    x, y, yaw = np.ascontiguousarray(poses.T)
+    return replace(readings, x=x, y=y, yaw=yaw)
+
+
+def local_map(readings: Readings, parameters: Parameters, stop: NDArray[np.uint8]) -> LocalMap:
+    """Return the map of readings that are placed in its frame.
+
+    Raises
+    ------
+    Cancelled
+        If `stop` was set.
+    """
+    model = parameters.model
+    grid = grid_of(readings, model, parameters.grid)
+    evidence = Evidence(grid, model, 1e9, 1, stop)
+    evidence.extend(readings)
+    traversed = traversed_cells(readings, grid)
+    Search(evidence, parameters.search, traversed.ravel()).run()
+    return soft_map(evidence, grid, traversed, model)
+
+
+def soft_map(evidence: Evidence, grid: Grid, traversed: NDArray[np.bool_], model: ModelParameters) -> LocalMap:
+    """Return the probabilities of a map that was searched."""
+    ml = evidence.observed()
+    p_hit, normals = hit_probability(model, grid.resolution), evidence.state.normals
+    hit = np.where(ml == 1, OCCUPIED, np.where((ml == 0) | traversed, FREE, UNKNOWN)) * p_hit
+    none = np.zeros(grid.shape, np.float32)
+    known = len(normals.known) > 0
+    return LocalMap(
+        float(grid.column),
+        float(grid.row),
+        grid.resolution,
+        hit.astype(np.float32),
+        normals.x.reshape(grid.shape) if known else none,
+        normals.y.reshape(grid.shape) if known else none,
+        normals.cos2_limit,
+        UNKNOWN * p_hit,
+    )

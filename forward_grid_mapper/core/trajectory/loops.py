@@ -1,0 +1,172 @@
+"""Loops: blocks matched with local maps of places that the robot came by at another time.
+
+How far a place may be off is asked from the posterior of the graph, of which deviations are drawn; there the block is
+searched, wherever it may be. A loop counts if its readings fit about as well as those matched with their own
+surroundings, and nowhere else in the searched area nearly as well. What does not agree with the rest is taken out again
+when the graph is solved.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .chain import axes_at
+from .likelihood import scores
+from .local_map import LocalMap
+from .matching import KAPPA, grid_around, measure
+from .passes import FEWEST, Found, Progress
+from .poses import Floats, compose, relative, wrapped
+from .scans import FEWEST_ON_MAP, Scans
+
+LENGTH = 8
+"""Windows of a block that is looked for."""
+
+APART = 8.0
+"""Metres of progress from which on two places are of different times."""
+
+REACH = 3.0
+"""Metres between a block and a place that its map may hold."""
+
+AROUND = 4.0
+"""Metres of travel before and after a place that its map is made of."""
+
+SIGMAS = 2.5
+LARGEST = np.array([2.5, 2.5, math.radians(20.0)])
+"""How far a block is searched: σ of the posterior, and metres and radians at most."""
+
+LEAST = np.array([0.2, 0.2, math.radians(3.0)])
+
+STEPS = (0.15, 0.15, math.radians(2.5))
+
+ASKED = 60
+"""Readings that the search asks."""
+
+GOOD = 0.65
+"""Part of the usual score of a reading that a loop must have."""
+
+OTHER = 0.45
+"""Metres from the best pose from where on another is another place."""
+
+TOLD = 8.0
+"""σ² by which another place must differ in what is measured at the best one: along a bare corridor none does."""
+
+CLEAR = 2.0
+"""Nats by which the best pose must be better than any of another place."""
+
+CLIMBS = 3
+"""Parabolas that the best pose of the search is moved to the top of."""
+
+CANDIDATES = 2
+"""Places that a block is looked for at, at the most."""
+
+SHARED = 3
+"""Windows in a row whose place has one map."""
+
+
+@dataclass(frozen=True)
+class Loop:
+    """A block that was found at another time's place.
+
+    Attributes
+    ----------
+    block, place : int
+        Nodes in the middle of the block, and of the map.
+    found : Found
+        Matches of the block's windows.
+    """
+
+    block: int
+    place: int
+    found: Found
+
+
+class Places:
+    """Local maps of places, made when they are asked for, from the nodes as they are."""
+
+    def __init__(self, scans: Scans, nodes: Floats) -> None:
+        self._scans, self._nodes = scans, nodes
+        self._maps: dict[int, LocalMap | None] = {}
+
+    def __getitem__(self, node: int) -> LocalMap | None:
+        if node not in self._maps:
+            progress = self._scans.windows.node_progress
+            members = np.flatnonzero(np.abs(progress - progress[node]) < AROUND)
+            self._maps[node] = self._scans.map(members, self._nodes[node], self._nodes)
+        return self._maps[node]
+
+
+def candidates(nodes: Floats, samples: Floats, progress: Floats, middle: int) -> list[tuple[int, Floats]]:
+    """Return places where a block may have been before or after, and σ of its pose there, shape (3,)."""
+    drawn = relative(nodes + samples, (nodes + samples)[:, middle : middle + 1])
+    mean = relative(nodes, nodes[middle])
+    off = drawn - mean
+    off[..., 2] = wrapped(off[..., 2])
+    sigma = np.sqrt((off**2).mean(0))
+    far = np.hypot(mean[:, 0], mean[:, 1])
+    wide = np.hypot(sigma[:, 0], sigma[:, 1])
+    possible = (np.abs(progress - progress[middle]) > APART) & (far < REACH + np.minimum(wide, LARGEST[0]))
+    out: list[tuple[int, Floats]] = []
+    for node in np.argsort(np.where(possible, far + wide, np.inf))[: possible.sum()]:
+        if all(abs(progress[node] - progress[other]) > AROUND for other, _ in out):
+            out.append((int(node), sigma[node]))
+            if len(out) == CANDIDATES:
+                break
+    return out
+
+
+def find_loop(
+    scans: Scans, block: NDArray[np.int64], nodes: Floats, place: int, sigma: Floats, around: LocalMap, usual: float
+) -> Loop | None:
+    """Return the loop of a block with a place, or None."""
+    middle = block[len(block) // 2]
+    shape = relative(nodes[middle], nodes[block])
+    joint = scans.joint(block, shape)
+    guess = relative(nodes[place], nodes[middle])
+    reach = np.clip(SIGMAS * sigma, LEAST, LARGEST)
+    poses = grid_around(guess, reach, STEPS)
+    stride = max(len(joint.readings) // ASKED, 1)
+    values = scores(joint, around, poses, stride)
+    off = relative(guess, poses)
+    prior = 0.5 * ((off / np.maximum(sigma, LEAST / 2)) ** 2).sum(1)
+    total = KAPPA * values - prior
+    best = poses[int(total.argmax())]
+    for _ in range(CLIMBS):
+        best = measure(joint, around, best).pose
+    final = measure(joint, around, best)
+    count = len(joint.readings)
+    if final.score < GOOD * usual * count:
+        return None
+    # directions that are not measured may not decide
+    apart, axes = relative(best, poses), axes_at(best[2])
+    curved = np.einsum('pi,ij,pj->p', apart, axes.T @ final.information @ axes, apart)
+    elsewhere = (np.hypot(apart[:, 0], apart[:, 1]) > OTHER) & (curved > TOLD)
+    if elsewhere.any() and KAPPA * final.score - (KAPPA * values[elsewhere]).max() < CLEAR:
+        return None
+    found = Found()
+    for j, local in zip(block, shape, strict=True):
+        if scans.count[j] >= FEWEST:
+            found.add(place, int(j), measure(scans.scan[j], around, compose(best, local)), int(scans.count[j]))
+    return Loop(int(middle), place, found)
+
+
+def find_loops(scans: Scans, nodes: Floats, samples: Floats, usual: float, watch: Progress) -> list[Loop]:
+    """Return the loops of a drive, given its nodes, deviations of them, and the usual score of a reading."""
+    places, out = Places(scans, nodes), []
+    progress = scans.windows.node_progress
+    for k in range(0, len(nodes) - LENGTH // 2, LENGTH):
+        watch(k / len(nodes))
+        block = np.arange(k, min(k + LENGTH, len(nodes)))
+        if scans.count[block].sum() < FEWEST_ON_MAP:
+            continue
+        for place, sigma in candidates(nodes, samples, progress, block[len(block) // 2]):
+            around = places[place]
+            if around is None:
+                continue
+            loop = find_loop(scans, block, nodes, place, sigma, around, usual)
+            if loop is not None:
+                out.append(loop)
+    return out

@@ -1,0 +1,118 @@
+"""What odometry measures, and how well: its calibration, and its noise.
+
+Of a small motion, `ahead` and `aside` in the robot's frame and `turn`, odometry measures what the calibration c makes
+right:
+
+    ahead + i·aside  =  (1 + scale) e^{i·heading} (ahead + i·aside)_measured
+    turn             =  (1 + turn_scale) turn_measured + bias · ahead_measured
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from .poses import Floats, relative, wrapped
+from .windows import Odometry, Windows
+
+CALIBRATION = ('scale', 'heading', 'bias', 'turn_scale')
+"""The calibration: parts, radians, radians a metre, parts."""
+
+CALIBRATION_SIGMA = np.array([0.03, math.radians(1.5), math.radians(1.5), 0.03])
+"""A priori."""
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Noise of odometry.
+
+    Attributes
+    ----------
+    yaw : float
+        Radians a √metre.
+    yaw_of_turn : float
+        Radians a √radian.
+    along : float
+        Metres a √metre.
+    least : tuple of float
+        Metres and radians that a window has at least.
+    """
+
+    yaw: float = math.radians(3.0)
+    yaw_of_turn: float = math.radians(2.0)
+    along: float = 0.02
+    across: float = 0.01
+    least: tuple[float, float] = (0.01, math.radians(0.3))
+
+
+def calibrated(odometry: Odometry, calibration: Floats) -> Odometry:
+    """Return the odometry with a calibration applied, from the same first pose on."""
+    scale, heading, bias, turn_scale = calibration
+    pose = odometry.pose
+    turns = np.diff(pose[:, 2])
+    # motions are arcs: they go along the chord, whose direction is that of the middle
+    middle = pose[:-1, 2] + turns / 2
+    steps = np.diff(pose[:, :2], axis=0)
+    c, s = np.cos(middle), np.sin(middle)
+    ahead, aside = c * steps[:, 0] + s * steps[:, 1], -s * steps[:, 0] + c * steps[:, 1]
+    turns = (1 + turn_scale) * turns + bias * ahead
+    yaw = pose[0, 2] + np.concatenate([[0.0], np.cumsum(turns)])
+    direction = yaw[:-1] + turns / 2 + heading
+    c, s = (1 + scale) * np.cos(direction), (1 + scale) * np.sin(direction)
+    moved = np.stack([c * ahead - s * aside, s * ahead + c * aside], axis=1)
+    return Odometry(
+        odometry.stamp,
+        np.column_stack([np.concatenate([pose[:1, :2], pose[0, :2] + np.cumsum(moved, axis=0)]), yaw]),
+    )
+
+
+def with_yaw(odometry: Odometry, progress: Floats, correction: Floats) -> Odometry:
+    """Return the odometry with its yaw corrected, linearly between places, and its motions turned along.
+
+    Parameters
+    ----------
+    odometry : Odometry
+    progress, correction : float64, shape (B,)
+        Where, in metres of progress, and by how much, radians.
+    """
+    pose = odometry.pose
+    more = np.interp(odometry.progress, progress, correction)
+    steps, turned = np.diff(pose[:, :2], axis=0), (more[1:] + more[:-1]) / 2
+    c, s = np.cos(turned), np.sin(turned)
+    moved = np.stack([c * steps[:, 0] - s * steps[:, 1], s * steps[:, 0] + c * steps[:, 1]], axis=1)
+    ahead = np.concatenate([pose[:1, :2], pose[0, :2] + np.cumsum(moved, axis=0)])
+    return Odometry(odometry.stamp, np.column_stack([ahead, pose[:, 2] + more]))
+
+
+def motions(odometry: Odometry, windows: Windows) -> Floats:
+    """Return the motion from each node to the next one, shape (K − 1, 3), in the frame of the first of the two."""
+    node = odometry.at(windows.node_stamp)
+    return relative(node[:-1], node[1:])
+
+
+def sensitivity(odometry: Odometry, windows: Windows) -> Floats:
+    """Return how these motions change with the calibration, shape (K − 1, 3, 4)."""
+    before = motions(odometry, windows)
+    out = np.empty((*before.shape, len(CALIBRATION)))
+    for k in range(len(CALIBRATION)):
+        small = np.zeros(len(CALIBRATION))
+        small[k] = 1e-4
+        change = motions(calibrated(odometry, small), windows) - before
+        change[:, 2] = wrapped(change[:, 2])
+        out[:, :, k] = change / 1e-4
+    return out
+
+
+def covariances(windows: Windows, noise: Noise) -> Floats:
+    """Return the covariance of the motion from each node to the next one, shape (K − 1, 3, 3)."""
+    length, turn = np.diff(windows.travel), np.diff(windows.turn)
+    yaw = noise.yaw**2 * length + noise.yaw_of_turn**2 * turn + noise.least[1] ** 2
+    out = np.zeros((len(length), 3, 3))
+    out[:, 0, 0] = noise.along**2 * length + noise.least[0] ** 2
+    # a yaw error grows on the way, and so does what it makes aside
+    out[:, 1, 1] = noise.across**2 * length + noise.least[0] ** 2 + yaw * length**2 / 3
+    out[:, 1, 2] = out[:, 2, 1] = yaw * length / 2
+    out[:, 2, 2] = yaw
+    return out

@@ -1,0 +1,361 @@
+"""From readings and drifting odometry to the trajectory that explains both: the steps, one after the other.
+
+windows       the drive in pieces of 0.4 m, each a node of the pose graph
+heading       yaw from walls at right angles, followed over the whole drive
+calibration   scale and heading of the wheels: what foresees readings best
+first pass    each block matched with the map of what was driven before it
+again, loops  each block matched with what lies around it, and with what was mapped there at another time
+judgement     what was held out and where walls stand must speak for the trajectory, or odometry stays
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+
+from ..common.parameters import Parameters
+from ..common.readings import Readings
+from ..runtime.cancelling import check
+from .chain import Chain
+from .heading import Heading, heading
+from .holding_out import Gain, blocks_of, foreseen, gain, held_out, held_out_blocks
+from .local_map import at_poses
+from .loops import Loop, find_loops
+from .odometry_model import CALIBRATION, Noise, calibrated, covariances, motions, sensitivity, with_yaw
+from .passes import BLOCK, again, first_pass
+from .pose_graph import Edges, Graph, Solution, Yaws, joined, solve
+from .poses import Floats, compose, inverse, relative
+from .scans import Scans
+from .walls import wall_votes
+from .windows import Odometry, Windows, corrected, cut
+
+SHORTEST = 8.0
+"""Metres of a drive below which nothing is refined: its drift is small, and there is little to judge it by."""
+
+LONGEST_STEP = 1.0
+"""Metres between two poses of odometry, beyond which it jumped."""
+
+FEWEST_READINGS = 200
+
+LEAST_ECHOES = 0.05
+"""Part of the readings that must have an echo."""
+
+LEAST_SENSORS = 2
+
+ROUNDS = 2
+"""Times that loops are looked for."""
+
+SAMPLES = 40
+"""Deviations that are drawn to know how far places may be off."""
+
+LARGEST_RESIDUAL = 5.0
+"""σ², in the mean over a loop, from which on it does not agree with the rest."""
+
+SCALES = np.array([-0.03, 0.0, 0.03])
+HEADINGS = np.radians([-1.5, 0.0, 1.5])
+"""What is tried of the calibration: parts, and radians. Beyond the ends it goes on in equal steps."""
+
+MOST_STEPS = 3
+"""Steps beyond the ends."""
+
+SIGMA = np.array([0.01, math.radians(0.5), math.radians(0.5), 0.02])
+"""σ of the calibration found."""
+
+TRIED_ON, FEWEST_TRIED, TRIED_SPAN = 45, 10, 6.0
+"""Windows that a calibration is tried on, the readings that these have at least, and the metres of travel before and
+after them that their maps are made of."""
+
+JUDGED_ON, HELD_OUT = 60, 40
+"""Blocks, and held-out windows, that trajectories are compared on at the most."""
+
+LEAST_SIGMAS = 2.3
+"""Standard errors by which readings must be foreseen better than with odometry: by chance it is so in one of 100."""
+
+MOST_WORSE = 1.0
+"""Standard errors by which matching may foresee what was held out worse."""
+
+OF_WAYS = np.array([1.0, 1.0, 0.0, 0.0])
+"""The part of a calibration that is left where the yaw is known."""
+
+LEAST_CERTAINTY = 0.9
+"""Probability that the heading did not get lost by a right angle."""
+
+LEAST_MOVED = 0.15
+"""Metres that odometry must be off, in the root mean square: about the error of what takes its place."""
+
+NO_WALLS = 'no walls at right angles to each other tell the heading: the drift of the yaw cannot be told'
+
+Watch = Callable[[str, float], None]
+"""Receives what is going on, and how much of it is done, from 0 to 1."""
+
+
+@dataclass(frozen=True)
+class Refinement:
+    """What became of a drive.
+
+    Attributes
+    ----------
+    accepted : bool
+        Whether the trajectory is another one than odometry's.
+    reason : str
+        Why not, or what it is better by, in words.
+    readings : Readings
+        Placed by the trajectory; those that were given if it is odometry's.
+    trajectory : Odometry
+        The pose of the robot at each stamp of the odometry.
+    calibration : dict
+        `scale`, `heading`, `bias` and `turn_scale` of `odometry_model`; empty if nothing was found.
+    moved, turned : float
+        Root mean square of how far positions, metres, and yaws, radians, were off, after the best alignment.
+    loops : int
+        Places that were recognised.
+    gain : float
+        Nats by which a reading is foreseen better.
+    """
+
+    accepted: bool
+    reason: str
+    readings: Readings
+    trajectory: Odometry
+    calibration: dict[str, float]
+    moved: float = 0.0
+    turned: float = 0.0
+    loops: int = 0
+    gain: float = 0.0
+
+
+class Refiner:
+    """Runs from a drive to its trajectory; can be cancelled from another thread."""
+
+    def __init__(self, parameters: Parameters) -> None:
+        """Prepare runs with these parameters; the sensor model and the search are those of the maps."""
+        # matches are made on cells of one size, whatever size the maps are to have
+        self._parameters = replace(parameters, grid=replace(parameters.grid, resolution=0.1))
+        self._stop = np.zeros(1, np.uint8)
+        self._watch: Watch = lambda stage, part: None
+
+    def cancel(self) -> None:
+        """Make `run` raise `Cancelled` soon; may be called from any thread."""
+        self._stop[0] = 1
+
+    def run(self, readings: Readings, odometry: Odometry, watch: Watch = lambda stage, part: None) -> Refinement:
+        """Return the trajectory of a drive.
+
+        Parameters
+        ----------
+        readings : Readings
+            Placed by `odometry`.
+        odometry : Odometry
+        watch : callable
+            Called from this thread as the work goes on.
+
+        Raises
+        ------
+        Cancelled
+            If `cancel` was called.
+        """
+        self._watch = watch
+        reason = unfit(readings, odometry)
+        if reason:
+            return Refinement(False, reason, readings, odometry, {})
+        windows = cut(readings, odometry)
+        scans = Scans(windows, self._parameters, self._stop, held_out(len(windows)))
+        walls = self._heading(windows, scans)
+        if walls is None:
+            return Refinement(False, NO_WALLS, readings, odometry, {})
+        if walls.certainty < LEAST_CERTAINTY:
+            reason = (
+                f'the heading was lost somewhere: that it is not off by a right angle is only {walls.certainty:.0%} '
+                f'certain'
+            )
+            return Refinement(False, reason, readings, odometry, {})
+        calibration = self._calibrate(odometry, windows, scans, walls)
+        straight = self._straightened(odometry, windows, walls, calibration)
+        better = self._compare(scans, windows.node, straight)
+        said = f'readings are foreseen {better.mean:+.3f} ± {better.error:.3f} nats a reading better than with odometry'
+        named = dict(zip(CALIBRATION, calibration.tolist(), strict=True))
+        if better.sigmas < LEAST_SIGMAS:
+            reason = f'{said}: not enough to tell that odometry is off'
+            return Refinement(False, reason, readings, odometry, named, gain=better.mean)
+        solution, loops = self._solve(odometry, windows, scans, walls, calibration)
+        nodes = self._choose(scans, straight, solution.nodes)
+        if nodes is solution.nodes:
+            named = dict(zip(CALIBRATION, solution.calibration.tolist(), strict=True))
+        trajectory = refined(odometry, windows, nodes)
+        moved, turned = differences(odometry, trajectory)
+        if moved < LEAST_MOVED:
+            reason = f'odometry is off by {moved:.2f} m, which is no more than sonar can tell'
+            return Refinement(False, reason, readings, odometry, named, gain=better.mean)
+        placed = replaced(readings, odometry, trajectory)
+        return Refinement(True, said, placed, trajectory, named, moved, turned, len(loops), better.mean)
+
+    def _say(self, stage: str) -> Callable[[float], None]:
+        def progress(part: float) -> None:
+            check(self._stop)
+            self._watch(stage, part)
+
+        progress(0.0)
+        return progress
+
+    def _heading(self, windows: Windows, scans: Scans) -> Heading | None:
+        self._say('directions of walls')
+        return heading(windows, *wall_votes(windows, scans.held_out))
+
+    def _calibrate(self, odometry: Odometry, windows: Windows, scans: Scans, walls: Heading) -> Floats:
+        """Return the calibration with which readings are foreseen best, shape (4,)."""
+        say = self._say('calibration of the odometry')
+        enough = np.flatnonzero(scans.count >= FEWEST_TRIED)
+        chosen = [enough[k] for k in blocks_of(len(enough), 1, TRIED_ON)]
+        turned = with_yaw(odometry, windows.node_progress[walls.at], walls.correction)
+        found = np.zeros(len(CALIBRATION))
+
+        def score(which: int, value: float) -> float:
+            say(0.5)
+            trial = found.copy()
+            trial[which] = value
+            nodes = calibrated(turned, trial).at(windows.node_stamp)
+            found_there = foreseen(scans, nodes, chosen, TRIED_SPAN)
+            return float(np.nanmean(found_there)) if np.isfinite(found_there).any() else 0.0
+
+        for name, values in (('scale', SCALES), ('heading', HEADINGS)):
+            which = CALIBRATION.index(name)
+            found[which] = highest(partial(score, which), values)
+        # the yaw is right already; these are what made it so
+        found[2:] = walls.drifts.bias, walls.drifts.turn_scale
+        return found
+
+    def _solve(
+        self, odometry: Odometry, windows: Windows, scans: Scans, walls: Heading, calibration: Floats
+    ) -> tuple[Solution, list[Loop]]:
+        """Return the pose graph's solution with the whole calibration, and the loops in it."""
+        measured = Yaws(walls.at, windows.node[walls.at, 2] + walls.measured, walls.information)
+        start = windows.node[0] + np.array([0.0, 0.0, walls.correction[0]])
+        change = sensitivity(odometry, windows)
+        motion = motions(odometry, windows) + change @ calibration
+        covariance = covariances(windows, Noise(yaw=walls.drifts.noise))
+        count = np.arange(len(windows))
+        information = np.asarray(np.linalg.inv(covariance), np.float64)
+        steps = Edges(count[:-1], count[1:], motion, information)
+
+        def graph(matches: Edges) -> Graph:
+            return Graph(steps, change, SIGMA, matches, measured)
+
+        chain = Chain(motion, covariance, measured)
+        nodes, found = first_pass(scans, chain, start, self._say('first pass'))
+        solution, loops = solve(graph(found.edges()), nodes, np.zeros(len(calibration)), SAMPLES), []
+        for _ in range(ROUNDS):
+            found = again(scans, solution.nodes, self._say('matching again'))
+            loops = find_loops(scans, solution.nodes, solution.samples, found.usual, self._say('places seen before'))
+            solution, loops = with_loops(graph, found.edges(), loops, solution)
+        return replace(solution, calibration=solution.calibration + calibration), loops
+
+    def _straightened(self, odometry: Odometry, windows: Windows, walls: Heading, calibration: Floats) -> Floats:
+        """Return the nodes of odometry with the heading of walls and the calibration."""
+        turned = with_yaw(odometry, windows.node_progress[walls.at], walls.correction)
+        return calibrated(turned, calibration * OF_WAYS).at(windows.node_stamp)
+
+    def _compare(self, scans: Scans, before: Floats, after: Floats) -> Gain:
+        """Return by how much one trajectory foresees readings better than another, all over the drive."""
+        say = self._say('judgement')
+        blocks = blocks_of(len(before), BLOCK, JUDGED_ON)
+        one = foreseen(scans, before, blocks)
+        say(0.5)
+        return gain(one, foreseen(scans, after, blocks))
+
+    def _choose(self, scans: Scans, straight: Floats, matched: Floats) -> Floats:
+        """Return the nodes after matching, unless they foresee what was held out from it worse than those before."""
+        self._say('judgement')
+        blocks = held_out_blocks(scans, HELD_OUT)
+        more = gain(foreseen(scans, straight, blocks), foreseen(scans, matched, blocks))
+        return matched if more.sigmas > -MOST_WORSE else straight
+
+
+def unfit(readings: Readings, odometry: Odometry) -> str:
+    """Return why a drive cannot be refined; empty if it can."""
+    if not len(odometry.stamp):
+        return 'the poses of odometry are not at hand, as in a journal'
+    early, late = readings.stamp.min(initial=odometry.stamp[0]), readings.stamp.max(initial=odometry.stamp[-1])
+    if early < odometry.stamp[0] or late > odometry.stamp[-1]:
+        return "there are readings of a time that has no odometry, as where odometry's clock jumped"
+    if len(odometry.stamp) < 2 or odometry.travel[-1] < SHORTEST:
+        return (
+            f'the drive is {odometry.travel[-1]:.1f} m long; from {SHORTEST:g} m on odometry drifts enough to be told'
+        )
+    steps = np.hypot(*np.diff(odometry.pose[:, :2], axis=0).T)
+    if steps.max() > LONGEST_STEP:
+        return f'odometry jumps by {steps.max():.1f} m: it is no wheel odometry, or messages are missing'
+    if len(readings) < FEWEST_READINGS:
+        return f'there are {len(readings)} readings; it takes {FEWEST_READINGS}'
+    if readings.echo.mean() < LEAST_ECHOES:
+        return f'only {readings.echo.mean():.0%} of the readings have an echo'
+    if len(np.unique(readings.sensor)) < LEAST_SENSORS:
+        return 'there is one sensor only, which cannot tell a turn from a step aside'
+    return ''
+
+
+def highest(value_at: Callable[[float], float], tried: Floats) -> float:
+    """Return where a function is highest: among values in equal steps, beyond them if need be, and between two."""
+    step = tried[1] - tried[0]
+    known = {round(x / step): value_at(float(x)) for x in tried}
+    for _ in range(MOST_STEPS):
+        best = max(known, key=lambda k: known[k])
+        if best not in (min(known), max(known)):
+            break
+        beyond = best + (1 if best == max(known) else -1)
+        known[beyond] = value_at(float(beyond * step))
+    best = max(known, key=lambda k: known[k])
+    if best - 1 not in known or best + 1 not in known:
+        return float(best * step)
+    left, middle, right = known[best - 1], known[best], known[best + 1]
+    curvature = left - 2 * middle + right
+    return float((best + (0.5 * (left - right) / curvature if curvature < 0 else 0.0)) * step)
+
+
+def with_loops(
+    graph: Callable[[Edges], Graph], matches: Edges, loops: list[Loop], start: Solution
+) -> tuple[Solution, list[Loop]]:
+    """Return the solution with those loops that agree with each other and with the matches."""
+    while True:
+        edges = joined(matches, *(loop.found.edges() for loop in loops))
+        solution = solve(graph(edges), start.nodes, start.calibration, SAMPLES)
+        at, agree = len(matches.first), []
+        for loop in loops:
+            end = at + len(loop.found)
+            if solution.squared[at:end].mean() <= LARGEST_RESIDUAL:
+                agree.append(loop)
+            at = end
+        if len(agree) == len(loops):
+            return solution, loops
+        loops = agree
+
+
+def refined(odometry: Odometry, windows: Windows, nodes: Floats) -> Odometry:
+    """Return the corrected odometry, which begins where odometry does."""
+    w = windows
+    pose = corrected(odometry.progress, odometry.pose, w.node_progress, w.node, nodes)
+    home = compose(odometry.pose[0], inverse(pose[0]))
+    pose = compose(home, pose)
+    pose[:, 2] = np.unwrap(pose[:, 2])
+    return Odometry(odometry.stamp, pose)
+
+
+def replaced(readings: Readings, odometry: Odometry, trajectory: Odometry) -> Readings:
+    """Return readings placed by `odometry` as `trajectory` places them."""
+    sensors = np.stack([readings.x, readings.y, readings.yaw], axis=1)
+    mount = relative(odometry.at(readings.stamp), sensors)
+    return at_poses(readings, compose(trajectory.at(readings.stamp), mount))
+
+
+def differences(odometry: Odometry, trajectory: Odometry) -> tuple[float, float]:
+    """Return the rms distance, metres, and the rms turn, radians, between two trajectories after the best alignment."""
+    a = odometry.pose[:, :2] - odometry.pose[:, :2].mean(0)
+    b = trajectory.pose[:, :2] - trajectory.pose[:, :2].mean(0)
+    turn = math.atan2((a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum(), (a * b).sum())
+    c, s = math.cos(turn), math.sin(turn)
+    moved = float(np.sqrt(((a @ np.array([[c, s], [-s, c]]) - b) ** 2).sum(1).mean()))
+    off = trajectory.pose[:, 2] - odometry.pose[:, 2]
+    return moved, float(np.std(off))

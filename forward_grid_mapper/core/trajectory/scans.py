@@ -1,0 +1,77 @@
+"""The scans and local maps of a drive's windows, given the nodes."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..common.parameters import Parameters
+from ..sensor.density import hit_probability
+from .likelihood import Scan, make_scan
+from .local_map import UNKNOWN, LocalMap, at_poses, local_map
+from .poses import Floats, compose, relative
+from .windows import Windows, corrected
+
+FEWEST_ON_MAP = 30
+"""Readings that a local map is made from at least."""
+
+
+class Scans:
+    """Scans and local maps of windows.
+
+    Attributes
+    ----------
+    windows : Windows
+    scan : list of Scan
+        The readings of each window in the frame of its node.
+    count : int64, shape (K,)
+        How many of them may be used; none of windows that are held out.
+    held_out : bool, shape (K,)
+    """
+
+    def __init__(
+        self, windows: Windows, parameters: Parameters, stop: NDArray[np.uint8], held_out: NDArray[np.bool_]
+    ) -> None:
+        self.windows, self._parameters, self._stop = windows, parameters, stop
+        first, resolution = windows.first, parameters.grid.resolution
+        self.resolution = resolution
+        self.held_out = held_out
+        sensors = compose(windows.robot, windows.mount)
+        local = relative(np.repeat(windows.node, np.diff(first), axis=0), sensors)
+        unknown = UNKNOWN * hit_probability(parameters.model, resolution)
+        whole = make_scan(windows.readings, local, parameters.model, resolution, unknown)
+        self.count = np.where(held_out, 0, np.diff(first))
+        self.scan = [Scan(whole.readings[begin:end], whole.weight) for begin, end in itertools.pairwise(first.tolist())]
+
+    def joint(self, members: NDArray[np.int64], poses: Floats) -> Scan:
+        """Return the readings of several windows as one scan, given their nodes' poses, shape (len(members), 3)."""
+        parts = []
+        for k, pose in zip(members, poses, strict=True):
+            if self.held_out[k]:
+                continue
+            table = self.scan[k].readings.copy()
+            moved = compose(pose, np.stack([table['x'], table['y'], table['yaw']], axis=1))
+            table['x'], table['y'], table['yaw'] = moved.T
+            parts.append(table)
+        return Scan(np.concatenate(parts) if parts else self.scan[0].readings[:0], self.scan[0].weight)
+
+    def map(self, members: NDArray[np.int64], origin: Floats, nodes: Floats) -> LocalMap | None:
+        """Return the map of some windows in the frame `origin`; None where they have hardly any readings.
+
+        Parameters
+        ----------
+        members : int64
+            Windows.
+        origin : float64, shape (3,)
+        nodes : float64, shape (n, 3)
+            Of the first n windows, all of `members` among them.
+        """
+        w, known = self.windows, len(nodes)
+        if self.count[members].sum() < FEWEST_ON_MAP:
+            return None
+        which = np.concatenate([np.arange(w.first[k], w.first[k + 1]) for k in members if not self.held_out[k]])
+        robot = corrected(w.progress[which], w.robot[which], w.node_progress[:known], w.node[:known], nodes)
+        placed = relative(origin, compose(robot, w.mount[which]))
+        return local_map(at_poses(w.readings.select(which), placed), self._parameters, self._stop)

@@ -1,0 +1,201 @@
+"""The windows of a drive: pieces short enough for the shape that odometry gives them, each with a node in its middle.
+
+    u = travel / 1.5 m + |turn| / 270°
+
+counts how far odometry has drifted, more or less; a window is a whole step of u. Its *node* is the robot's pose in the
+middle of the step. The trajectory is a pose for each node; between nodes the correction of the odometry goes over
+linearly from one to the next.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..common.readings import Readings
+from .poses import Floats, compose, interpolated, relative
+
+TRAVEL = 0.4
+"""Metres of a window that does not turn."""
+
+TURN = math.radians(90.0)
+"""Radians of a window that does not travel."""
+
+TURN_AS_TRAVEL = 0.3
+"""Metres that a radian of turning counts where corrections go over from one node to the next."""
+
+STILL = 0.01
+"""Metres, and radians, by which the robot must have moved for a sensor to say something new."""
+
+
+@dataclass(frozen=True)
+class Odometry:
+    """The poses that odometry gives.
+
+    Attributes
+    ----------
+    stamp : int64, shape (M,)
+        Nanoseconds, increasing.
+    pose : float64, shape (M, 3)
+        In the frame of odometry; metres, and radians without jumps of a full turn.
+    """
+
+    stamp: NDArray[np.int64]
+    pose: Floats
+
+    @classmethod
+    def of(cls, stamp: NDArray[np.int64], pose: Floats) -> Odometry:
+        """Return the odometry with its poses in order of time and its yaw unwrapped."""
+        order = np.argsort(stamp, kind='stable')
+        stamp, pose = np.asarray(stamp, np.int64)[order], np.array(pose, np.float64)[order]
+        pose = pose.reshape(-1, 3)
+        first = np.ones(len(stamp), np.bool_)
+        first[1:] = stamp[1:] > stamp[:-1]
+        stamp, pose = stamp[first], pose[first]
+        pose[:, 2] = np.unwrap(pose[:, 2])
+        return cls(stamp, pose)
+
+    def seconds(self, stamp: NDArray[np.int64]) -> Floats:
+        """Return seconds since the first pose."""
+        return np.asarray((stamp - self.stamp[0]) * 1e-9)
+
+    def at(self, stamp: NDArray[np.int64]) -> Floats:
+        """Return the poses at stamps, shape (N, 3)."""
+        return interpolated(self.seconds(stamp), self.seconds(self.stamp), self.pose)
+
+    @property
+    def travel(self) -> Floats:
+        """Metres driven until each pose."""
+        return np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(self.pose[:, :2], axis=0).T))])
+
+    @property
+    def turn(self) -> Floats:
+        """Radians turned, either way, until each pose."""
+        return np.concatenate([[0.0], np.cumsum(np.abs(np.diff(self.pose[:, 2])))])
+
+    @property
+    def progress(self) -> Floats:
+        """Travel and turn until each pose, in metres."""
+        out: Floats = self.travel + TURN_AS_TRAVEL * self.turn
+        return out
+
+
+@dataclass(frozen=True)
+class Windows:
+    """A drive in windows. There are K nodes and N readings, those taken at standstill left out.
+
+    Attributes
+    ----------
+    readings : Readings
+        Of which only ranges and limits matter; poses are those of odometry.
+    robot : float64, shape (N, 3)
+        Pose of the robot at each reading, as odometry gives it.
+    mount : float64, shape (N, 3)
+        Pose of the sensor on the robot.
+    progress : float64, shape (N,)
+        Travel and turn until each reading, in metres.
+    first : int64, shape (K + 1,)
+        The readings of window k are `first[k]` to `first[k + 1]`.
+    node : float64, shape (K, 3)
+        Odometry at each node.
+    node_progress : float64, shape (K,)
+    node_stamp : int64, shape (K,)
+        Nanoseconds.
+    travel, turn : float64, shape (K,)
+        Metres and radians until each node.
+    """
+
+    readings: Readings
+    robot: Floats
+    mount: Floats
+    progress: Floats
+    first: NDArray[np.int64]
+    node: Floats
+    node_progress: Floats
+    node_stamp: NDArray[np.int64]
+    travel: Floats
+    turn: Floats
+
+    def __len__(self) -> int:
+        return len(self.node)
+
+    def corrected(self, progress: Floats, odometry: Floats, nodes: Floats) -> Floats:
+        """Return poses of odometry, shape (N, 3), corrected as `nodes` say, shape (K, 3)."""
+        return corrected(progress, odometry, self.node_progress, self.node, nodes)
+
+
+def corrected(progress: Floats, odometry: Floats, at: Floats, node: Floats, nodes: Floats) -> Floats:
+    """Return poses of odometry corrected so that those of the nodes become `nodes`.
+
+    Parameters
+    ----------
+    progress, odometry : float64, shapes (N,) and (N, 3)
+        Of the poses to correct.
+    at, node, nodes : float64, shapes (K,), (K, 3) and (K, 3)
+        Progress of the nodes, their odometry and their corrected poses.
+    """
+    if len(at) == 1:
+        return compose(nodes[0], relative(node[0], odometry))
+    left = np.clip(np.searchsorted(at, progress, side='right') - 1, 0, len(at) - 2)
+    fraction = np.clip((progress - at[left]) / (at[left + 1] - at[left]), 0.0, 1.0)[:, None]
+    before = compose(nodes[left], relative(node[left], odometry))
+    after = compose(nodes[left + 1], relative(node[left + 1], odometry))
+    after[:, 2] = before[:, 2] + np.remainder(after[:, 2] - before[:, 2] + np.pi, 2 * np.pi) - np.pi
+    return before + fraction * (after - before)
+
+
+def _still(odometry: Floats, sensor: NDArray[np.int32]) -> NDArray[np.bool_]:
+    """Return which readings were taken where the same sensor was read before, shape (N,)."""
+    out = np.zeros(len(sensor), np.bool_)
+    for number in np.unique(sensor):
+        mine = np.flatnonzero(sensor == number)
+        last = odometry[mine[0]]
+        for t in mine[1:]:
+            pose = odometry[t]
+            if math.hypot(pose[0] - last[0], pose[1] - last[1]) < STILL and abs(pose[2] - last[2]) < STILL:
+                out[t] = True
+            else:
+                last = pose
+    return out
+
+
+def cut(readings: Readings, odometry: Odometry) -> Windows:
+    """Return the windows of a drive; the last, unfinished one is part of the one before it.
+
+    Parameters
+    ----------
+    readings : Readings
+        Placed by this odometry, in any order.
+    odometry : Odometry
+        Of all of the drive.
+    """
+    readings = readings.select(np.argsort(readings.stamp, kind='stable'))
+    robot = odometry.at(readings.stamp)
+    moved = ~_still(robot, readings.sensor)
+    readings, robot = readings.select(moved), robot[moved]
+    knots, travel, turn = odometry.seconds(odometry.stamp), odometry.travel, odometry.turn
+    u = travel / TRAVEL + turn / TURN
+    seconds = odometry.seconds(readings.stamp)
+    count = max(int(u[-1]), 1)
+    # where the robot stands u does not grow: its middle is when it first came there
+    rising = np.concatenate([[True], np.diff(u) > 0])
+    middle = np.interp(np.arange(count) + 0.5, u[rising], knots[rising])
+    of_reading = np.clip(np.interp(seconds, knots, u).astype(np.int64), 0, count - 1)
+    first = np.searchsorted(of_reading, np.arange(count + 1))
+    progress = odometry.progress
+    sensors = np.stack([readings.x, readings.y, readings.yaw], axis=1)
+    return Windows(
+        readings=readings,
+        robot=robot,
+        mount=relative(robot, sensors),
+        progress=np.interp(seconds, knots, progress),
+        first=first,
+        node=interpolated(middle, knots, odometry.pose),
+        node_progress=np.interp(middle, knots, progress),
+        node_stamp=odometry.stamp[0] + np.round(middle * 1e9).astype(np.int64),
+        travel=np.interp(middle, knots, travel),
+        turn=np.interp(middle, knots, turn),
+    )

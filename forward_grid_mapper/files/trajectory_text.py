@@ -1,0 +1,55 @@
+"""A trajectory as text: poses in the TUM format, and what was found out about the odometry in the words of an owner."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+from ..core.trajectory.refinement import Refinement
+from ..core.trajectory.windows import Odometry
+
+LEAST_SCALE, LEAST_ANGLE = 0.003, math.radians(0.1)
+"""Parts, and radians or radians a metre, from which on a figure of the calibration is worth a word."""
+
+
+def tum_text(trajectory: Odometry) -> str:
+    """Return a line for each pose, `stamp x y z qx qy qz qw` in seconds and metres, as evo reads them."""
+    lines = []
+    for stamp, (x, y, yaw) in zip(trajectory.stamp.tolist(), trajectory.pose.tolist(), strict=True):
+        seconds = f'{stamp // 10**9}.{stamp % 10**9:09d}'
+        lines.append(f'{seconds} {x:.6f} {y:.6f} 0 0 0 {math.sin(yaw / 2):.9f} {math.cos(yaw / 2):.9f}')
+    return '\n'.join(lines) + '\n'
+
+
+def trajectory_data(outcome: Refinement) -> dict[str, Any]:
+    """Return what became of the trajectory, for the report: metres, degrees, nats, parts and radians."""
+    return {
+        'refined': outcome.accepted,
+        'reason': outcome.reason,
+        'odometry_off_m': outcome.moved,
+        'odometry_off_deg': math.degrees(outcome.turned),
+        'places_recognised': outcome.loops,
+        'gain_a_reading': outcome.gain,
+        'calibration': dict(outcome.calibration),
+        'odometry': calibration_words(outcome.calibration) if outcome.accepted else '',
+    }
+
+
+def calibration_words(calibration: Mapping[str, float]) -> str:
+    """Return what the wheels do, for the robot's owner; empty if they do nothing worth a word."""
+    words = []
+    # the calibration makes right what is measured, so the measurement errs the other way
+    scale, turn_scale = -calibration.get('scale', 0.0), -calibration.get('turn_scale', 0.0)
+    bias, heading = -calibration.get('bias', 0.0), calibration.get('heading', 0.0)
+    if abs(scale) >= LEAST_SCALE:
+        words.append(f'ways are measured {abs(scale):.1%} too {"long" if scale > 0 else "short"}')
+    if abs(bias) >= LEAST_ANGLE:
+        side = 'left' if bias > 0 else 'right'
+        words.append(f'going straight is measured as turning {math.degrees(abs(bias)):.1f}° a metre to the {side}')
+    if abs(turn_scale) >= LEAST_SCALE:
+        words.append(f'turns are measured {abs(turn_scale):.1%} too {"large" if turn_scale > 0 else "small"}')
+    if abs(heading) >= LEAST_ANGLE:
+        side = 'left' if heading > 0 else 'right'
+        words.append(f'the robot drives {math.degrees(abs(heading)):.1f}° to the {side} of where it is said to look')
+    return '; '.join(words).replace('%', ' %')

@@ -1,0 +1,128 @@
+"""Drift of wheel odometry: what makes the exact odometry of a simulated drive like a robot's.
+
+Each small motion is measured in the robot's frame, travel and turn, and summed up with errors:
+
+    travel' = travel · (1 + scale) + noise · √travel
+    turn' = turn · (1 + turn_scale) + bias · travel + noise · √travel
+
+`scale`, `turn_scale`, `bias` and `heading` (the direction in which the robot really drives when odometry says straight
+on) are drawn once for a drive, as wheels and mounts are; noise is drawn for every 5 cm, with the heavy tails of wheels
+that slip.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core.messages.message_types import Pose2
+from .drive import Recording
+
+Floats = NDArray[np.float64]
+
+STEP = 0.05
+"""Metres of one draw of noise; 0.15 rad of turning count as much."""
+
+TAIL = 5.0
+"""Degrees of freedom of Student's t that noise of yaw is drawn from; it has the stated variance."""
+
+
+@dataclass(frozen=True)
+class Drift:
+    """How far odometry drifts. What a drive has of `bias`, `scale`, `turn_scale` and `heading` is drawn with these σ.
+
+    Attributes
+    ----------
+    yaw_noise : float
+        Radians a √metre.
+    travel_noise : float
+        Metres a √metre.
+    bias : float
+        Radians a metre.
+    scale, turn_scale : float
+        Of travel, and of turning.
+    heading : float
+        Radians.
+    """
+
+    yaw_noise: float
+    travel_noise: float
+    bias: float
+    scale: float
+    turn_scale: float = 0.01
+    heading: float = 0.0
+
+
+LEVELS = {
+    'low': Drift(math.radians(1.0), 0.01, math.radians(0.3), 0.01),
+    'middle': Drift(math.radians(2.0), 0.015, math.radians(0.6), 0.015),
+    'high': Drift(math.radians(3.0), 0.02, math.radians(1.0), 0.02),
+    'wheels': Drift(math.radians(4.5), 0.02, math.radians(0.7), 0.03, 0.03, math.radians(1.3)),
+}
+"""Levels by name; `wheels` is what old research robots show beside a laser."""
+
+
+def drifted(poses: Floats, drift: Drift, seed: int) -> Floats:
+    """Return what odometry makes of exact poses.
+
+    Parameters
+    ----------
+    poses : float64, shape (M, 3)
+        In order of time; metres, radians.
+    drift : Drift
+    seed : int
+
+    Returns
+    -------
+    float64, shape (M, 3)
+        From the same first pose on.
+    """
+    rng = np.random.default_rng([seed, 77])
+    bias, scale, turn_scale, heading = rng.standard_normal(4) * (
+        drift.bias,
+        drift.scale,
+        drift.turn_scale,
+        drift.heading,
+    )
+    yaw = np.unwrap(poses[:, 2])
+    steps, turns = np.diff(poses[:, :2], axis=0), np.diff(yaw)
+    c, s = np.cos(yaw[:-1]), np.sin(yaw[:-1])
+    ahead, aside = c * steps[:, 0] + s * steps[:, 1], -s * steps[:, 0] + c * steps[:, 1]
+    travel = np.hypot(ahead, aside)
+    progress = np.concatenate([[0.0], np.cumsum(travel + np.abs(turns) * STEP / 0.15)])
+    count = int(progress[-1] / STEP) + 2
+    unit = math.sqrt(STEP)
+    along = np.concatenate([[0.0], np.cumsum(rng.standard_normal(count))]) * drift.travel_noise * unit
+    tail = rng.standard_t(TAIL, count) / math.sqrt(TAIL / (TAIL - 2.0))
+    about = np.concatenate([[0.0], np.cumsum(tail)]) * drift.yaw_noise * unit
+    ends = np.arange(count + 1) * STEP
+    noise_along, noise_yaw = (np.diff(np.interp(progress, ends, walk)) for walk in (along, about))
+    ahead = ahead * (1.0 + scale) + noise_along
+    turns = turns * (1.0 + turn_scale) + bias * travel + noise_yaw
+    measured = poses[0, 2] + np.concatenate([[0.0], np.cumsum(turns)])
+    direction = measured[:-1] + turns / 2 - np.diff(yaw) / 2 + heading
+    c, s = np.cos(direction), np.sin(direction)
+    moved = np.stack([c * ahead - s * aside, s * ahead + c * aside], axis=1)
+    return np.column_stack([np.concatenate([poses[:1, :2], poses[0, :2] + np.cumsum(moved, axis=0)]), measured])
+
+
+def with_drift(recording: Recording, drift: Drift, seed: int) -> Recording:
+    """Return a recording whose odometry drifts, and whose readings are placed by it; `robot` stays the truth."""
+    true = np.array([message.pose for message in recording.odometry], np.float64)
+    true[:, 2] = np.unwrap(true[:, 2])
+    measured = drifted(true, drift, seed)
+    odometry = [
+        message._replace(pose=Pose2(*pose)) for message, pose in zip(recording.odometry, measured.tolist(), strict=True)
+    ]
+    stamps = np.array([message.stamp for message in recording.odometry])
+    readings = recording.readings
+    seconds, knots = (readings.stamp - stamps[0]) * 1e-9, (stamps - stamps[0]) * 1e-9
+    was, now = (np.stack([np.interp(seconds, knots, column) for column in poses.T]) for poses in (true, measured))
+    turn = now[2] - was[2]
+    c, s = np.cos(turn), np.sin(turn)
+    dx, dy = readings.x - was[0], readings.y - was[1]
+    placed = replace(readings, x=now[0] + c * dx - s * dy, y=now[1] + s * dx + c * dy, yaw=readings.yaw + turn)
+    return replace(recording, odometry=odometry, readings=placed)

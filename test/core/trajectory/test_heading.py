@@ -1,0 +1,140 @@
+"""Walls and the heading: votes against plain Python, and yaws that are known."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from forward_grid_mapper.core.trajectory.heading import LEAST_GAIN, heading
+from forward_grid_mapper.core.trajectory.odometry_model import calibrated, motions, sensitivity, with_yaw
+from forward_grid_mapper.core.trajectory.poses import wrapped
+from forward_grid_mapper.core.trajectory.walls import BIN, BINS, DIRECTIONS, count_votes, wall_votes
+from forward_grid_mapper.core.trajectory.windows import Odometry, Windows, corrected, cut
+from forward_grid_mapper.simulation.drift import LEVELS, with_drift
+from forward_grid_mapper.simulation.drive import Recording, drive
+from forward_grid_mapper.simulation.sonar import NOISY, front_array
+from forward_grid_mapper.simulation.world import building_tour, building_world
+
+
+def odometry_of(recording: Recording) -> Odometry:
+    messages = recording.odometry
+    return Odometry.of(np.array([m.stamp for m in messages]), np.array([m.pose for m in messages], float))
+
+
+@pytest.fixture(scope='module')
+def tour() -> Recording:
+    return drive(building_world(), building_tour()[:20], 0.1, front_array(), NOISY, seed=3)
+
+
+@pytest.fixture(scope='module')
+def true(tour: Recording) -> Odometry:
+    return odometry_of(tour)
+
+
+@pytest.fixture(scope='module')
+def bent(tour: Recording) -> tuple[Recording, Odometry, Windows]:
+    recording = with_drift(tour, LEVELS['high'], 6)
+    odometry = odometry_of(recording)
+    return recording, odometry, cut(recording.readings, odometry)
+
+
+def test_votes_are_those_of_plain_python() -> None:
+    rng = np.random.default_rng(0)
+    echoes = np.column_stack(
+        [rng.normal(0, 1, (12, 2)), rng.uniform(-4, 4, 12), rng.choice([0.13, 0.3], 12), rng.uniform(0.3, 3, 12)]
+    )
+    wanted = np.zeros(DIRECTIONS)
+    for degree in range(360):
+        angle, bins = math.radians(degree), {}
+        for x, y, bearing, half, z in echoes:
+            if abs(wrapped(bearing - angle)) <= half:
+                at = (z + math.cos(angle) * x + math.sin(angle) * y) / BIN + BINS // 2
+                below = math.floor(at)
+                bins[below] = bins.get(below, 0.0) + 1 - (at - below)
+                bins[below + 1] = bins.get(below + 1, 0.0) + at - below
+        wanted[degree % DIRECTIONS] += sum(n * max(n - 1, 0) for n in bins.values())
+    votes = np.empty(DIRECTIONS)
+    count_votes(echoes, np.empty(BINS), votes)
+    assert votes == pytest.approx(wanted)
+
+
+def test_windows_hold_every_reading_once(bent) -> None:
+    recording, odometry, windows = bent
+    assert windows.first[0] == 0
+    assert windows.first[-1] == len(windows.readings) <= len(recording.readings)
+    assert (np.diff(windows.first) >= 0).all()
+    assert (np.diff(windows.node_progress) > 0).all()
+    # where nothing is corrected, nothing moves
+    same = corrected(windows.progress, windows.robot, windows.node_progress, windows.node, windows.node)
+    assert same == pytest.approx(windows.robot)
+    assert odometry.travel[-1] == pytest.approx(windows.travel[-1], abs=1.5)
+
+
+def test_the_heading_is_found_where_odometry_drifts(bent, true) -> None:
+    _, _, windows = bent
+    at, votes = wall_votes(windows, np.zeros(len(windows), bool))
+    found = heading(windows, at, votes)
+    assert found is not None
+    off = wrapped(windows.node[at, 2] + found.correction - true.at(windows.node_stamp)[at, 2])
+    was = wrapped(windows.node[at, 2] - true.at(windows.node_stamp)[at, 2])
+    off, was = (np.degrees(wrapped(yaw - np.median(yaw))) for yaw in (off, was))
+    assert np.sqrt(np.mean(was**2)) > 10
+    assert np.sqrt(np.mean(off**2)) < np.sqrt(np.mean(was**2)) / 3
+    assert found.certainty > 0.99
+    assert found.over_odometry > 20
+
+
+def test_exact_odometry_is_likelier_than_any_drift(tour, true) -> None:
+    windows = cut(tour.readings, true)
+    found = heading(windows, *wall_votes(windows, np.zeros(len(windows), bool)))
+    assert found is not None
+    assert found.over_odometry < 0
+
+
+def test_votes_that_agree_on_nothing_say_nothing(bent) -> None:
+    _, _, windows = bent
+    at, votes = wall_votes(windows, np.zeros(len(windows), bool))
+    rng = np.random.default_rng(1)
+    turned = np.stack([np.roll(row, rng.integers(DIRECTIONS)) for row in votes])
+    found = heading(windows, at, turned)
+    assert found is None or found.certainty < 0.9
+    assert heading(windows, at, np.ones_like(votes)) is None
+    assert LEAST_GAIN > 0
+
+
+def test_windows_held_out_do_not_vote(bent) -> None:
+    _, _, windows = bent
+    _, votes = wall_votes(windows, np.ones(len(windows), bool))
+    assert (votes == 1).all()
+
+
+def test_calibration_takes_out_what_is_systematic() -> None:
+    t = np.linspace(0, 40, 400)
+    right = np.column_stack([3 * np.sin(t / 5), 2 * np.cos(t / 7), np.zeros(400)])
+    steps = np.diff(right[:, :2], axis=0)
+    right[:, 2] = np.unwrap(np.arctan2(np.r_[steps[:1, 1], steps[:, 1]], np.r_[steps[:1, 0], steps[:, 0]]))
+    odometry = Odometry.of(np.arange(400) * 10**8, right)
+    wrong = np.array([0.04, 0.02, 0.05, -0.03])
+    there = calibrated(odometry, wrong)
+    assert np.abs(there.pose - odometry.pose).max() > 0.3
+    # to first order, the opposite calibration takes it back
+    small = wrong / 100
+    back = calibrated(calibrated(odometry, small), -small)
+    assert back.pose == pytest.approx(odometry.pose, abs=2e-3)
+
+
+def test_sensitivity_is_the_change_of_motions(bent) -> None:
+    _, odometry, windows = bent
+    change = sensitivity(odometry, windows)
+    c = np.array([2e-3, -1e-3, 1e-3, 3e-3])
+    wanted = motions(calibrated(odometry, c), windows) - motions(odometry, windows)
+    assert change @ c == pytest.approx(wanted, abs=2e-5)
+
+
+def test_a_turned_drive_is_turned() -> None:
+    line = np.column_stack([np.linspace(0, 5, 50), np.zeros(50), np.zeros(50)])
+    odometry = Odometry.of(np.arange(50) * 10**8, line)
+    turned = with_yaw(odometry, np.array([0.0, 5.0]), np.full(2, math.pi / 2))
+    assert turned.pose[-1] == pytest.approx([0.0, 5.0, math.pi / 2])

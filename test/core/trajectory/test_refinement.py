@@ -1,0 +1,184 @@
+"""A whole drive: drift is taken out, exact odometry stays, and what cannot be refined is left alone in words."""
+
+from __future__ import annotations
+
+import math
+import threading
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from forward_grid_mapper.core.common.errors import Cancelled
+from forward_grid_mapper.core.common.parameters import Parameters
+from forward_grid_mapper.core.common.readings import Readings
+from forward_grid_mapper.core.mapping import Mapper
+from forward_grid_mapper.core.trajectory.poses import compose, relative, rms_after_alignment
+from forward_grid_mapper.core.trajectory.refinement import Refinement, Refiner, highest, unfit
+from forward_grid_mapper.core.trajectory.windows import Odometry
+from forward_grid_mapper.simulation.drift import LEVELS, with_drift
+from forward_grid_mapper.simulation.drive import Recording, drive
+from forward_grid_mapper.simulation.sonar import NOISY, front_array, sonar_ring
+from forward_grid_mapper.simulation.world import building_tour, building_world
+
+TOUR = building_tour()[:20]
+
+
+def odometry_of(recording: Recording) -> Odometry:
+    messages = recording.odometry
+    return Odometry.of(np.array([m.stamp for m in messages]), np.array([m.pose for m in messages], float))
+
+
+@pytest.fixture(scope='module')
+def tour() -> Recording:
+    return drive(building_world(), TOUR, 0.15, sonar_ring(16), NOISY, seed=3)
+
+
+@pytest.fixture(scope='module')
+def bent(tour: Recording) -> tuple[Readings, Odometry]:
+    recording = with_drift(tour, LEVELS['high'], 6)
+    return recording.readings, odometry_of(recording)
+
+
+@pytest.fixture(scope='module')
+def outcome(bent) -> Refinement:
+    return Refiner(Parameters()).run(*bent)
+
+
+def test_drift_is_taken_out(tour, bent, outcome) -> None:
+    _, odometry = bent
+    true = odometry_of(tour).pose
+    before = rms_after_alignment(odometry.pose, true)
+    after = rms_after_alignment(outcome.trajectory.pose, true)
+    assert outcome.accepted
+    assert before > 0.8
+    assert after < 0.2
+    assert outcome.moved == pytest.approx(before, abs=0.2)
+    assert outcome.trajectory.pose[0] == pytest.approx(odometry.pose[0], abs=1e-6)
+
+
+def test_readings_go_along(bent, outcome) -> None:
+    readings, odometry = bent
+    placed = outcome.readings
+    for name in ('z', 'stamp', 'sensor', 'z_max', 'half_angle'):
+        assert np.array_equal(getattr(placed, name), getattr(readings, name))
+    was, now = (
+        relative(path.at(r.stamp), np.stack([r.x, r.y, r.yaw], 1))
+        for path, r in ((odometry, readings), (outcome.trajectory, placed))
+    )
+    assert now[:, :2] == pytest.approx(was[:, :2], abs=1e-9)
+
+
+def test_the_map_explains_more(bent, outcome) -> None:
+    drifted, refined = (Mapper(Parameters()).run(readings).objective for readings in (bent[0], outcome.readings))
+    assert refined > drifted + 0.1 * len(outcome.readings)
+
+
+def test_exact_odometry_stays(tour) -> None:
+    odometry = odometry_of(tour)
+    left = Refiner(Parameters()).run(tour.readings, odometry)
+    assert not left.accepted
+    assert left.reason
+    assert left.readings is tour.readings
+    assert left.trajectory is odometry
+
+
+def test_a_drive_that_is_moved_gives_the_same_trajectory_moved(bent, outcome) -> None:
+    readings, odometry = bent
+    home = np.array([3.0, -12.0, math.pi / 2])
+    sensors = compose(home, np.stack([readings.x, readings.y, readings.yaw], 1))
+    moved = replace(readings, x=sensors[:, 0].copy(), y=sensors[:, 1].copy(), yaw=sensors[:, 2].copy())
+    other = Refiner(Parameters()).run(moved, Odometry.of(odometry.stamp, compose(home, odometry.pose)))
+    assert other.accepted
+    back = relative(home, other.trajectory.pose)
+    assert np.hypot(*(back - outcome.trajectory.pose)[:, :2].T).max() < 0.2
+
+
+def test_cancelling_ends_the_work(bent) -> None:
+    refiner = Refiner(Parameters())
+    stages = []
+
+    def watch(stage: str, part: float) -> None:
+        stages.append(stage)
+        if stage == 'first pass':
+            threading.Thread(target=refiner.cancel).run()
+
+    with pytest.raises(Cancelled):
+        refiner.run(*bent, watch)
+    assert stages[-1] == 'first pass'
+
+
+def still(readings: Readings, odometry: Odometry) -> tuple[Readings, Odometry]:
+    return readings, replace(odometry, pose=np.zeros_like(odometry.pose))
+
+
+def short(readings: Readings, odometry: Odometry) -> tuple[Readings, Odometry]:
+    last = int(np.searchsorted(odometry.travel, 2.0))
+    kept = readings.stamp <= odometry.stamp[last]
+    return readings.select(kept), Odometry(odometry.stamp[: last + 1], odometry.pose[: last + 1])
+
+
+def silent(readings: Readings, odometry: Odometry) -> tuple[Readings, Odometry]:
+    return replace(readings, z=readings.z_max.copy()), odometry
+
+
+def one_sensor(readings: Readings, odometry: Odometry) -> tuple[Readings, Odometry]:
+    return readings.select(readings.sensor == 3), odometry
+
+
+def jumping(readings: Readings, odometry: Odometry) -> tuple[Readings, Odometry]:
+    pose = odometry.pose.copy()
+    pose[len(pose) // 2 :, 0] += 5.0
+    return readings, replace(odometry, pose=pose)
+
+
+def late(readings: Readings, odometry: Odometry) -> tuple[Readings, Odometry]:
+    half = len(odometry.stamp) // 2
+    return readings, Odometry(odometry.stamp[half:], odometry.pose[half:])
+
+
+def nothing(readings: Readings, odometry: Odometry) -> tuple[Readings, Odometry]:
+    return readings, Odometry.of(np.zeros(0, np.int64), np.zeros((0, 3)))
+
+
+@pytest.mark.parametrize(
+    ('spoilt', 'word'),
+    [
+        (short, '2.0 m long'),
+        (still, '0.0 m long'),
+        (silent, 'have an echo'),
+        (one_sensor, 'one sensor'),
+        (jumping, 'jumps by 5.0 m'),
+        (late, 'no odometry'),
+        (nothing, 'not at hand'),
+    ],
+)
+def test_what_cannot_be_refined_is_left_alone(bent, spoilt, word) -> None:
+    readings, odometry = spoilt(*bent)
+    left = Refiner(Parameters()).run(readings, odometry)
+    assert not left.accepted
+    assert word in left.reason
+    assert left.readings is readings
+    assert left.trajectory is odometry
+    assert unfit(*bent) == ''
+
+
+def test_random_ranges_are_left_alone(bent) -> None:
+    readings, odometry = bent
+    z = np.random.default_rng(0).uniform(0.2, 5.9, len(readings))
+    assert not Refiner(Parameters()).run(replace(readings, z=z), odometry).accepted
+
+
+def test_a_straight_drive_without_revisits_is_no_worse() -> None:
+    recording = drive(building_world(), np.array([[2.0, 8.85], [29.0, 8.85]]), 0.1, front_array(), NOISY, seed=4)
+    bent = with_drift(recording, LEVELS['middle'], 3)
+    true, odometry = odometry_of(recording).pose, odometry_of(bent)
+    left = Refiner(Parameters()).run(bent.readings, odometry)
+    assert rms_after_alignment(left.trajectory.pose, true) < rms_after_alignment(odometry.pose, true) + 0.02
+
+
+def test_the_highest_value_is_found_beyond_the_ends_and_between() -> None:
+    tried = np.array([-1.0, 0.0, 1.0])
+    assert highest(lambda x: -((x - 0.3) ** 2), tried) == pytest.approx(0.3)
+    assert highest(lambda x: -((x - 2.4) ** 2), tried) == pytest.approx(2.4)
+    assert highest(lambda x: x, tried) == pytest.approx(4.0)

@@ -1,0 +1,49 @@
+"""Trajectories as text."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from forward_grid_mapper.core.trajectory.windows import Odometry
+from forward_grid_mapper.files.report_text import report_text
+from forward_grid_mapper.files.trajectory_text import calibration_words, tum_text
+
+
+def test_tum_lines_hold_stamp_position_and_quaternion() -> None:
+    poses = np.array([[1.0, -2.0, 0.0], [1.5, 0.25, math.pi / 2]])
+    text = tum_text(Odometry(np.array([1_700_000_000_000_000_005, 1_700_000_001_500_000_000]), poses))
+    first, second = text.splitlines()
+    assert first.split()[0] == '1700000000.000000005'
+    values = [float(word) for word in second.split()]
+    assert values == pytest.approx([1700000001.5, 1.5, 0.25, 0, 0, 0, math.sqrt(0.5), math.sqrt(0.5)])
+
+
+def test_the_calibration_is_told_in_words() -> None:
+    words = calibration_words({'scale': 0.012, 'heading': 0.0, 'bias': -math.radians(0.5), 'turn_scale': -0.02})
+    assert words == (
+        'ways are measured 1.2 % too short; going straight is measured as turning 0.5° a metre to the left; turns are '
+        'measured 2.0 % too large'
+    )
+    assert calibration_words({'scale': 0.001}) == ''
+    assert '1.0° to the right of' in calibration_words({'heading': -math.radians(1.0)})
+
+
+def test_the_report_says_what_became_of_the_trajectory() -> None:
+    refined = {
+        'refined': True,
+        'reason': 'readings are foreseen better',
+        'odometry_off_m': 5.432,
+        'odometry_off_deg': 16.0,
+        'places_recognised': 1,
+        'odometry': 'turns are measured 2.0 % too large',
+    }
+    text = report_text({'input': {'trajectory': refined}})
+    assert 'off by 5.43 m and 16.0°' in text
+    assert '1 place recognised' in text
+    assert 'Wheels' in text
+    left = report_text({'input': {'trajectory': {'refined': False, 'reason': 'the drive is short'}}})
+    assert "odometry's, not refined: the drive is short" in left
+    assert 'Wheels' not in left
