@@ -1,12 +1,19 @@
 """Installation with pip, and with colcon as an ament_python package."""
 
+import sys
 from pathlib import Path
 
 from setuptools import find_packages, setup
 
 NAME = 'forward_grid_mapper'
 SHARE = f'share/{NAME}'
-COMMANDS = ('mapper', 'process_bag', 'learn', 'replay_bag', 'simulate', 'experiment', 'demo')
+COMMANDS = ('mapper', 'process_bag', 'explain', 'learn', 'replay_bag', 'simulate', 'experiment', 'warm_up', 'demo')
+
+# ros2 run finds one executable for each command; pip, which puts them on everybody's PATH, installs one for all
+FOR_PIP = {'sdist', 'dist_info', 'bdist_wheel', 'editable_wheel'} & set(sys.argv)
+SCRIPTS = [f'{NAME} = {NAME}.__main__:main']
+if not FOR_PIP:
+    SCRIPTS += [f'{command} = {NAME}.__main__:{command}' for command in COMMANDS]
 
 
 def shared(folder):
@@ -18,6 +25,22 @@ setup(
     name=NAME,
     version='0.1.0',
     description='Occupancy grid maps from sonar with forward sensor models, for ROS 2',
+    long_description=Path('README.md').read_text(encoding='utf-8'),
+    long_description_content_type='text/markdown',
+    keywords=['ROS 2', 'sonar', 'ultrasonic', 'mapping', 'occupancy grid', 'EM', 'Nav2'],
+    classifiers=[
+        'Development Status :: 4 - Beta',
+        'Intended Audience :: Developers',
+        'Intended Audience :: Science/Research',
+        'License :: OSI Approved :: Apache Software License',
+        'Operating System :: POSIX :: Linux',
+        'Programming Language :: Python :: 3',
+        'Programming Language :: Python :: 3.10',
+        'Programming Language :: Python :: 3.11',
+        'Programming Language :: Python :: 3.12',
+        'Topic :: Scientific/Engineering',
+        'Typing :: Typed',
+    ],
     maintainer='The forward_grid_mapper maintainers',
     maintainer_email='maintainers@example.com',
     license='Apache-2.0',
@@ -53,7 +76,5 @@ setup(
         'test': ['pytest>=7.2,<10', 'hypothesis>=6.80,<7', 'pillow>=9.2,<14'],
         'lint': ['ruff>=0.17,<0.18', 'mypy>=1.15,<3', 'types-PyYAML>=6,<7'],
     },
-    entry_points={
-        'console_scripts': [f'{command} = {NAME}.__main__:{command}' for command in COMMANDS],
-    },
+    entry_points={'console_scripts': SCRIPTS},
 )

@@ -30,13 +30,14 @@ import rclpy
 from hostile import FRAMES, Hostile, TransformFailed
 from rclpy.exceptions import ParameterNotDeclaredException
 from rclpy.parameter import Parameter
-from std_srvs.srv import SetBool, Trigger
+from std_srvs.srv import SetBool
 
 from forward_grid_mapper.core.common.errors import MapperError
 from forward_grid_mapper.core.common.parameters import TABLE
 from forward_grid_mapper.core.mapping import Mapper
 from forward_grid_mapper.node import frames
-from forward_grid_mapper.node.mapper_node import MAPS, MapperNode
+from forward_grid_mapper.node.map_publishers import MAPS
+from forward_grid_mapper.node.mapper_node import MapperNode
 
 OVERRIDES: dict[str, Any] = {
     'sensors.sonar_left.pose': [0.1, 0.1, 1.5],
@@ -63,6 +64,18 @@ def require(condition: bool, what: str) -> None:
         raise Broken(what)
 
 
+class Answer:
+    """What a service is given to answer with, where nobody waits for it."""
+
+    def __init__(self, request: Any = None) -> None:
+        self.request = request
+        self.sent: list[tuple[Any, ...]] = []
+
+    def send(self, *fields: Any) -> None:
+        """Take the answer."""
+        self.sent.append(fields)
+
+
 class Fuzz:
     """A node in this process, whose callbacks are called as the executor would."""
 
@@ -76,26 +89,37 @@ class Fuzz:
         overrides = {**OVERRIDES, 'save_directory': str(folder / 'maps'), 'journal': str(folder / 'journal')}
         self.node = MapperNode(parameter_overrides=[Parameter(k, value=v) for k, v in overrides.items()])
         self.node.start()
+        while not self.node.mapping:
+            self.work()
+            time.sleep(0.01)
 
     @property
     def associator(self) -> Any:
         """The node's account."""
-        return self.node._associator
+        return self.node.associator
+
+    def work(self) -> None:
+        """Do what an executor does where no message comes."""
+        while self.node.intake.busy:
+            self.node.intake.work()
+        self.node.inbox.work()
 
     def step(self) -> None:
         """Send one message."""
         self.total += 1
         if self.hostile.random.random() < 0.4:
-            self.node._on_odometry(self.hostile.odometry())
+            self.node.intake.on_odometry(self.hostile.odometry(), {'source_timestamp': time.time_ns()})
         else:
             self.sent += 1
-            self.node._on_range(self.hostile.range(), {'source_timestamp': time.time_ns()})
+            intake = self.node.intake
+            intake.on_range(intake.range_losses[0], self.hostile.range(), {'source_timestamp': time.time_ns()})
+        self.work()
 
     def check(self) -> None:
         """Do what the node's timers do, and look at its account and its live map."""
-        self.node._publish_live()
-        self.node._journal.take()
-        self.node._report()
+        self.node.publish_live()
+        self.node.journal.take()
+        self.node.reporter.report()
         associator = self.associator
         require(associator.received == self.sent, f'{self.sent} ranges were sent and {associator.received} received')
         accounted = len(associator.buffer) + associator.waiting + sum(associator.rejected.values())
@@ -103,16 +127,19 @@ class Fuzz:
             accounted == associator.received,
             f'{associator.received} ranges were received and {accounted} accounted for',
         )
-        log_odds = self.node._live.log_odds()
-        require(not np.isinf(log_odds).any(), 'the live map has an infinite value')
+        live = self.node.live.snapshot().probability
+        known = live[~np.isnan(live)]
+        require(bool(((known >= 0) & (known <= 1)).all()), 'the live map has a value that is no probability')
+        require(not any(worker.trouble for worker in self.node.workers), 'a worker failed')
         self._check_messages()
         x = associator.readings
         for name in ('x', 'y', 'yaw', 'z', 'z_max', 'half_angle', 'sigma'):
             require(bool(np.isfinite(getattr(x, name)).all()), f'a reading has a {name} that is not finite')
 
     def _check_messages(self) -> None:
+        self.node.maps.worker.ask(lambda: None)
         for name in MAPS:
-            message = self.node._latest[name]
+            message = self.node.maps.latest[name]
             values = np.frombuffer(message.data, np.int8)
             require(bool(((values >= -1) & (values <= 100)).all()), f'{name} has a value that is none of a map')
             require(len(values) == message.info.width * message.info.height, f'{name} has another size than it says')
@@ -157,13 +184,15 @@ class Fuzz:
         self.rejected += self.associator.rejected
         self.accepted += len(self.associator.buffer)
         self.rejected['(waited at a reset)'] += self.associator.waiting
-        self.node._reset(Trigger.Request(), Trigger.Response())
+        answer = Answer()
+        self.node.reset(answer)
+        require(answer.sent[0][0], 'reset failed')
         self.sent = 0
         require(self.associator.received == self.associator.waiting == 0, 'a reset left something')
 
     def pause(self, value: bool) -> None:
         """Call the service."""
-        self.node._pause(SetBool.Request(data=value), SetBool.Response())
+        self.node.pause(Answer(SetBool.Request(data=value)))
 
     def run(self, messages: int) -> float:
         """Send so many messages; return by how many MB memory grew after the first third."""

@@ -10,6 +10,26 @@ Layers, from the bottom up; each imports only from those that stand above it in 
 ``replay``      playing a recorded drive to the node
 ``node``        the ROS 2 node
 ``commands``    the command lines
+
+``library`` is for programs of others: `make_maps` and what goes with it can be imported from here.
 """
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from .library import Sonar, SonarMaps, make_maps, poses_from_tum
+
+__all__ = ['Sonar', 'SonarMaps', '__version__', 'make_maps', 'poses_from_tum']
+
 __version__ = '0.1.0'
+
+
+def __getattr__(name: str) -> Any:
+    """Import the library when one of its names is asked for: it takes a second, which a command line need not."""
+    if name in __all__:
+        from . import library
+
+        return getattr(library, name)
+    raise AttributeError(f'module {__name__} has no attribute {name!r}')

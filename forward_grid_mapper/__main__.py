@@ -5,9 +5,11 @@ Signals get their handlers before the commands' modules are imported, which take
 
 from __future__ import annotations
 
+import difflib
 import importlib
 import sys
 from collections.abc import Sequence
+from pathlib import Path
 
 from . import __version__
 from .commands import signals
@@ -15,13 +17,19 @@ from .commands import signals
 COMMANDS = {
     'mapper': ('node.main', 'the ROS 2 node: map while driving'),
     'process_bag': ('commands.process_bag', 'map a recorded drive'),
+    'explain': ('commands.explain', 'say why a cell of a map is what it is'),
     'learn': ('commands.learn', 'learn the sensor model from a recorded drive'),
     'replay_bag': ('commands.replay_bag', 'play a recorded drive to the node'),
     'simulate': ('commands.simulate', 'record a drive through a small world with a known map'),
     'experiment': ('commands.experiment', "repeat the paper's experiments: a table and a figure"),
+    'warm_up': ('commands.warm_up', 'compile all kernels once, for a node that starts fast'),
     'demo': ('commands.demo', 'simulate, map, score: the whole way in one command'),
 }
 """Module and help of each command."""
+
+
+EXTRAS = {'rosbags': 'offline', 'matplotlib': 'offline', 'rclpy': 'ros'}
+"""The extra of the installation that brings a package which not every command needs."""
 
 
 def run(command: str, arguments: Sequence[str] | None = None) -> int:
@@ -30,9 +38,24 @@ def run(command: str, arguments: Sequence[str] | None = None) -> int:
     signals.end_with_parent()
     module, _ = COMMANDS[command]
     try:
-        return int(importlib.import_module(f'.{module}', __package__).main(arguments))
+        main = importlib.import_module(f'.{module}', __package__).main
+    except ModuleNotFoundError as error:
+        if error.name is None or (package := error.name.partition('.')[0]) not in EXTRAS:
+            raise
+        print(f'{command}: error: {_what_brings(package)}', file=sys.stderr)
+        return 1
+    try:
+        return int(main(arguments))
     finally:
         signals.leave_silently()
+
+
+def _what_brings(package: str) -> str:
+    """Say how a package that is not installed can be."""
+    extra = f'pip install "forward_grid_mapper[{EXTRAS[package]}]", or .[{EXTRAS[package]}] in a checkout'
+    if package == 'rclpy':
+        return f"{package} is not installed: source ROS 2's setup.bash, or {extra}"
+    return f'{package} is not installed: {extra}; pip install {package} will do as well'
 
 
 def mapper() -> int:
@@ -43,6 +66,11 @@ def mapper() -> int:
 def process_bag() -> int:
     """Run `process_bag`; return its exit code."""
     return run('process_bag')
+
+
+def explain() -> int:
+    """Run `explain`; return its exit code."""
+    return run('explain')
 
 
 def learn() -> int:
@@ -65,6 +93,11 @@ def experiment() -> int:
     return run('experiment')
 
 
+def warm_up() -> int:
+    """Run `warm_up`; return its exit code."""
+    return run('warm_up')
+
+
 def demo() -> int:
     """Run `demo`; return its exit code."""
     return run('demo')
@@ -72,16 +105,23 @@ def demo() -> int:
 
 def main() -> int:
     """Run the command named by the first argument."""
-    if len(sys.argv) > 1 and sys.argv[1] in COMMANDS:
-        return run(sys.argv[1], sys.argv[2:])
-    if len(sys.argv) > 1 and sys.argv[1] == '--version':
+    given = sys.argv[1] if len(sys.argv) > 1 else ''
+    if given in COMMANDS:
+        return run(given, sys.argv[2:])
+    if given == '--version':
         print(__version__)
         return 0
-    lines = '\n'.join(f'  {name:12s} {text}' for name, (_, text) in COMMANDS.items())
-    usage = f'usage: python3 -m forward_grid_mapper COMMAND …\n\n{lines}\n\nCOMMAND --help tells more.'
-    if len(sys.argv) > 1 and sys.argv[1] in ('-h', '--help'):
+    name = Path(sys.argv[0]).name
+    program = 'python3 -m forward_grid_mapper' if name == '__main__.py' else name
+    lines = '\n'.join(f'  {command:12s} {text}' for command, (_, text) in COMMANDS.items())
+    usage = f'usage: {program} COMMAND …\n\n{lines}\n\nCOMMAND --help tells more.'
+    if given in ('-h', '--help'):
         print(usage)
         return 0
+    if given:
+        near = difflib.get_close_matches(given, COMMANDS, n=1)
+        hint = f'; did you mean {near[0]}?' if near else ''
+        print(f'{program}: error: there is no command {given!r}{hint}\n', file=sys.stderr)
     print(usage, file=sys.stderr)
     return 2
 

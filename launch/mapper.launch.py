@@ -1,7 +1,7 @@
 """Starts the mapper and, on request, RViz with its three maps."""
 
 from launch import LaunchDescription
-from launch.actions import DeclareLaunchArgument
+from launch.actions import DeclareLaunchArgument, OpaqueFunction
 from launch.conditions import IfCondition
 from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import Node
@@ -12,12 +12,23 @@ PACKAGE = 'forward_grid_mapper'
 MAPS = ('live_map', 'ml_map', 'uncertainty_map')
 # Each robot has its transforms in its namespace, as with Nav2; without a namespace this changes nothing.
 TRANSFORMS = [('/tf', 'tf'), ('/tf_static', 'tf_static')]
+RELIABILITY = ['', 'best_effort', 'reliable']
+SWITCH = ['', 'true', 'false']
+# Parameters of the mapper that are launch arguments as well; one that is not given is as the parameter file has it.
+PARAMETERS = {
+    'range_topics': ('Topics of sensor_msgs/Range, separated by commas, where there are several', None),
+    'range_reliability': ('Quality of service of the Range subscriptions', RELIABILITY),
+    'odom_reliability': ('Quality of service of the odometry subscription', RELIABILITY),
+    'map_frame': ("Frame of the maps, if another than odometry's, such as map with a localiser", None),
+    'online': ('Whether the ML map and the uncertainty map follow every reading', SWITCH),
+    'journal': ('Folder of the journal, which gives accepted readings back after a restart', None),
+}
 
 
-def generate_launch_description():
-    """Return what `ros2 launch forward_grid_mapper mapper.launch.py` starts."""
+def declared_arguments():
+    """Return the launch arguments."""
     share = FindPackageShare(PACKAGE)
-    arguments = [
+    return [
         DeclareLaunchArgument(
             'namespace', default_value='', description='Namespace of the node, its topics, /tf and /tf_static'
         ),
@@ -33,11 +44,30 @@ def generate_launch_description():
             description='Take the time from /clock, as in simulation or when a bag is replayed with --clock',
         ),
         DeclareLaunchArgument(
-            'sonar',
-            default_value='sonar',
-            description='Topic of sensor_msgs/Range; for several topics set range_topics in params_file',
+            'sonar', default_value='sonar', description='Topic of sensor_msgs/Range; for several give range_topics'
         ),
         DeclareLaunchArgument('odom', default_value='odom', description='Topic of nav_msgs/Odometry'),
+        *(
+            DeclareLaunchArgument(
+                name,
+                default_value='',
+                description=f'{text} (empty: as in params_file)',
+                **({'choices': choices} if choices else {}),
+            )
+            for name, (text, choices) in PARAMETERS.items()
+        ),
+        DeclareLaunchArgument(
+            'map',
+            default_value='',
+            choices=['', *MAPS],
+            description="Which of the maps goes to the topic map, where Nav2 expects one, instead of the mapper's own",
+        ),
+        DeclareLaunchArgument(
+            'use_respawn',
+            default_value='false',
+            choices=['true', 'false'],
+            description='Whether to start the mapper again when it ends; give it a journal, so that it goes on',
+        ),
         DeclareLaunchArgument(
             'log_level',
             default_value='info',
@@ -53,8 +83,22 @@ def generate_launch_description():
             description='Full path to the RViz configuration',
         ),
     ]
+
+
+def parameter_value(name, text):
+    """Return the value of a launch argument with the type that the parameter has."""
+    if name == 'range_topics':
+        return [topic.strip() for topic in text.split(',') if topic.strip()]
+    return text == 'true' if PARAMETERS[name][1] is SWITCH else text
+
+
+def start(context):
+    """Return the nodes that the arguments ask for."""
+    given = {name: LaunchConfiguration(name).perform(context) for name in (*PARAMETERS, 'map')}
     namespace = LaunchConfiguration('namespace')
     use_sim_time = {'use_sim_time': ParameterValue(LaunchConfiguration('use_sim_time'), value_type=bool)}
+    chosen = {name: parameter_value(name, given[name]) for name in PARAMETERS if given[name]}
+    respawn = LaunchConfiguration('use_respawn').perform(context) == 'true'
     mapper = Node(
         package=PACKAGE,
         executable='mapper',
@@ -62,11 +106,14 @@ def generate_launch_description():
         namespace=namespace,
         output='screen',
         emulate_tty=True,
-        parameters=[LaunchConfiguration('params_file'), use_sim_time],
+        respawn=respawn,
+        respawn_delay=2.0,
+        parameters=[LaunchConfiguration('params_file'), use_sim_time, *([chosen] if chosen else [])],
         remappings=[
             *TRANSFORMS,
             ('sonar', LaunchConfiguration('sonar')),
             ('odom', LaunchConfiguration('odom')),
+            *([(f'~/{given["map"]}', 'map')] if given['map'] else []),
         ],
         arguments=['--ros-args', '--log-level', LaunchConfiguration('log_level')],
     )
@@ -80,9 +127,15 @@ def generate_launch_description():
         # the configuration names topics from the root, which a namespace moves
         remappings=[
             *TRANSFORMS,
-            *((f'/{PACKAGE}/{name}', f'{PACKAGE}/{name}') for name in MAPS),
+            *((f'/{PACKAGE}/{name}', 'map' if name == given['map'] else f'{PACKAGE}/{name}') for name in MAPS),
             ('/odom', LaunchConfiguration('odom')),
         ],
         arguments=['-d', LaunchConfiguration('rviz_config')],
     )
-    return LaunchDescription([*arguments, mapper, rviz])
+    # RViz first: where it is not installed, launch ends before it has started a mapper that nothing would stop
+    return [rviz, mapper]
+
+
+def generate_launch_description():
+    """Return what `ros2 launch forward_grid_mapper mapper.launch.py` starts."""
+    return LaunchDescription([*declared_arguments(), OpaqueFunction(function=start)])

@@ -19,7 +19,7 @@ from forward_grid_mapper.core.messages.rep117 import ODOMETRY_REASONS, REASONS
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / 'forward_grid_mapper'
-PAGES = [ROOT / 'README.md', *sorted((ROOT / 'docs').glob('*.md'))]
+PAGES = [ROOT / 'README.md', ROOT / 'CONTRIBUTING.md', *sorted((ROOT / 'docs').glob('*.md'))]
 
 FOLDERS = (ROOT, PACKAGE, PACKAGE / 'core', ROOT / 'test')
 """Where a path in a page may begin, beside the page's own folder."""
@@ -113,7 +113,7 @@ def topics() -> frozenset[str]:
     texts = texts_in('node')
     maps = next(
         ast.literal_eval(node.value)
-        for node in tree_of(PACKAGE / 'node' / 'mapper_node.py').body
+        for node in tree_of(PACKAGE / 'node' / 'map_publishers.py').body
         if isinstance(node, ast.Assign) and 'MAPS' in _targets(node)
     )
     # a text that ends so is completed by the name of a map
@@ -127,13 +127,15 @@ def topics() -> frozenset[str]:
 
 @cache
 def launch_arguments() -> frozenset[str]:
-    """The arguments of the launch files."""
-    return frozenset(
-        node.args[0].value
-        for path in (ROOT / 'launch').glob('*.py')
-        for node in ast.walk(tree_of(path))
-        if isinstance(node, ast.Call) and getattr(node.func, 'id', '') == 'DeclareLaunchArgument'
-    )
+    """The arguments of the launch files: those declared by name, and the parameters that are arguments as well."""
+    found = set()
+    for path in (ROOT / 'launch').glob('*.py'):
+        for node in ast.walk(tree_of(path)):
+            if isinstance(node, ast.Call) and getattr(node.func, 'id', '') == 'DeclareLaunchArgument':
+                found |= {arg.value for arg in node.args if isinstance(arg, ast.Constant)}
+            if isinstance(node, ast.Assign) and isinstance(node.value, ast.Dict) and 'PARAMETERS' in _targets(node):
+                found |= {key.value for key in node.value.keys if isinstance(key, ast.Constant)}
+    return frozenset(found)
 
 
 def is_value(name: str) -> bool:
@@ -251,6 +253,18 @@ def is_spoken(name: str) -> bool:
     return name in keys | texts_in('files') or name.split(': ', maxsplit=1)[0] in keys
 
 
+@cache
+def library_names() -> frozenset[str]:
+    """What programs of others import and use: functions of the library, their arguments, and what its results have."""
+    found = {'grid.shape', 'grid.extent'}
+    for node in ast.walk(tree_of(PACKAGE / 'library.py')):
+        if isinstance(node, ast.FunctionDef):
+            found |= {node.name} | {arg.arg for arg in node.args.args}
+    for path in (PACKAGE / 'library.py', PACKAGE / 'core' / 'maps' / 'map_set.py'):
+        found |= {name.rpartition('.')[2] for name in names_in(path)}
+    return frozenset(found)
+
+
 def exists(name: str, page: Path) -> bool:
     """Whether anything in the repository has this name."""
     first = name.split(maxsplit=1)[0] if name.split() else ''
@@ -268,6 +282,7 @@ def exists(name: str, page: Path) -> bool:
         or is_member(name)
         or f'{name}.py' in sources()
         or is_spoken(name)
+        or (page.name in ('README.md', 'library.md') and re.split(r'[=(]', name)[0] in library_names())
     )
 
 

@@ -37,6 +37,13 @@ ALLOWED = {
     '-wal': 'the ending of that file',
     'synchronous=NORMAL': 'a setting of SQLite',
     'TMPDIR': 'an environment variable of POSIX',
+    '/map': 'the topic of the map in Nav2, where a launch argument sends one of ours',
+    '/tf': 'the topic of transforms',
+    '--delay 3': 'an option of ros2 bag play',
+    'ml_map.yaml': 'a name of a map and an ending',
+    'global_frame: odom': 'a setting of Nav2',
+    '/robot1/forward_grid_mapper/run_em': 'a service of a node in a namespace',
+    'pip install --break-system-packages rosbags': 'a command of pip',
 }
 """Words in code spans that name nothing in the repository, and why they may stand there."""
 

@@ -12,13 +12,14 @@ from typing import Any
 import pytest
 import yaml
 
+from forward_grid_mapper.core.common.parameters import TABLE, find
 from forward_grid_mapper.files.parameter_file import load_parameters
 
 ROOT = Path(__file__).resolve().parents[1]
 FILE = ROOT / 'launch' / 'mapper.launch.py'
 MODULES = {
     'launch': ['LaunchDescription'],
-    'launch.actions': ['DeclareLaunchArgument'],
+    'launch.actions': ['DeclareLaunchArgument', 'OpaqueFunction'],
     'launch.conditions': ['IfCondition'],
     'launch.substitutions': ['LaunchConfiguration', 'PathJoinSubstitution'],
     'launch_ros': [],
@@ -38,6 +39,10 @@ class Call:
     @property
     def kind(self) -> str:
         return type(self).__name__
+
+    def perform(self, context: dict[str, str]) -> str:
+        """The text of a substitution; here the context is the values of the launch arguments."""
+        return str(self.resolve(context))
 
     def resolve(self, values: dict[str, str]) -> Any:
         """The value of a substitution when the launch arguments have these values."""
@@ -79,8 +84,8 @@ def description() -> Iterator[list[Call]]:
         yield runpy.run_path(str(FILE))['generate_launch_description']().arguments[0]
 
 
-def launched(description: list[Call], **given: str) -> dict[str, dict[str, Any]]:
-    """Options of the nodes that would start, by executable."""
+def started(description: list[Call], **given: str) -> list[dict[str, Any]]:
+    """Options of the nodes that would start, in their order."""
     values: dict[str, str] = {}
     for call in description:
         if call.kind == 'DeclareLaunchArgument':
@@ -88,8 +93,14 @@ def launched(description: list[Call], **given: str) -> dict[str, dict[str, Any]]
             values[name] = given.pop(name, None) or resolved(call.options['default_value'], values)
             assert values[name] in call.options.get('choices', [values[name]])
     assert not given, 'these arguments are not declared'
-    nodes = [resolved(call.options, values) for call in description if call.kind == 'Node']
-    return {node['executable']: node for node in nodes if node.get('condition', True)}
+    (opaque,) = (call for call in description if call.kind == 'OpaqueFunction')
+    nodes = [resolved(call.options, values) for call in opaque.options['function'](values) if call.kind == 'Node']
+    return [node for node in nodes if node.get('condition', True)]
+
+
+def launched(description: list[Call], **given: str) -> dict[str, dict[str, Any]]:
+    """The same by executable."""
+    return {node['executable']: node for node in started(description, **given)}
 
 
 def test_by_default_it_starts_the_node_alone(description: list[Call]) -> None:
@@ -101,6 +112,7 @@ def test_by_default_it_starts_the_node_alone(description: list[Call]) -> None:
     assert overrides == {'use_sim_time': False}
     assert load_parameters(ROOT / file.removeprefix('share/forward_grid_mapper/')).values
     assert node['arguments'] == ['--ros-args', '--log-level', 'info']
+    assert node['respawn'] is False
 
 
 def test_every_argument_tells_what_it_is_for(description: list[Call]) -> None:
@@ -140,6 +152,50 @@ def test_a_namespace_moves_what_rviz_listens_to_with_the_node(description: list[
         if topic := display.get('Topic', {}).get('Value'):
             assert not renamed[topic].startswith('/'), f'{topic} would not follow the namespace'
     assert renamed['/odom'] == 'wheels'
+
+
+def test_parameters_that_are_launch_arguments_reach_the_node_with_their_types(description: list[Call]) -> None:
+    given = {
+        'range_topics': 'left, right,',
+        'range_reliability': 'reliable',
+        'odom_reliability': 'best_effort',
+        'map_frame': 'map',
+        'online': 'true',
+        'journal': '/var/lib/robot/map_journal',
+    }
+    _, _, chosen = launched(description, **given)['mapper']['parameters']
+    assert chosen == {**given, 'range_topics': ['left', 'right'], 'online': True}
+    for name, value in chosen.items():
+        assert find(name).check(value) == (tuple(value) if isinstance(value, list) else value)
+    *_, alone = launched(description, online='false')['mapper']['parameters']
+    assert alone == {'online': False}
+
+
+def test_what_the_launch_file_offers_of_the_table_has_the_choices_of_the_table(description: list[Call]) -> None:
+    declared = {call.arguments[0]: call.options for call in description if call.kind == 'DeclareLaunchArgument'}
+    for row in TABLE:
+        if row.name in declared and row.choices:
+            assert declared[row.name]['choices'] == ['', *row.choices]
+            assert declared[row.name]['default_value'] == ''
+
+
+def test_one_of_the_maps_goes_where_nav2_expects_it(description: list[Call]) -> None:
+    nodes = launched(description, map='ml_map', rviz='true')
+    assert [pair for pair in nodes['mapper']['remappings'] if pair[1] == 'map'] == [('~/ml_map', 'map')]
+    renamed = dict(nodes['rviz2']['remappings'])
+    assert renamed['/forward_grid_mapper/ml_map'] == 'map'
+    assert renamed['/forward_grid_mapper/live_map'] == 'forward_grid_mapper/live_map'
+    assert not [pair for pair in launched(description)['mapper']['remappings'] if pair[1] == 'map']
+
+
+def test_the_mapper_is_started_again_on_request(description: list[Call]) -> None:
+    node = launched(description, use_respawn='true')['mapper']
+    assert node['respawn'] is True
+    assert node['respawn_delay'] > 0
+
+
+def test_rviz_comes_first_so_that_its_absence_leaves_no_mapper_behind(description: list[Call]) -> None:
+    assert [node['executable'] for node in started(description, rviz='true')] == ['rviz2', 'mapper']
 
 
 def test_launch_itself_takes_the_file() -> None:

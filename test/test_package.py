@@ -6,6 +6,7 @@ import importlib
 import re
 import runpy
 import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -26,7 +27,8 @@ NAME = 'forward_grid_mapper'
 DEPENDENCIES = {
     'exec_depend': {
         *('diagnostic_msgs', 'geometry_msgs', 'launch', 'launch_ros', 'nav_msgs', 'rclpy'),
-        *('rosgraph_msgs', 'sensor_msgs', 'std_srvs', 'tf2_msgs', 'tf2_ros'),
+        *('rosgraph_msgs', 'sensor_msgs', 'std_srvs', 'tf2_msgs', 'tf2_ros_py'),
+        *('builtin_interfaces', 'rcl_interfaces', 'rviz2'),
         *('python3-matplotlib', 'python3-numba', 'python3-numpy', 'python3-rosbags-pip', 'python3-scipy'),
         'python3-yaml',
     },
@@ -45,15 +47,21 @@ def manifest() -> ElementTree.Element:
     return ElementTree.parse(ROOT / 'package.xml').getroot()
 
 
-@pytest.fixture(scope='module')
-def setup() -> dict[str, Any]:
-    """What setup.py hands to setuptools."""
+def given_to_setuptools(*arguments: str) -> dict[str, Any]:
+    """What setup.py hands to setuptools when it is called with these arguments."""
     given: dict[str, Any] = {}
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(ROOT)
         patch.setattr(setuptools, 'setup', lambda **options: given.update(options))
+        patch.setattr(sys, 'argv', ['setup.py', *arguments])
         runpy.run_path('setup.py')
     return given
+
+
+@pytest.fixture(scope='module')
+def setup() -> dict[str, Any]:
+    """What setup.py hands to setuptools when colcon builds."""
+    return given_to_setuptools('install', '--prefix', 'install')
 
 
 def text_of(manifest: ElementTree.Element, tag: str) -> str:
@@ -102,12 +110,24 @@ def test_every_command_can_be_started(setup: dict[str, Any]) -> None:
     from forward_grid_mapper.__main__ import COMMANDS
 
     scripts = dict(line.split(' = ') for line in setup['entry_points']['console_scripts'])
-    assert scripts == {name: f'{NAME}.__main__:{name}' for name in COMMANDS}
+    assert scripts == {NAME: f'{NAME}.__main__:main', **{name: f'{NAME}.__main__:{name}' for name in COMMANDS}}
     for target in scripts.values():
         module, function = target.split(':')
         assert callable(getattr(importlib.import_module(module), function))
     for module, _ in COMMANDS.values():
         assert callable(importlib.import_module(f'{NAME}.{module}').main)
+
+
+def test_the_citation_and_the_changes_are_of_this_version() -> None:
+    version = forward_grid_mapper.__version__
+    assert yaml.safe_load((ROOT / 'CITATION.cff').read_text())['version'] == version
+    assert re.search(rf'^## {re.escape(version)}\b', (ROOT / 'CHANGELOG.md').read_text(), re.MULTILINE)
+
+
+@pytest.mark.parametrize('build', ['dist_info', 'bdist_wheel', 'editable_wheel'])
+def test_pip_puts_one_command_on_the_path(build: str) -> None:
+    made = given_to_setuptools(build)['entry_points']['console_scripts']
+    assert made == [f'{NAME} = {NAME}.__main__:main']
 
 
 @pytest.mark.parametrize('folder', ['config', 'launch', 'rviz'])

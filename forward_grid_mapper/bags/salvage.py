@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Collection, Iterator
 from pathlib import Path
@@ -10,7 +11,7 @@ from .bounds import Budget
 from .source import Channel, RawMessage
 
 
-class Scan:
+class Scan(ABC):
     """Reads a file from front to back; a subclass knows the format.
 
     The first pass, on construction, finds the channels and counts their messages. Files without an index are not in
@@ -33,16 +34,16 @@ class Scan:
         """Return the number of messages by channel; the pass over the file notes channels and damage."""
         return Counter(key for key, _, _ in self._pass())
 
-    def close(self) -> None:
+    def close(self) -> None:  # noqa: B027 (for any scan, not for its subclass to fill in)
         """Nothing is held open between passes."""
 
     def _pass(self) -> Iterator[RawMessage]:
         self._budget = Budget(self._path.stat().st_size)
         return self._walk()
 
+    @abstractmethod
     def _walk(self) -> Iterator[RawMessage]:
         """Yield every message that can be read, in the file's order; note channels and damage."""
-        raise NotImplementedError
 
     def _note(self, damage: str) -> None:
         self.damage = self.damage or damage

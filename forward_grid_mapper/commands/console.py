@@ -14,6 +14,7 @@ from contextlib import suppress
 from types import TracebackType
 from typing import TextIO
 
+from .. import __version__
 from ..core.common.errors import MapperError
 from ..core.runtime.compiling import compiling
 from ..core.search.search import Progress
@@ -32,6 +33,7 @@ def run(
     if isinstance(sys.stdout, io.TextIOWrapper):
         # a path may hold what the terminal cannot show
         sys.stdout.reconfigure(errors='backslashreplace')
+    parser.add_argument('--version', action='version', version=f'%(prog)s of forward_grid_mapper {__version__}')
     try:
         try:
             with Interruptible():

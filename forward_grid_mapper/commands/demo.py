@@ -104,6 +104,8 @@ def ros_is_here() -> bool:
 
 def demo(options: argparse.Namespace) -> int:
     """Do what the command line asks for."""
+    # before the work: they may be wrong, or all that is asked for
+    chosen_parameters(options)
     output = Path(options.output) if options.output else free_name(Path.cwd(), 'demo_output')
     if not options.offline and not ros_is_here():
         raise MapperError('ROS 2 is not there: source its setup.bash, pip install .[ros], or use --offline')

@@ -12,6 +12,7 @@ from pathlib import Path
 from ..core.common.errors import OutputError, ParameterError
 from ..core.common.shell import command_line
 from ..core.joint_learning import learn_jointly
+from ..core.learning.consistency import consistency_warnings
 from ..core.learning.input_warnings import input_warnings
 from ..core.learning.sensor_health import health_warning, sensor_health
 from ..files.learned_text import learned_text, parameter_file_text, write_new_file
@@ -70,6 +71,7 @@ def learn(options: argparse.Namespace) -> int:
         *drive.source['warnings'],
         *ignored,
         *input_warnings(found.maps.readings),
+        *consistency_warnings(found.maps.readings, drive.source.get('extrinsics') or {}, parameters),
         *found.warnings,
         *filter(None, [suspects]),
     )

@@ -79,7 +79,7 @@ def add_bag_options(parser: argparse.ArgumentParser) -> None:
 
 
 def add_mapping_options(parser: argparse.ArgumentParser) -> None:
-    """Add `--params`, `--set` and `--list-parameters`."""
+    """Add `--params`, `--set`, `--dump-config` and `--list-parameters`."""
     group = parser.add_argument_group('parameters')
     group.add_argument('--params', metavar='FILE', help='parameter YAML, the same file that the node takes')
     group.add_argument(
@@ -87,7 +87,11 @@ def add_mapping_options(parser: argparse.ArgumentParser) -> None:
         action='append',
         default=[],
         metavar='NAME=VALUE',
-        help='set one parameter, after --params; may be repeated (--list-parameters shows all)',
+        help='set one parameter, after --params; may be repeated (--list-parameters shows all); angles in radians, or '
+        'as 40deg',
+    )
+    group.add_argument(
+        '--dump-config', action='store_true', help='show every parameter as this call would use it, as YAML, and exit'
     )
     group.add_argument('--list-parameters', action=ListParameters, help='show every parameter as YAML and exit')
 
@@ -124,6 +128,8 @@ INSTEAD = {
 def chosen_parameters(options: argparse.Namespace) -> Chosen:
     """Return the parameters and the sensor poses of `--params` and `--set`.
 
+    With `--dump-config` it prints the parameters and leaves.
+
     Raises
     ------
     ParameterError
@@ -135,7 +141,11 @@ def chosen_parameters(options: argparse.Namespace) -> Chosen:
         if name not in DEPRECATED and find(name).group == 'node':
             raise ParameterError(f'--set {name}: only the node has this parameter; topics have options of their own')
     warnings = [text] if (text := _ignored(values, options.params)) else []
-    return Chosen(Parameters.from_flat({**values, **settings}), dict(extrinsics), warnings)
+    parameters = Parameters.from_flat({**values, **settings})
+    if options.dump_config:
+        print(dump_parameters(parameters), end='')
+        raise SystemExit(0)
+    return Chosen(parameters, dict(extrinsics), warnings)
 
 
 def _ignored(values: Mapping[str, Any], source: str) -> str:

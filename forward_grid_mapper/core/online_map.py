@@ -74,6 +74,7 @@ class OnlineMap:
 
     def __init__(self, parameters: Parameters) -> None:
         self._parameters = parameters
+        self._stop = np.zeros(1, np.uint8)
         self.clear()
 
     def clear(self) -> None:
@@ -88,6 +89,16 @@ class OnlineMap:
         self.grid = Grid(self._parameters.grid.resolution, 0, 0, 0, 0)
         self.taken = 0
         """Readings added, those that were merged with others included."""
+
+    def cancel(self) -> None:
+        """Give the map up: calls end soon, with `Cancelled`; may be called from any thread."""
+        self._stop[0] = 1
+
+    def dismantle(self) -> None:
+        """Free the memory of a map that nobody needs any more, bit by bit: at once, it would keep the GIL for long."""
+        self._evidence = None
+        while self._kept:
+            self._kept.popitem()
 
     def __len__(self) -> int:
         """Return the number of readings kept."""
@@ -108,6 +119,8 @@ class OnlineMap:
         ------
         InputError
             If the grid would exceed `max_cells`; nothing is changed.
+        Cancelled
+            If `cancel` was called.
         MemoryError
         """
         if not len(readings):
@@ -233,7 +246,7 @@ class OnlineMap:
         prior = wall_prior(p.search, traversed.ravel(), g.resolution)
         if evidence is None:
             threads = p.search.threads or cores()
-            evidence = Evidence(larger, p.model, memory_for_pairs(p), threads, renewable=True)
+            evidence = Evidence(larger, p.model, memory_for_pairs(p), threads, self._stop, renewable=True)
         else:
             evidence.grow(larger)
             if self._since:

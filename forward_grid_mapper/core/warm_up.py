@@ -1,9 +1,13 @@
-"""Compilation of every kernel before the first reading comes, so that no callback has to wait for it."""
+"""Compilation of every kernel before the first reading comes, so that nothing has to wait for it.
+
+What is needed first is compiled first: the kernels of the live map, then those of the online map, then those of EM.
+"""
 
 from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Callable
 
 import numpy as np
 
@@ -11,19 +15,50 @@ from .common.parameters import Parameters
 from .common.readings import Readings
 from .learning.sensor_health import sensor_health
 from .mapping import Mapper
+from .maps.log_odds_map import LogOddsMap
 from .maps.map_set import MapSet
 from .online_map import OnlineMap
 
 
-def warm_up() -> MapSet:
-    """Map a square room, which calls every kernel with the types that real work has."""
+def _square_room() -> Readings:
     yaw = np.linspace(-math.pi, math.pi, 24, endpoint=False)
     z = 1.0 / np.maximum(np.abs(np.cos(yaw)), np.abs(np.sin(yaw)))
-    readings = Readings.from_columns(('',), x=0.0, y=0.0, yaw=yaw, z=np.minimum(z, 1.4), z_max=1.4, half_angle=0.1)
-    online = OnlineMap(Parameters())
+    return Readings.from_columns(('',), x=0.0, y=0.0, yaw=yaw, z=np.minimum(z, 1.4), z_max=1.4, half_angle=0.1)
+
+
+def warm_up_live_map() -> None:
+    """Compile the kernels of the live map."""
+    live = LogOddsMap(Parameters())
+    live.add(_square_room())
+    live.probability()
+
+
+def warm_up_online_map() -> None:
+    """Compile the kernels of the online map."""
+    readings, online = _square_room(), OnlineMap(Parameters())
     # twice the same, then a place so far away that the grid grows
     for moved in (0.0, 0.0, 40.0):
         online.add(dataclasses.replace(readings, x=readings.x + moved))
-    maps = Mapper(Parameters()).run(readings)
+    online.maps()
+
+
+def warm_up_em() -> MapSet:
+    """Compile the kernels of EM and of what comes after it."""
+    maps = Mapper(Parameters()).run(_square_room())
     sensor_health(maps)
     return maps
+
+
+STEPS: dict[str, Callable[[], object]] = {
+    'live map': warm_up_live_map,
+    'online map': warm_up_online_map,
+    'EM': warm_up_em,
+}
+"""What there is to compile, in this order."""
+
+
+def warm_up() -> MapSet:
+    """Map a square room in every way, which calls every kernel with the types that real work has."""
+    warm_up_live_map()
+    warm_up_online_map()
+    return warm_up_em()

@@ -75,6 +75,8 @@ def load_parameters(path: Path | str) -> ParameterFile:
 def parse_setting(text: str) -> tuple[str, Any]:
     """Return the name and the checked value of `name=value`; unchecked for the names of `DEPRECATED`.
 
+    Angles are in radians or, with the suffix `deg`, in degrees.
+
     Raises
     ------
     ParameterError
@@ -206,6 +208,8 @@ def _typed(row: Parameter, text: str) -> Any:
     if row.type is tuple:
         return [part.strip() for part in text.split(',') if part.strip()]
     try:
+        if row.unit == 'rad' and text.endswith('deg'):
+            return math.radians(float(text.removesuffix('deg')))
         return row.type(text)
     except ValueError:
         return text

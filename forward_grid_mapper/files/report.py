@@ -30,9 +30,9 @@ def report_data(maps: MapSet, source: Mapping[str, Any]) -> dict[str, Any]:
     maps : MapSet
     source : mapping
         Where the readings came from. All keys are optional: `bag`, `range_topics`, `odom_topic`, `odom_frame`,
-        `map_frame`, `mounts_from`, `stamps` (first and last, nanoseconds), `duration_s`, `path_m`, `counts`
-        (`received`, `accepted`, `rejected` by reason), `sensors` (by frame: `accepted`, `no_echo`, `unexplained`),
-        `warnings`. Others are kept as they are under `input`.
+        `map_frame`, `mounts_from`, `extrinsics` (poses of the sensors on the robot, by frame), `stamps` (first and
+        last, nanoseconds), `duration_s`, `path_m`, `counts` (`received`, `accepted`, `rejected` by reason), `sensors`
+        (by frame: `accepted`, `no_echo`, `unexplained`), `warnings`. Others are kept as they are under `input`.
 
     Returns
     -------

@@ -9,6 +9,7 @@ from typing import Any
 
 _LABEL = 14
 _WIDTH = 100
+_SHOWN = 6
 
 
 def report_text(data: dict[str, Any]) -> str:
@@ -77,11 +78,27 @@ def _counts(data: dict[str, Any]) -> Iterator[str]:
     received = counts.get('received')
     if received is None:
         received = accepted + sum(rejected.values())
-    yield from _line('Readings', f'{received:,} received, {accepted:,} accepted ({_share(accepted, received)})')
+    waiting = f', {counts["waiting"]:,} waiting' if counts.get('waiting') else ''
+    yield from _line(
+        'Readings', f'{received:,} received, {accepted:,} accepted ({_share(accepted, received)}){waiting}'
+    )
+    if counts.get('lost') is not None:
+        yield from _line('Lost', f'{counts["lost"]:,} before they were received (estimated)')
     if rejected:
         yield '  rejected'
+    by_frame = (data.get('input') or {}).get('rejected_by_frame') or {}
     for reason, number in sorted(rejected.items(), key=lambda item: -item[1]):
-        yield f'  {number:>12,}  {_share(number, received):>7}  {reason}'
+        lead = f'  {number:>12,}  {_share(number, received):>7}  {reason}'
+        yield f'{lead}{_frames({name: n for name, row in by_frame.items() if (n := row.get(reason))})}'
+
+
+def _frames(counts: dict[str, int]) -> str:
+    """Return the frames with most readings, and how many each has; sensors that fail alike are many."""
+    if not counts:
+        return ''
+    order = sorted(counts, key=lambda name: (-counts[name], name))
+    more = f', {len(order) - _SHOWN} more' if len(order) > _SHOWN else ''
+    return f' ({", ".join(f"{name} {counts[name]:,}" for name in order[:_SHOWN])}{more})'
 
 
 def _sensors(data: dict[str, Any]) -> Iterator[str]:

@@ -11,12 +11,14 @@ from numpy.typing import NDArray
 
 from ..core.common.errors import OutputError
 from ..core.common.grid import Grid
+from ..core.learning.consistency import consistency_warnings
 from ..core.learning.input_warnings import input_warnings
 from ..core.maps.map_set import MapSet
 from .map_archive import write_npz
 from .map_files import write_raw, write_trinary
 from .output_folder import output_errors, output_folder
 from .quality_warning import quality_warning
+from .reading_archive import write_readings
 from .report import report_data, write_report
 
 
@@ -65,9 +67,11 @@ def write_results(
         write_trinary(folder / 'ml_map', maps.grid, maps.ml)
         write_raw(folder / 'uncertainty_map', maps.grid, maps.uncertainty)
         write_npz(folder / 'maps.npz', maps)
+        write_readings(folder / 'readings.npz', maps)
         warnings = [
             *(source.get('warnings') or []),
             *input_warnings(maps.readings),
+            *consistency_warnings(maps.readings, source.get('extrinsics') or {}, maps.parameters),
             *filter(None, [quality_warning(maps)]),
         ]
         try:

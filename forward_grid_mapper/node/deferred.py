@@ -10,23 +10,28 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.service import Service
 
-CALLS = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
+CALLS = QoSProfile(depth=5000, reliability=ReliabilityPolicy.RELIABLE)
 """Calls and answers that may wait at once; of more than ROS's own 10 some would never be answered."""
 
 
 class Reply:
     """The answer that a client waits for."""
 
-    def __init__(self, service: DeferredService) -> None:
+    def __init__(self, service: DeferredService, request: Any) -> None:
+        self.request = request
         self._service = service
         self._lock = threading.Lock()
         self._header: Any = None
         self._response: Any = None
 
-    def send(self, success: bool, message: str) -> None:
-        """Answer, once; a client that has gone is no error."""
-        response = self._service.kind.Response(success=success, message=message)
+    def send(self, *arguments: Any, **fields: Any) -> None:
+        """Answer with the fields of the response, in order or by name, once; a client that has gone is no error."""
+        kind = self._service.kind.Response
+        names = kind.get_fields_and_field_types()
+        response = kind(**dict(zip(names, arguments, strict=False)), **fields)
         with self._lock:
+            if self._response is not None:
+                return
             self._response, header = response, self._header
         if header is not None:
             self._service.transmit(response, header)
@@ -54,7 +59,7 @@ class DeferredService:
         self._service.send_response = self._send
 
     def _accept(self, request: Any, response: Any) -> Reply:
-        reply = Reply(self)
+        reply = Reply(self, request)
         self._handler(reply)
         return reply
 

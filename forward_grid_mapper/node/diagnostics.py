@@ -13,6 +13,7 @@ from ..core.common.grid import Grid
 from ..core.messages.pose_association import PoseAssociator
 from ..core.messages.rep117 import ODOMETRY_REASONS, REASONS
 from .em import Run
+from .intake import Intake
 
 SILENCE = 3.0
 """Seconds without odometry, or without ranges, that are worth a warning."""
@@ -43,26 +44,28 @@ class Health:
     def statuses(
         self,
         name: str,
+        intake: Intake,
         associator: PoseAssociator,
         run: Run | None,
         last_run: str,
         grid: Grid,
-        paused: bool,
         extra: dict[str, Any],
     ) -> list[DiagnosticStatus]:
         """Return the statuses of input and of EM."""
-        level, message = self._judge(associator, paused)
+        level, message = self._judge(associator, intake)
         bound = associator.parameters.max_readings
         held = min(associator.buffer.held, bound or associator.buffer.held)
         values = {
-            'readings received': associator.received,
+            'readings received': intake.received,
             'readings accepted': len(associator.buffer),
             'readings kept to map from': f'{held} of at most {bound}' if bound else held,
-            'readings waiting for a pose': associator.waiting,
+            'readings waiting for a pose': intake.waiting,
             'readings rejected': sum(associator.rejected.values()),
-            **{f'rejected: {reason}': count for reason, count in sorted(associator.rejected.items())},
+            'readings lost in the middleware (estimated)': intake.lost,
+            **{f'rejected: {reason}': count for reason, count in sorted(dict(associator.rejected).items())},
             'longest delay of a reading (ms)': f'{self._slowest / 1e6:.1f}',
             'odometry received': associator.odometry_received,
+            'odometry lost in the middleware (estimated)': intake.odometry_lost,
             **{f'odometry rejected: {reason}': count for reason, count in sorted(associator.odometry_rejected.items())},
             'clock jumps back': associator.time_jumps,
             'frames without a pose': _listed(associator.unknown_frames),
@@ -77,15 +80,15 @@ class Health:
             status(f'{name}: EM', DiagnosticStatus.OK, em['state'], name, em),
         ]
 
-    def _judge(self, associator: PoseAssociator, paused: bool) -> tuple[bytes, str]:
-        received, rejected = associator.received, sum(associator.rejected.values())
+    def _judge(self, associator: PoseAssociator, intake: Intake) -> tuple[bytes, str]:
+        received, rejected = intake.received, sum(associator.rejected.values())
         new, new_rejected = received - self._received, rejected - self._rejected
         self._received, self._rejected = received, rejected
         refused = sum(associator.odometry_rejected.values())
         silent_odometry = self._silence('odometry', associator.odometry_received - refused)
         refused_now, self._refused = refused - self._refused, refused
-        silent_ranges = self._silence('range', associator.received)
-        if paused:
+        silent_ranges = self._silence('range', received)
+        if intake.paused:
             return DiagnosticStatus.OK, 'paused'
         if silent_odometry > SILENCE and refused_now > 0:
             reason = max(associator.odometry_rejected, key=lambda key: associator.odometry_rejected[key])

@@ -6,7 +6,6 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +15,7 @@ from ..core.common.grid import Grid
 from ..core.common.parameters import Parameters
 from ..core.common.readings import Readings
 from ..core.learning.input_warnings import input_warnings
+from ..core.learning.sensor_health import SensorHealth, sensor_health
 from ..core.mapping import Mapper
 from ..core.maps.log_odds_map import map_grid
 from ..core.maps.map_set import MapSet
@@ -23,32 +23,42 @@ from ..core.runtime.memory import shortage
 from ..core.runtime.threads import cores
 from ..core.search.search import Progress
 from ..files.quality_warning import quality_warning
+from .background import Worker
 
 
 @dataclass
 class Outcome:
-    """How a run ended: `maps`, or None and the reason in `message`; `warnings` say what is wrong with the readings."""
+    """How a run ended: `maps`, or None and the reason in `message`.
+
+    `warnings` say what is wrong with the readings, `health` how each sensor does.
+    """
 
     maps: MapSet | None
     message: str
     warnings: list[str] = field(default_factory=list)
+    health: dict[str, SensorHealth] = field(default_factory=dict)
 
 
 @dataclass
 class Run:
-    """One run of EM, from map `start` or from the empty one.
+    """One run of EM on what `readings` returns, from map `start` or from the empty one.
 
-    `stage` and `progress` say where it stands; `finished` is set after `done` was called.
+    `stage` and `progress` say where it stands; `ended` is set when its thread has done all that it does for it. `found`
+    is called with the maps as soon as they are there, in the thread.
     """
 
     mapper: Mapper
-    readings: Readings
+    parameters: Parameters
+    readings: Callable[[], Readings]
+    found: Callable[[MapSet], object] = lambda maps: None
     start: tuple[Grid, NDArray[np.int8]] | None = None
     begin: float = field(default_factory=time.monotonic)
     stage: str = 'starting'
+    count: int = 0
     progress: Progress | None = None
-    finished: threading.Event = field(default_factory=threading.Event)
-    thread: threading.Thread | None = None
+    cancelled: bool = False
+    ended: threading.Event = field(default_factory=threading.Event)
+    waiting: list[Callable[[Outcome], object]] = field(default_factory=list)
 
     @property
     def seconds(self) -> float:
@@ -56,80 +66,120 @@ class Run:
         return time.monotonic() - self.begin
 
     def __str__(self) -> str:
-        text = f'{self.stage} of {len(self.readings)} readings, {self.seconds:.1f} s'
+        text = f'{self.stage} of {self.count} readings, {self.seconds:.1f} s'
         if self.progress:
             p = self.progress
             text += f', iteration {p.iterations}, {p.flips} flips, {p.gain:.0f} nats gained'
-        return text
+        return text + (', being cancelled' if self.cancelled else '')
 
 
 class EmWorker:
-    """Runs EM on snapshots of the readings, one at a time."""
+    """Runs EM on snapshots of the readings, one at a time; all methods return at once, and are called by one thread.
 
-    def __init__(self, watch: Callable[[Run], None], log: Callable[[str], Any]) -> None:
-        """`watch` is called at every stage and iteration, in the run's thread; `log` takes errors no user caused."""
-        self._watch, self._log = watch, log
-        self._lock = threading.Lock()
-        self._run: Run | None = None
+    Attributes
+    ----------
+    current : Run or None
+        The run that goes on; there is no other until its thread has done everything for it.
+    """
 
-    @property
-    def current(self) -> Run | None:
-        """The run that goes on, or None."""
-        run = self._run
-        return run if run is not None and not run.finished.is_set() else None
-
-    def start(
+    def __init__(
         self,
-        readings: Readings,
-        parameters: Parameters,
-        done: Callable[[Outcome], None],
-        start: tuple[Grid, NDArray[np.int8]] | None = None,
-    ) -> Run | None:
-        """Begin a run; `done` is called in its thread. Return None if one goes on already."""
-        with self._lock:
-            if self.current is not None:
-                return None
-            run = Run(Mapper(parameters), readings, start)
-            run.thread = threading.Thread(target=self._work, args=(run, parameters, done), name='em', daemon=True)
-            self._run = run
-        run.thread.start()
-        return run
+        watch: Callable[[Run], object],
+        log: Callable[[str], object],
+        conclude: Callable[[Callable[[], None]], object],
+        prepare: Callable[[Callable[[], bool]], None] = lambda stop: None,
+    ) -> None:
+        """Begin without a run.
 
-    def cancel(self, wait: float = 0.0) -> None:
-        """Cancel the run that goes on, if any, and give it `wait` seconds to end."""
+        Parameters
+        ----------
+        watch : callable
+            Takes the run at every stage and iteration, in the run's thread.
+        log : callable
+            Takes errors no user caused.
+        conclude : callable
+            Takes a function and has the thread that calls the methods call it.
+        prepare : callable
+            Called in the thread before the first run, and given what says whether to stop.
+        """
+        self.worker = Worker('EM', log)
+        self._log = log
+        self.current: Run | None = None
+        self._watch, self._conclude, self._prepare = watch, conclude, prepare
+
+    def start(self, run: Run, done: Callable[[Outcome], object]) -> bool:
+        """Begin a run; `done` is called when it has ended. Return whether it began: it does not while one goes on."""
+        if self.current is not None:
+            return False
+        run.waiting.append(done)
+        self.current = run
+        self.worker.put(lambda: self._work(run), lambda why: self._end(run, Outcome(None, f'EM failed: {why}')))
+        return True
+
+    def cancel(self) -> None:
+        """Cancel the run that goes on, if any."""
         run = self.current
         if run is not None:
+            run.cancelled = True
             run.mapper.cancel()
-            run.finished.wait(wait)
 
-    def _work(self, run: Run, parameters: Parameters, done: Callable[[Outcome], None]) -> None:
+    def close(self, seconds: float) -> None:
+        """Cancel the run that goes on, and wait so long for its end."""
+        self.cancel()
+        self.worker.close(seconds)
+
+    def _work(self, run: Run) -> None:
+        """Do all that a run does; whatever is raised here and not expected, the worker reports."""
+        outcome = self._outcome(run)
+        if outcome.maps is not None:
+            run.found(outcome.maps)
+            run.stage, run.progress = 'judging sensors', None
+            self._judge(run, outcome, outcome.maps)
+        self._end(run, outcome)
+
+    def _judge(self, run: Run, outcome: Outcome, maps: MapSet) -> None:
+        """Add what the maps say of sensors and readings; the maps are good without it."""
+        try:
+            outcome.health = sensor_health(maps)
+            outcome.warnings = input_warnings(maps.readings)
+        except Exception as error:
+            outcome.warnings = [f'sensors could not be judged: {error!r}']
+
+    def _outcome(self, run: Run) -> Outcome:
         def watch(stage: str, progress: Progress | None) -> None:
             run.stage, run.progress = stage, progress
             self._watch(run)
 
         try:
-            cells = map_grid(run.readings, parameters).size
-            if lack := shortage(cells, len(run.readings), parameters.search.threads or cores()):
+            run.stage = 'waiting for kernels that are being compiled'
+            self._prepare(lambda: run.cancelled)
+            run.stage = 'starting'
+            readings, p = run.readings(), run.parameters
+            run.count = len(readings)
+            if lack := shortage(map_grid(readings, p).size, len(readings), p.search.threads or cores()):
                 raise InputError(lack)
-            outcome = Outcome(run.mapper.run(run.readings, watch, run.start), '', input_warnings(run.readings))
+            return Outcome(run.mapper.run(readings, watch, run.start), '')
         except Cancelled:
-            outcome = Outcome(None, 'EM was cancelled')
+            return Outcome(None, 'EM was cancelled')
         except MapperError as error:
-            outcome = Outcome(None, str(error))
+            return Outcome(None, str(error))
         except MemoryError:
-            outcome = Outcome(
-                None, f'EM of {len(run.readings)} readings does not fit the memory; reset, or use a coarser resolution'
+            return Outcome(
+                None, f'EM of {run.count} readings does not fit the memory; reset, or use a coarser resolution'
             )
-        except Exception as error:
-            # a run must never take the live map with it
-            self._log(f'EM failed: {error!r}')
-            outcome = Outcome(None, f'EM failed: {error!r}')
-        # whoever learns that the run has ended may start the next
-        self._run = None
-        try:
-            done(outcome)
-        finally:
-            run.finished.set()
+
+    def _end(self, run: Run, outcome: Outcome) -> None:
+        def conclude() -> None:
+            self.current = None
+            for done in run.waiting:
+                try:
+                    done(outcome)
+                except Exception as error:
+                    # one that fails must not keep the others waiting
+                    self._log(f'EM has ended, and not everybody could be told: {error!r}')
+
+        run.ended.set()
+        self._conclude(conclude)
 
 
 def summary(maps: MapSet, seconds: float) -> str:

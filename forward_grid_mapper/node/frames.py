@@ -17,6 +17,9 @@ PATIENCE = 0.2
 MOST_HELD = 10_000
 """Odometry messages that wait for a transform at the most."""
 
+LOOKUPS = 100
+"""Transforms that one odometry message asks for at the most, so that a transform that comes late holds up nobody."""
+
 MOST_MISSING = 1000
 """Frames whose absence is remembered, so that names that strangers make up cost no memory."""
 
@@ -28,6 +31,7 @@ class Transforms:
         """`buffer` is a `tf2_ros.Buffer`, `error` the base of its exceptions."""
         self._buffer, self._error = buffer, error
         self._missing: dict[tuple[str, str], float] = {}
+        self._newest: int | None = None
 
     @classmethod
     def of(cls, node: Any) -> Transforms:
@@ -45,6 +49,19 @@ class Transforms:
     def available(self) -> bool:
         """Whether there is any TF to ask."""
         return self._buffer is not None
+
+    def heed(self, stamp: int) -> None:
+        """Take the stamp of a message in nanoseconds; where the clock jumped back, forget the transforms of before.
+
+        TF refuses transforms that are much older than those it has, and joins others with those of the time before the
+        jump. Static transforms stay: tf2 never forgets them.
+        """
+        if self._newest is not None and stamp < self._newest - JUMP:
+            self._newest = stamp
+            self._missing.clear()
+            if self._buffer is not None:
+                self._buffer.clear()
+        self._newest = stamp if self._newest is None else max(stamp, self._newest)
 
     def lookup(self, target: str, source: str, stamp: int) -> Any | None:
         """Return the `geometry_msgs/Transform` of `source` in `target` at `stamp` in nanoseconds, or None."""
@@ -91,16 +108,28 @@ class Extrinsics:
 
 
 class MapFrame:
-    """Gives odometry in another map frame, by the transform that TF has at its stamp; holds it back until TF does."""
+    """Gives odometry in another map frame, by the transform that TF has at its stamp; holds it back until TF does.
+
+    Attributes
+    ----------
+    timeout : float
+        Seconds, by stamps, for which it is held back; it may change.
+    dropped : int
+        Messages for which TF had no transform in time.
+    """
 
     def __init__(self, map_frame: str, transforms: Transforms, timeout: float) -> None:
         self._map_frame, self._transforms = map_frame, transforms
-        self._timeout = round(timeout * NANOSECONDS)
+        self.timeout = timeout
         self._held: deque[OdometryMessage] = deque()
         self.dropped = 0
 
     def convert(self, message: OdometryMessage) -> list[OdometryMessage]:
-        """Take an odometry message; return those whose pose in the map frame is known now, in order."""
+        """Take an odometry message; return those whose pose in the map frame is known now, `LOOKUPS` of them, in order.
+
+        Others wait for the next call.
+        """
+        self._transforms.heed(message.stamp)
         if not self._map_frame or message.frame_id.lstrip('/') == self._map_frame.lstrip('/'):
             return [message]
         # the associator sorts in what only overtook
@@ -113,7 +142,7 @@ class MapFrame:
             self._held.popleft()
             self.dropped += 1
         ready = []
-        while self._held:
+        for _ in range(min(len(self._held), LOOKUPS)):
             first = self._held[0]
             transform = self._transforms.lookup(self._map_frame, first.frame_id, first.stamp)
             pose = planar_pose(transform.translation, transform.rotation) if transform is not None else None
@@ -121,7 +150,7 @@ class MapFrame:
                 ready.append(first._replace(frame_id=self._map_frame, pose=pose.compose(first.pose)))
             elif first.pose is None:
                 ready.append(first)
-            elif message.stamp - first.stamp <= self._timeout:
+            elif message.stamp - first.stamp <= self.timeout * NANOSECONDS:
                 break
             else:
                 self.dropped += 1

@@ -29,8 +29,8 @@ FULL = (errno.ENOSPC, errno.EDQUOT)
 class JournalKeeper:
     """Keeps a node's journal; does nothing where the folder is empty text."""
 
-    def __init__(self, node: Node, folder: str, associator: PoseAssociator, clock: Any) -> None:
-        """Open the journal and give its readings to the associator.
+    def __init__(self, node: Node, folder: str, associator: PoseAssociator) -> None:
+        """Open the journal; call `restore` before anything else.
 
         Parameters
         ----------
@@ -38,8 +38,6 @@ class JournalKeeper:
             Its attribute `parameters` holds the parameters of the mapper.
         folder : str
         associator : PoseAssociator
-        clock : Clock
-            Of the timer that looks for new readings.
 
         Raises
         ------
@@ -54,6 +52,7 @@ class JournalKeeper:
         self._restored = self._taken = 0
         self._last_point: tuple[float, float] | None = None
         self._parameters: Parameters | None = None
+        self._begun = False
         if not folder:
             return
         warn: Callable[[str], Any] = node.get_logger().warning
@@ -65,11 +64,24 @@ class JournalKeeper:
                 raise
             self._trouble = str(error)
             warn(f'there is no journal: {error}')
-            return
-        self._restore(self._journal)
-        # both before readings go and as they come
-        associator.buffer.before_thinning.append(self.take)
-        node.create_timer(PERIOD, self.take, clock=clock)
+
+    def restore(self) -> None:
+        """Give the journal's readings to the associator; any thread, as long as no other uses the associator.
+
+        Raises
+        ------
+        OutputError
+            If another program has the file open.
+        """
+        if self._journal is not None:
+            self._restore(self._journal)
+
+    def begin(self, clock: Any) -> None:
+        """Look for new readings by a timer, which has this clock, and before readings go."""
+        if self._journal is not None:
+            self._associator.buffer.before_thinning.append(self.take)
+            self._node.create_timer(PERIOD, self.take, clock=clock)
+            self._begun = True
 
     def _restore(self, journal: Journal) -> None:
         associator, logger = self._associator, self._node.get_logger()
@@ -126,7 +138,8 @@ class JournalKeeper:
     def close(self) -> None:
         """Write what is left."""
         if self._journal is not None:
-            self.take()
+            if self._begun:
+                self.take()
             self._journal.close()
 
     def statuses(self, name: str) -> list[DiagnosticStatus]:

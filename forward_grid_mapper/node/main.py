@@ -8,6 +8,7 @@ if __name__ == '__main__':
     # Ctrl-C while this is imported ends it at once and without a traceback; see `Stopper` for what comes then
     signal.signal(signal.SIGINT, signal.SIG_DFL)
 
+import os
 import sys
 import threading
 import time
@@ -77,7 +78,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 1
     # callbacks get their turn soon where EM is between two kernels
     sys.setswitchinterval(0.0005)
-    from ..core.warm_up import warm_up
     from .mapper_node import MapperNode
 
     try:
@@ -95,12 +95,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     node = None
     try:
         node = MapperNode()
-        begin = time.monotonic()
-        node.get_logger().info('preparing kernels; the first start compiles them, which takes half a minute')
-        warm_up()
-        node.get_logger().info(f'kernels are ready after {time.monotonic() - begin:.1f} s')
         executor = SingleThreadedExecutor()
         executor.add_node(node)
+        node.when_failed = lambda: executor.create_task(_raise_stop)
         node.start()
         stopper.call(lambda: executor.create_task(_raise_stop))
         _spin(executor, node)
@@ -114,7 +111,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
             node.close()
             node.destroy_node()
         rclpy.try_shutdown()
-    return 0
+    code = 0
+    if node is not None and node.failure:
+        print(f'mapper: error: {node.failure}', file=sys.stderr)
+        code = 1
+    if node is not None and node.kernels.stage:
+        # the compiler must not be at work when its libraries are unloaded
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(code)
+    return code
 
 
 if __name__ == '__main__':

@@ -1,114 +1,165 @@
-"""The online map in the background: takes readings as they come, in a thread whose kernels leave the node the GIL."""
+"""The online map in the background: takes commands from a queue, and publishes immutable snapshots."""
 
 from __future__ import annotations
 
-import threading
 import time
 from collections.abc import Callable
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.common.errors import MapperError
+from ..core.common.errors import Cancelled, MapperError
 from ..core.common.grid import Grid
 from ..core.common.parameters import Parameters
 from ..core.common.readings import Readings
 from ..core.maps.map_set import MapSet
 from ..core.online_map import OnlineMap
+from .background import Worker
 
-Publish = Callable[[int, Grid, NDArray[np.int8], NDArray[np.float32]], None]
-"""Takes the generation of the map, its grid, the ML map and the uncertainty map."""
+
+class OnlineSnapshot(NamedTuple):
+    """The online map at a moment.
+
+    `epoch` is that of the worker when it was made; `ml` and `uncertainty` are as in `MapSet`, `searched` is what EM
+    may start from. All have shape `grid.shape`, and nobody changes them.
+    """
+
+    epoch: int
+    grid: Grid
+    ml: NDArray[np.int8]
+    uncertainty: NDArray[np.float32]
+    searched: NDArray[np.int8]
 
 
 class OnlineWorker:
-    """Keeps an online map of the readings that it is offered, and publishes it at a bounded rate."""
+    """Keeps an online map of the readings that it is offered, and publishes it at a bounded rate.
 
-    def __init__(self, parameters: Parameters, publish: Publish, log: Callable[[str], Any]) -> None:
-        """Begin without readings; `publish` is called in the worker's thread, `log` takes errors.
+    All methods are called by one thread and return at once; the map belongs to the worker's.
 
-        What `publish` is given counts only if its generation is still `generation`.
+    Attributes
+    ----------
+    epoch : int
+        How often the map was begun anew or replaced: snapshots of an earlier one are out of date.
+    kept : int
+        Number of readings that the map keeps; those that say the same as another one are counted with it.
+    """
+
+    def __init__(
+        self,
+        parameters: Parameters,
+        publish: Callable[[OnlineSnapshot], object],
+        log: Callable[[str], object],
+        prepare: Callable[[], None] = lambda: None,
+    ) -> None:
+        """Begin without readings.
+
+        Parameters
+        ----------
+        parameters : Parameters
+        publish : callable
+            Takes a snapshot, in the worker's thread.
+        log : callable
+            Takes what goes wrong.
+        prepare : callable
+            Called in the worker's thread before anything else.
         """
-        self.parameters = parameters
-        self._publish, self._log = publish, log
+        self.worker = Worker('online map', log, lasting=True)
+        self.epoch = self.kept = 0
+        self._parameters = parameters
+        self._publish_snapshot = publish
         self._map = OnlineMap(parameters)
-        self._waiting: list[Readings] = []
-        self._work = threading.Condition()
-        self._using = threading.Lock()
-        self._ended = False
-        self.generation = 0
-        self.slowest = 0.0
-        self._thread = threading.Thread(target=self._run, name='online', daemon=True)
-        self._thread.start()
+        self._start: tuple[Grid, NDArray[np.int8]] | None = None
+        self._changed = self._publishing = False
+        self._next = 0.0
+        self.worker.put(prepare)
 
     def offer(self, readings: Readings) -> None:
         """Have readings added soon."""
-        with self._work:
-            self._waiting.append(readings)
-            self._work.notify()
+        wanted = self._map
+        self.worker.put(lambda: self._add(wanted, lambda: readings))
 
-    def restart(self, parameters: Parameters, readings: Readings | None = None) -> None:
-        """Forget the map; begin anew with other parameters and, if given, these readings."""
-        with self._work, self._using:
-            self.parameters = parameters
-            self.generation += 1
-            self._map = OnlineMap(parameters)
-            self._waiting = [] if readings is None else [readings]
-            self._work.notify()
+    def restart(self, parameters: Parameters, readings: Callable[[], Readings] | None = None) -> None:
+        """Forget the map; begin anew with other parameters and, if given, the readings that `readings` returns.
+
+        It is called in the worker's thread.
+        """
+        self._map.cancel()
+        self.worker.put(self._map.dismantle)
+        self.epoch += 1
+        self._parameters = parameters
+        wanted = self._map = OnlineMap(parameters)
+        self._start, self.kept = None, 0
+        self.worker.forgive()
+        if readings is not None:
+            self.worker.put(lambda: self._add(wanted, readings))
+
+    def change(self, parameters: Parameters) -> None:
+        """Use another `publish_rate`."""
+        self._parameters = parameters
+        self._next = 0.0
 
     def adopt(self, maps: MapSet) -> None:
         """Go on from the map that EM found."""
-        with self._using:
-            self._map.adopt(maps.grid, maps.searched)
+        self.epoch += 1
+        wanted, self._start = self._map, (maps.grid, maps.searched)
+        self.worker.put(lambda: self._adopt(wanted, maps))
 
     def so_far(self) -> tuple[Grid, NDArray[np.int8]] | None:
-        """Return the grid and a copy of the map to start EM from, or None if there is none yet."""
-        with self._using:
-            grid, searched = self._map.searched()
-        return (grid, searched) if grid.size else None
+        """Return the grid and the map to start EM from, as of the last snapshot, or None if there is none yet."""
+        return self._start
 
-    @property
-    def kept(self) -> int:
-        """Number of readings that the map keeps; those that say the same as another one are counted with it."""
-        return len(self._map)
+    def tick(self) -> None:
+        """Have the map published if it changed and it is time; to be called again and again."""
+        if self._changed and not self._publishing and time.monotonic() >= self._next:
+            self._next = time.monotonic() + 1.0 / self._parameters.node.publish_rate
+            self._publishing, self._changed = True, False
+            wanted, epoch = self._map, self.epoch
+            self.worker.put(lambda: self._publish(wanted, epoch), lambda why: self._published())
 
-    def close(self) -> None:
+    def close(self, seconds: float) -> None:
         """End the thread."""
-        with self._work:
-            self._ended = True
-            self._work.notify()
-        self._thread.join(2.0)
+        self._map.cancel()
+        self.worker.close(seconds)
 
-    def _run(self) -> None:
-        published, changed = 0.0, False
-        while True:
-            with self._work:
-                due = published + 1.0 / self.parameters.node.publish_rate - time.monotonic()
-                if not self._waiting and not self._ended:
-                    self._work.wait(max(due, 0.0) if changed else None)
-                if self._ended:
-                    return
-                todo, self._waiting = self._waiting, []
-                generation = self.generation
-            if todo:
-                self._add(todo, generation)
-                changed = True
-            if changed and time.monotonic() - published >= 1.0 / self.parameters.node.publish_rate:
-                with self._using:
-                    generation, found = self.generation, self._map.maps()
-                if found[0].size:
-                    self._publish(generation, *found)
-                published, changed = time.monotonic(), False
+    # in the worker's thread; `wanted` is the map that a command is meant for, which may have been given up since
 
-    def _add(self, todo: list[Readings], generation: int) -> None:
-        for readings in todo:
-            begin = time.monotonic()
+    def _add(self, wanted: OnlineMap, readings: Callable[[], Readings]) -> None:
+        if wanted is not self._map:
+            return
+        new = readings()
+        try:
+            wanted.add(new)
+        except Cancelled:
+            return
+        except (MapperError, MemoryError) as error:
+            why = str(error) or 'there is not enough memory'
+            raise MapperError(f'{len(new)} readings are not in the online map: {why}') from None
+        finally:
+            if wanted is self._map:
+                self.kept = len(wanted)
+                self._changed = True
+
+    def _adopt(self, wanted: OnlineMap, maps: MapSet) -> None:
+        if wanted is self._map:
             try:
-                with self._using:
-                    if generation == self.generation:
-                        self._map.add(readings)
-            except MapperError as error:
-                self._log(f'{len(readings)} readings are not in the online map: {error}')
-            except MemoryError:
-                self._log(f'{len(readings)} readings are not in the online map: there is no memory for them')
-            self.slowest = max(self.slowest, time.monotonic() - begin)
+                wanted.adopt(maps.grid, maps.searched)
+            except Cancelled:
+                return
+            self._changed = True
+
+    def _published(self) -> None:
+        self._publishing = False
+
+    def _publish(self, wanted: OnlineMap, epoch: int) -> None:
+        self._published()
+        if wanted is not self._map:
+            return
+        try:
+            grid, ml, uncertainty = wanted.maps()
+        except Cancelled:
+            return
+        _, searched = wanted.searched()
+        if grid.size and epoch == self.epoch:
+            self._start = grid, searched
+            self._publish_snapshot(OnlineSnapshot(epoch, grid, ml, uncertainty, searched))

@@ -26,8 +26,6 @@ def descriptor(row: Parameter) -> ParameterDescriptor:
         description=f'{row.help} [{row.unit}]' if row.unit else row.help,
         additional_constraints='' if row.type in (int, float) else row.range,
         read_only=row.read_only,
-        # so that `p_hit: 1` is not refused for being written without a point
-        dynamic_typing=row.type is float,
     )
     if row.type is float and math.isfinite(row.low) and math.isfinite(row.high):
         made.floating_point_range = [FloatingPointRange(from_value=row.low, to_value=row.high)]
@@ -86,6 +84,20 @@ def validator(current: Callable[[], Parameters], accept: Callable[[Parameters], 
         return SetParametersResult(successful=True)
 
     return check
+
+
+def with_points(changes: list[RosParameter]) -> list[RosParameter]:
+    """Return parameters that are to be set, whole numbers for parameters of type double as such.
+
+    So `p_hit 1` is not refused for being written without a point, and the parameter keeps its type.
+    """
+    floats = {row.name for row in TABLE if row.type is float}
+    return [
+        RosParameter(change.name, RosParameter.Type.DOUBLE, float(change.value))
+        if change.name in floats and change.type_ == RosParameter.Type.INTEGER
+        else change
+        for change in changes
+    ]
 
 
 def _extrinsics(given: dict[str, RosParameter]) -> dict[str, Pose2]:

@@ -53,6 +53,11 @@ class Extrinsics:
         return pose
 
     @property
+    def poses(self) -> dict[str, Pose2]:
+        """Poses of the sensors that readings asked for, by frame."""
+        return {frame: pose for (_, frame), pose in self._found.items() if pose is not None}
+
+    @property
     def unused(self) -> list[str]:
         """Frames with a given pose that no reading asked for."""
         return sorted(set(self._given) - {frame.lstrip('/') for frame in self.used})
@@ -131,6 +136,7 @@ def read_drive(
         'map_frame': associator.map_frame,
         'base_frame': associator.base_frame,
         'mounts_from': ' and '.join(sorted(set(lookup.used.values()))),
+        'extrinsics': lookup.poses,
         'stamps': [int(stamps.min()), int(stamps.max())],
         'duration_s': float(stamps.max() - stamps.min()) / NANOSECONDS,
         'path_m': sum(math.dist(a, b) for a, b in zip(associator.path, associator.path[1:], strict=False)),
@@ -196,4 +202,6 @@ def _nothing_associated(
     for reason, count in associator.odometry_rejected.most_common():
         reasons += f'; {count} odometry messages were rejected too: {ODOMETRY_REASONS[reason]}'
     hints = ''.join(f'; {warning}' for warning in associator.limits.warnings())
+    if associator.unknown_frames:
+        hints += f'; {lookup.advice(associator.base_frame, sorted(associator.unknown_frames))}'
     return InputError(f'all {associator.received} readings were rejected: {reasons}{hints}')

@@ -123,3 +123,17 @@ def test_composition_agrees_with_rotating_vectors() -> None:
     forward = tip - origin
     expected = (origin[0], origin[1], math.atan2(forward[1], forward[0]))
     assert transforms.lookup('f0', 'f4') == pytest.approx(expected)
+
+
+@pytest.mark.parametrize(
+    ('quaternion', 'length'),
+    [
+        ((3.0, 0.0, 0.0, 4.0), '5'),
+        ((0.0, 2.0, 3.0, 6.0), '7'),
+        ((1.0, 4.0, 8.0, 0.0), '9'),
+        ((0.1, 0.2, 0.2, 0.4), '0.5'),
+    ],
+)
+def test_the_length_of_a_bad_quaternion_is_told(quaternion: tuple[float, ...], length: str) -> None:
+    with pytest.raises(InputError, match=f'a quaternion of length {length} instead of 1'):
+        StaticTransforms().add('base', 'sonar', (0.0, 0.0, 0.0), quaternion)

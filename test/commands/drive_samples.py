@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable, Iterable, Sequence
 from functools import lru_cache
 from pathlib import Path
@@ -15,10 +16,10 @@ from forward_grid_mapper.bags.writer import BagWriter
 from forward_grid_mapper.commands import process_bag
 from forward_grid_mapper.core.messages.message_types import OdometryMessage, Pose2, RangeMessage
 from forward_grid_mapper.simulation.drive import BASE_FRAME, START, door_drive
-from forward_grid_mapper.simulation.sonar import NOISY, front_array
+from forward_grid_mapper.simulation.sonar import NOISY, front_array, sonar_ring
 
 SECOND = 1_000_000_000
-FILES = {'maps.npz', 'maps.png', 'report.json', 'report.txt'} | {
+FILES = {'maps.npz', 'maps.png', 'readings.npz', 'report.json', 'report.txt'} | {
     f'{name}.{suffix}' for name in ('live_map', 'ml_map', 'uncertainty_map') for suffix in ('pgm', 'yaml')
 }
 Message = OdometryMessage | RangeMessage
@@ -55,6 +56,13 @@ def tape() -> Tape:
         for m in recording.ranges
     ]
     return Tape(recording.extrinsics, recording.odometry, exact)
+
+
+def backwards() -> tuple[tuple[tuple[str, Pose2], ...], Tape]:
+    """Where the sonars of a ring are, and a drive past a door in which they are said to look backwards."""
+    made = door_drive(1, NOISY, 0, sonar_ring())
+    wrong = tuple((frame, Pose2(-p.x, -p.y, p.yaw + math.pi)) for frame, p in made.extrinsics)
+    return made.extrinsics, Tape(wrong, list(made.odometry), list(made.ranges))
 
 
 def in_turn(drive: Tape) -> list[tuple[int, Message]]:

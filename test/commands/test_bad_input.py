@@ -162,6 +162,16 @@ def test_no_frame_has_a_pose(tmp_path: Path, capsys: pytest.CaptureFixture[str])
     assert 'no /tf_static' in said and f'--sensor {FRAMES[0]}=x,y,yaw' in said and f'sensors.{FRAMES[0]}.pose' in said
 
 
+def test_no_frame_has_a_pose_and_some_readings_are_rejected_for_another_reason(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    drive = tape()._replace(extrinsics=())
+    first = drive.ranges[0]._replace(range=math.nan)
+    said = refused_drive(capsys, tmp_path, drive._replace(ranges=[first, *drive.ranges[1:]]))
+    assert 'nan_range' in said and all(frame in said for frame in FRAMES)
+    assert 'no /tf_static' in said and f'--sensor {FRAMES[0]}=x,y,yaw' in said
+
+
 def test_frames_that_do_not_join_the_robot(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     said = refused_drive(capsys, tmp_path, tape().with_odometry(child_frame_id='base_footprint'))
     assert 'base_footprint' in said and 'base_link' in said and '--sensor' in said
@@ -172,6 +182,7 @@ def test_one_frame_without_a_pose_costs_only_its_readings(tmp_path: Path) -> Non
     report = mapped(bag, tmp_path / 'maps')
     assert report['counts']['rejected'] == {'unknown_extrinsics': COUNT // len(FRAMES)}
     assert report['input']['rejected_by_frame'] == {FRAMES[0]: {'unknown_extrinsics': COUNT // len(FRAMES)}}
+    assert f'unknown_extrinsics ({FRAMES[0]} {COUNT // len(FRAMES)})' in (tmp_path / 'maps' / 'report.txt').read_text()
     (warning,) = report['warnings']
     assert f'--sensor {FRAMES[0]}=x,y,yaw' in warning and FRAMES[1] not in warning.partition(':')[0]
     write_tape(tmp_path / 'rest', tape().of(*FRAMES[1:]))

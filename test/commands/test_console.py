@@ -45,17 +45,38 @@ def test_usage() -> None:
     helped = shell('--help')
     assert (helped.returncode, helped.stderr) == (0, '')
     assert all(re.search(rf'^  {name} ', helped.stdout, re.MULTILINE) for name in COMMANDS)
-    for arguments in ((), ('map_bag',)):
-        refused = shell(*arguments)
-        assert (refused.returncode, refused.stdout, refused.stderr) == (2, '', helped.stdout)
+    refused = shell()
+    assert (refused.returncode, refused.stdout, refused.stderr) == (2, '', helped.stdout)
+    refused = shell('procces_bag')
+    assert (refused.returncode, refused.stdout) == (2, '')
+    assert "no command 'procces_bag'; did you mean process_bag?" in refused.stderr
+    assert refused.stderr.endswith(helped.stdout)
     assert shell('--version').stdout == f'{__version__}\n'
+
+
+@pytest.mark.parametrize('command', ['process_bag', 'learn', 'replay_bag', 'simulate', 'demo'])
+@pytest.mark.parametrize('arguments', [('--help',), ()])
+def test_a_command_without_its_packages_says_what_brings_them(
+    tmp_path: Path, command: str, arguments: tuple[str, ...]
+) -> None:
+    # found before the real one
+    (tmp_path / 'rosbags.py').write_text('raise ModuleNotFoundError("no", name="rosbags.rosbag1")\n')
+    said = shell(command, *arguments, PYTHONPATH=str(tmp_path))
+    assert said.returncode == 1
+    assert said.stderr.startswith(f'{command}: error: rosbags is not installed: pip install')
+    assert '[offline]' in said.stderr and 'Traceback' not in said.stderr
+
+
+def test_a_module_that_no_extra_brings_is_no_matter_of_installation(tmp_path: Path) -> None:
+    (tmp_path / 'rosbags.py').write_text('import absent_from_everywhere\n')
+    assert 'Traceback' in shell('process_bag', '--help', PYTHONPATH=str(tmp_path)).stderr
 
 
 def test_from_simulation_to_maps(tmp_path: Path) -> None:
     simulated = shell('simulate', 'door', '--seen', 1, '-o', tmp_path / 'drive', '--sonars', 'front')
     assert simulated.returncode == 0, simulated.stderr
     command = simulated.stdout.splitlines()[-1].split()
-    assert command[:3] == ['python3', '-m', 'forward_grid_mapper']
+    assert command[1:3] == ['-m', 'forward_grid_mapper']
     done = shell(*command[3:], '-o', tmp_path / 'maps', '-q')
     assert (done.returncode, done.stdout, done.stderr) == (0, f'maps are in {tmp_path / "maps"}\n', '')
     assert {path.name for path in (tmp_path / 'maps').iterdir()} == FILES

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 import yaml
-from drive_samples import code_of, everything_in, mapped, tape, write_tape
+from drive_samples import backwards, code_of, everything_in, mapped, tape, write_tape
 
 from forward_grid_mapper.commands import learn
 from forward_grid_mapper.core.common.parameters import Parameters
@@ -112,3 +112,11 @@ def test_a_sensor_that_stands_out_is_told_of(tmp_path: Path, capsys: pytest.Capt
     assert f'# WARNING: a sensor stands out from the others: {broken}' in output.read_text()
     assert code_of(learn.main, bag, '--rounds', 1, '-q') == 0
     assert f'learn: warning: a sensor stands out from the others: {broken}' in capsys.readouterr().err
+
+
+def test_input_that_is_wrong_is_told_of(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    wrong = backwards()[1]
+    bag = write_tape(tmp_path / 'bag', wrong._replace(ranges=[m for m in wrong.ranges for _ in range(2)]))
+    text = ' '.join(said(capsys, bag, '--rounds', 1).split())
+    assert 'are copies of others' in text and 'recorded twice' in text
+    assert 'the sensors seem to be turned by 180 degrees; check the poses of the sensors' in text

@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 import argparse
+import importlib
+import math
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 from drive_samples import code_of, mapped, tape, write_tape
 
-from forward_grid_mapper.commands import experiment, learn, process_bag, replay_bag
+from forward_grid_mapper import __version__
+from forward_grid_mapper.__main__ import COMMANDS
+from forward_grid_mapper.commands import demo, experiment, learn, process_bag, replay_bag
 from forward_grid_mapper.commands.options import chosen_parameters
 from forward_grid_mapper.core.common.errors import ParameterError
 from forward_grid_mapper.core.common.parameters import TABLE
 from forward_grid_mapper.files import drawing
+from forward_grid_mapper.files.parameter_file import load_parameters
 from forward_grid_mapper.files.parameter_text import dump_parameters
 
 PARSERS = [process_bag.parser, learn.parser, replay_bag.parser]
@@ -139,3 +144,29 @@ def test_experiment_tells_of_them_too(tmp_path: Path, capsys: pytest.CaptureFixt
     (tmp_path / 'taken').write_text('')
     assert code_of(experiment.main, 'door', '--params', file, '-o', tmp_path / 'taken') == 1
     assert 'experiment: warning: ' in capsys.readouterr().err
+
+
+@pytest.mark.parametrize('main', [process_bag.main, learn.main, experiment.main, demo.main])
+def test_the_parameters_of_a_call_are_shown_as_a_file(
+    main: Callable[..., int],
+    tmp_path: Path,
+    bag: str,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    first = [bag] if main in (process_bag.main, learn.main) else ['door'] if main is experiment.main else []
+    settings = ['--set', 'p_hit=0.55', '--set', 'max_incidence_angle=35deg', '--dump-config']
+    assert code_of(main, *first, *settings) == 0
+    file = tmp_path / 'dumped.yaml'
+    file.write_text(capsys.readouterr().out)
+    values = load_parameters(file).values
+    assert (values['p_hit'], values['max_incidence_angle']) == (0.55, pytest.approx(math.radians(35)))
+    assert {path.name for path in tmp_path.iterdir()} == {'bag', 'dumped.yaml'}
+
+
+@pytest.mark.parametrize('name', sorted(set(COMMANDS) - {'mapper'}))
+def test_every_command_tells_its_version(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    main = importlib.import_module(f'forward_grid_mapper.{COMMANDS[name][0]}').main
+    assert code_of(main, '--version') == 0
+    assert capsys.readouterr().out == f'{name} of forward_grid_mapper {__version__}\n'

@@ -17,7 +17,7 @@ from forward_grid_mapper.core.common import shell
 from forward_grid_mapper.core.messages.message_types import Pose2
 from forward_grid_mapper.files import drawing
 
-LEAD = 'python3 -m forward_grid_mapper '
+LEAD = f'{shell.command_line("").rstrip()} '
 PARSERS = {'process_bag': process_bag.parser, 'learn': learn.parser, 'replay_bag': replay_bag.parser}
 NAMES = ['plain', 'with space', 'a, b', 'it\'s $HOME `x` "y"', 'a;b&c|d>e', '-dash', 'Büro 日本', '*?[a]', '#1', '~']
 
@@ -38,7 +38,7 @@ def words_of(line: str) -> list[str]:
 
 
 def commands_in(text: str) -> list[list[str]]:
-    """The commands among the lines of an output, without `python3 -m forward_grid_mapper`."""
+    """The commands among the lines of an output, without the interpreter and the package."""
     return [words_of(line.strip())[3:] for line in text.splitlines() if line.strip().startswith(LEAD)]
 
 
@@ -92,3 +92,18 @@ def test_words_are_what_they_were(name: str) -> None:
     assert '\n' not in shell.quoted(name)
     (path,) = words_of(shell.quoted(Path(name)))
     assert Path(path) == Path(name) and not path.startswith('-')
+
+
+def test_the_interpreter_is_named_as_the_shell_finds_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for python in (tmp_path / 'my venv' / 'bin' / 'python', tmp_path / 'bin' / 'python3'):
+        python.parent.mkdir(parents=True)
+        python.touch(0o755)
+    monkeypatch.setenv('PATH', str(tmp_path / 'bin'))
+    monkeypatch.setattr(shell.sys, 'executable', str(tmp_path / 'bin' / 'python3'))
+    assert shell.command_line('learn') == 'python3 -m forward_grid_mapper learn'
+    # no environment is activated
+    monkeypatch.setattr(shell.sys, 'executable', str(tmp_path / 'my venv' / 'bin' / 'python'))
+    monkeypatch.chdir(tmp_path / 'bin')
+    assert words_of(shell.command_line('learn'))[0] == str(tmp_path / 'my venv' / 'bin' / 'python')
+    monkeypatch.chdir(tmp_path)
+    assert shell.command_line('learn', 'a b') == "'my venv/bin/python' -m forward_grid_mapper learn 'a b'"

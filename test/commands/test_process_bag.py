@@ -10,7 +10,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from drive_samples import FILES, Tape, arrays_in, assert_same_maps, code_of, mapped, report_in, tape, write_tape
+from drive_samples import (
+    FILES,
+    Tape,
+    arrays_in,
+    assert_same_maps,
+    backwards,
+    code_of,
+    mapped,
+    report_in,
+    tape,
+    write_tape,
+)
 from rosbags.highlevel import AnyReader
 
 from forward_grid_mapper.commands import process_bag, simulate
@@ -328,3 +339,17 @@ def test_help(capsys: pytest.CaptureFixture[str]) -> None:
     text = capsys.readouterr().out
     for option in ('--range-topics', '--odom-topic', '--params', '--set', '--sensor', '--bag', '-o', '--learn'):
         assert option in text
+
+
+def test_poses_that_the_readings_contradict_are_told_of(tmp_path: Path) -> None:
+    """Sensors that look backwards, by transforms of the bag and by what the user gives."""
+    right, wrong = backwards()
+    bag = write_tape(tmp_path / 'bag', wrong)
+    report = mapped(bag, tmp_path / 'maps')
+    expected = 'the sensors seem to be turned by 180 degrees; check the poses of the sensors on the robot'
+    assert sum(w.startswith(expected) for w in report['warnings']) == 1
+    assert expected in ' '.join((tmp_path / 'maps' / 'report.txt').read_text('utf-8').split())
+    for frame, pose in wrong.extrinsics:
+        assert report['input']['extrinsics'][frame][:2] == pytest.approx(list(pose[:2]))
+    given = [f'--sensor={frame}={p.x},{p.y},{p.yaw}' for frame, p in right]
+    assert mapped(bag, tmp_path / 'right', *given)['warnings'] == []

@@ -165,12 +165,20 @@ def test_settings_round_trip(values: dict[str, Any]) -> None:
         ('p_hit=', "'' is not a number"),
         ('p_hit=nan', 'out of range'),
         ('max_iterations=1.5', "'1.5' is not a whole number"),
+        ('sigma=5deg', "'5deg' is not a number"),
+        ('field_of_view=xdeg', "'xdeg' is not a number"),
+        ('field_of_view=200deg', 'out of range'),
         ('online=maybe', 'not true or false'),
     ],
 )
 def test_bad_settings(text: str, message: str) -> None:
     with pytest.raises(ParameterError, match=message):
         parse_setting(text)
+
+
+def test_angles_may_be_in_degrees() -> None:
+    assert parse_setting('field_of_view=30deg') == ('field_of_view', pytest.approx(math.pi / 6))
+    assert parse_setting('field_of_view = 30 deg') == ('field_of_view', pytest.approx(math.pi / 6))
 
 
 @pytest.mark.parametrize(

@@ -48,3 +48,20 @@ def robot(domain: int) -> Iterator[Any]:
     made = Robot(domain)
     yield made
     made.close()
+
+
+@pytest.fixture
+def inside(domain: int, tmp_path: Path) -> Iterator[Callable[..., Any]]:
+    """Make nodes in this process, which are ended after the test."""
+    from inside import Inside
+
+    nodes = []
+
+    def begin(**parameters: Any) -> Inside:
+        node = Inside(domain, tmp_path, **parameters)
+        nodes.append(node)
+        return node
+
+    yield begin
+    for node in nodes:
+        node.close()

@@ -2,32 +2,50 @@
 
 from __future__ import annotations
 
+import queue
 import threading
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
 import pytest
 
+from forward_grid_mapper.core.common.errors import Cancelled
 from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.common.readings import Readings
 from forward_grid_mapper.core.mapping import Mapper
 from forward_grid_mapper.node import em
-from forward_grid_mapper.node.em import EmWorker, Outcome
+from forward_grid_mapper.node.em import EmWorker, Outcome, Run
 
 READING = Readings.from_columns(names=('sonar',), x=0.0, y=0.0, yaw=0.0, z=[1.0], z_max=4.0, half_angle=0.2)
 
 
-def outcome_of(worker: EmWorker, readings: Readings = READING) -> Outcome:
-    ended = threading.Event()
-    found: list[Outcome] = []
+class Caller:
+    """The thread that owns a worker, as the executor does in the node."""
 
-    def done(outcome: Outcome) -> None:
-        found.append(outcome)
-        ended.set()
+    def __init__(self) -> None:
+        self.logged: list[str] = []
+        self._conclusions: queue.Queue[Callable[[], None]] = queue.Queue()
+        self.worker = EmWorker(lambda run: None, self.logged.append, self._conclusions.put)
 
-    assert worker.start(readings, Parameters(), done) is not None
-    assert ended.wait(60.0)
-    return found[0]
+    def begin(self, done: Callable[[Outcome], Any], readings: Readings = READING) -> bool:
+        return self.worker.start(Run(Mapper(Parameters()), Parameters(), lambda: readings), done)
+
+    def conclude(self) -> None:
+        self._conclusions.get(timeout=60.0)()
+
+    def outcome_of(self, readings: Readings = READING) -> Outcome:
+        found: list[Outcome] = []
+        assert self.begin(found.append, readings)
+        self.conclude()
+        return found[0]
+
+
+@pytest.fixture
+def caller() -> Iterator[Caller]:
+    made = Caller()
+    yield made
+    made.worker.close(10.0)
 
 
 @pytest.mark.parametrize(
@@ -35,36 +53,146 @@ def outcome_of(worker: EmWorker, readings: Readings = READING) -> Outcome:
     [(MemoryError(), 'does not fit the memory'), (ValueError('odd'), "EM failed: ValueError('odd')")],
 )
 def test_a_run_that_fails_says_why_and_the_next_begins(
-    monkeypatch: pytest.MonkeyPatch, error: Exception, reported: str
+    monkeypatch: pytest.MonkeyPatch, caller: Caller, error: Exception, reported: str
 ) -> None:
-    logged: list[str] = []
-    worker = EmWorker(lambda run: None, logged.append)
-
     def fail(*arguments: Any) -> None:
         raise error
 
     with monkeypatch.context() as patch:
         patch.setattr(Mapper, 'run', fail)
-        assert reported in outcome_of(worker).message
-    maps = outcome_of(worker).maps
+        assert reported in caller.outcome_of().message
+    maps = caller.outcome_of().maps
     assert maps is not None
     assert len(maps.readings) == 1
 
 
-def test_a_run_that_cannot_fit_does_not_begin(monkeypatch: pytest.MonkeyPatch) -> None:
-    worker = EmWorker(lambda run: None, print)
+@pytest.mark.parametrize('where', ['map_grid', 'shortage', 'sensor_health', 'input_warnings', 'Outcome'])
+@pytest.mark.parametrize('error', [MemoryError(), KeyError('odd'), SystemExit(3)])
+def test_whatever_raises_wherever_an_answer_comes(
+    monkeypatch: pytest.MonkeyPatch, caller: Caller, where: str, error: BaseException
+) -> None:
+    failing = [True]
+    before = getattr(em, where)
+
+    def fail(*arguments: Any, **options: Any) -> Any:
+        if failing:
+            failing.clear()
+            raise error
+        return before(*arguments, **options)
+
+    monkeypatch.setattr(em, where, fail)
+    outcome = caller.outcome_of()
+    if where in ('sensor_health', 'input_warnings') and isinstance(error, Exception):
+        assert outcome.maps is not None
+        assert 'could not be judged' in outcome.warnings[0]
+    else:
+        assert outcome.maps is None
+        assert outcome.message
+    assert caller.worker.current is None
+    assert caller.outcome_of().maps is not None
+
+
+def test_a_thread_that_cannot_start_is_an_answer(monkeypatch: pytest.MonkeyPatch, caller: Caller) -> None:
+    def fail(self: threading.Thread) -> None:
+        raise RuntimeError("can't start new thread")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(threading.Thread, 'start', fail)
+        assert "can't start new thread" in caller.outcome_of().message
+    assert "can't start new thread" in caller.worker.worker.trouble
+    assert caller.outcome_of().maps is not None
+    assert caller.worker.worker.trouble == ''
+
+
+def test_a_run_that_cannot_fit_does_not_begin(monkeypatch: pytest.MonkeyPatch, caller: Caller) -> None:
     monkeypatch.setattr(em, 'shortage', lambda cells, readings, threads: 'there is no space')
-    assert outcome_of(worker) == Outcome(None, 'there is no space')
+    assert caller.outcome_of() == Outcome(None, 'there is no space')
 
 
-def test_what_is_wrong_with_the_readings_comes_with_the_maps() -> None:
-    worker = EmWorker(lambda run: None, print)
+def test_what_is_wrong_with_the_readings_comes_with_the_maps(caller: Caller) -> None:
     steps = np.repeat(np.arange(50), 2)
     twice = Readings.from_columns(
         names=('sonar',), x=0.02 * steps, y=0.0, yaw=0.0, z=3.0 - 0.02 * steps, z_max=4.0, half_angle=0.2, stamp=steps
     )
-    outcome = outcome_of(worker, twice)
+    outcome = caller.outcome_of(twice)
     assert outcome.maps is not None
     (warning,) = outcome.warnings
     assert '50 of 100 readings are copies' in warning
-    assert outcome_of(worker).warnings == []
+    assert caller.outcome_of().warnings == []
+
+
+def test_maps_are_shown_before_sensors_are_judged(monkeypatch: pytest.MonkeyPatch, caller: Caller) -> None:
+    order: list[str] = []
+    monkeypatch.setattr(em, 'sensor_health', lambda maps: order.append('judged') or {})
+    run = Run(Mapper(Parameters()), Parameters(), lambda: READING, lambda maps: order.append('shown'))
+    assert caller.worker.start(run, lambda outcome: order.append('answered'))
+    caller.conclude()
+    assert order == ['shown', 'judged', 'answered']
+
+
+class Slow:
+    """A run that goes on until it is cancelled, and then for as long as the test likes."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.begun, self.cancelled, self.may_end = threading.Event(), threading.Event(), threading.Event()
+        self.ended = False
+        monkeypatch.setattr(Mapper, 'run', self.run)
+        monkeypatch.setattr(Mapper, 'cancel', lambda mapper: self.cancelled.set())
+
+    def run(self, *arguments: Any) -> None:
+        self.begun.set()
+        assert self.cancelled.wait(60.0)
+        assert self.may_end.wait(60.0)
+        self.ended = True
+        raise Cancelled('cancelled')
+
+
+def test_no_second_run_begins_while_the_first_one_lives(monkeypatch: pytest.MonkeyPatch, caller: Caller) -> None:
+    slow, outcomes = Slow(monkeypatch), []
+    assert caller.begin(outcomes.append)
+    assert slow.begun.wait(60.0)
+    assert not caller.begin(outcomes.append)
+    caller.worker.cancel()
+    # being cancelled is not having ended
+    assert slow.cancelled.wait(60.0)
+    assert not caller.begin(outcomes.append)
+    slow.may_end.set()
+    caller.conclude()
+    assert slow.ended
+    assert [outcome.message for outcome in outcomes] == ['EM was cancelled']
+    assert caller.begin(outcomes.append)
+    caller.conclude()
+
+
+def test_closing_cancels_and_waits_for_the_end(monkeypatch: pytest.MonkeyPatch, caller: Caller) -> None:
+    slow = Slow(monkeypatch)
+    assert caller.begin(lambda outcome: None)
+    assert slow.begun.wait(60.0)
+    closed = threading.Thread(target=lambda: caller.worker.close(60.0))
+    closed.start()
+    assert slow.cancelled.wait(60.0)
+    assert closed.is_alive() and not slow.ended
+    slow.may_end.set()
+    closed.join(60.0)
+    assert slow.ended
+
+
+def test_a_run_that_waits_for_kernels_can_be_cancelled() -> None:
+    conclusions: queue.Queue[Callable[[], None]] = queue.Queue()
+    waits = threading.Event()
+
+    def prepare(stop: Callable[[], bool]) -> None:
+        waits.set()
+        while not stop():
+            pass
+        raise Cancelled('cancelled while kernels were compiled')
+
+    worker = EmWorker(lambda run: None, print, conclusions.put, prepare)
+    outcomes: list[Outcome] = []
+    assert worker.start(Run(Mapper(Parameters()), Parameters(), lambda: READING), outcomes.append)
+    assert waits.wait(60.0)
+    assert worker.current is not None
+    assert 'waiting for kernels' in str(worker.current)
+    worker.cancel()
+    conclusions.get(timeout=60.0)()
+    assert outcomes[0].message == 'EM was cancelled'

@@ -51,6 +51,10 @@ class Buffer:
         self.until = 1 << 62
         self.asked = 0
 
+    def clear(self) -> None:
+        """Forget what is not static; here nothing is."""
+        self.known.clear()
+
     def lookup_transform(self, target: str, source: str, time: Any) -> Any:
         self.asked += 1
         if (target, source) not in self.known:
@@ -181,3 +185,36 @@ def test_odometry_whose_clock_stands_still_does_not_pile_up(transforms: Transfor
     for _ in range(frames.MOST_HELD + 500):
         frame.convert(OdometryMessage(5, 'odom', 'base_link', Pose2(0.0, 0.0, 0.0)))
     assert frame.dropped == 500
+
+
+def test_transforms_of_before_a_jump_of_the_clock_are_forgotten(
+    buffer: Buffer, transforms: Transforms, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(frames, 'PATIENCE', 0.0)
+    frame = MapFrame('map', transforms, 2.0)
+    buffer.known['map', 'odom'] = transform(1.0, 0.0)
+
+    def at(seconds: float) -> OdometryMessage:
+        return OdometryMessage(round(seconds * NANOSECONDS), 'odom', 'base', Pose2(0.0, 0.0, 0.0))
+
+    assert frame.convert(at(100.0))[0].pose == Pose2(1.0, 0.0, 0.0)
+    # late by less than a jump, as messages may be
+    assert frame.convert(at(99.5))[0].pose == Pose2(1.0, 0.0, 0.0)
+    # the recording begins anew, and its transforms are not there yet
+    assert frame.convert(at(10.0)) == []
+    buffer.known['map', 'odom'] = transform(5.0, 0.0)
+    assert [m.pose for m in frame.convert(at(10.1))] == [Pose2(5.0, 0.0, 0.0)] * 2
+
+
+def test_the_extrinsics_are_asked_for_anew_after_a_jump_where_odometry_is_the_map_frame(
+    buffer: Buffer, transforms: Transforms, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(frames, 'PATIENCE', 0.0)
+    frame, extrinsics = MapFrame('', transforms, 2.0), Extrinsics({}, transforms)
+    buffer.known['base', 'sonar'] = transform(0.1, 0.0)
+    frame.convert(OdometryMessage(100 * NANOSECONDS, 'odom', 'base', Pose2(0.0, 0.0, 0.0)))
+    assert extrinsics('base', 'sonar', 100 * NANOSECONDS) == Pose2(0.1, 0.0, 0.0)
+    frame.convert(OdometryMessage(1 * NANOSECONDS, 'odom', 'base', Pose2(0.0, 0.0, 0.0)))
+    assert extrinsics('base', 'sonar', 1 * NANOSECONDS) is LATER
+    buffer.known['base', 'sonar'] = transform(0.2, 0.0)
+    assert extrinsics('base', 'sonar', 1 * NANOSECONDS) == Pose2(0.2, 0.0, 0.0)

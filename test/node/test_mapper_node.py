@@ -16,6 +16,7 @@ import pytest
 pytest.importorskip('rclpy', reason='the tests of the node need rclpy')
 
 from nav_msgs.msg import OccupancyGrid
+from rcl_interfaces.msg import ParameterType
 from robot import MAPS, Robot
 from rosgraph_msgs.msg import Clock
 
@@ -215,7 +216,7 @@ def test_parameters_are_checked(start: Any, robot: Robot, door: Recording) -> No
     assert robot.get_parameter('prior').double_value == 0.5
     for name, value, why in (
         ('p_hit', 1.5, 'range'),
-        ('p_hit', 'often', 'number'),
+        ('p_hit', 'often', 'number|type'),
         ('over_range', 'maybe', 'no_echo'),
         ('resolution', 0.05, 'read-only|read_only'),
         ('p_rand', 0.9, 'p_lost'),
@@ -228,6 +229,10 @@ def test_parameters_are_checked(start: Any, robot: Robot, door: Recording) -> No
     for name, value in (('p_hit', 0.9), ('max_iterations', 100), ('sigma', 1), ('publish_rate', 10.0)):
         result = robot.set_parameter(name, value)
         assert result.successful, result.reason
+    # neither a wrong type nor a whole number changes what a parameter is declared as
+    for name, value in (('p_hit', 0.9), ('sigma', 1.0)):
+        assert robot.get_parameter(name).type == ParameterType.PARAMETER_DOUBLE
+        assert robot.get_parameter(name).double_value == value
     robot.play(merged(door))
     first = robot.call('run_em').message
     robot.set_parameter('sigma', 0.05)

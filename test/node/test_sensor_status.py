@@ -12,6 +12,7 @@ pytest.importorskip('rclpy', reason='the tests of the node need rclpy')
 from diagnostic_msgs.msg import DiagnosticStatus
 
 from forward_grid_mapper.core.common.parameters import Parameters
+from forward_grid_mapper.core.learning.sensor_health import sensor_health
 from forward_grid_mapper.core.mapping import Mapper
 from forward_grid_mapper.node.sensor_status import SensorWatch
 from forward_grid_mapper.simulation.drive import drive
@@ -26,22 +27,20 @@ def values(status: DiagnosticStatus) -> dict[str, str]:
 def test_the_dead_sensor_is_named_once_em_has_run() -> None:
     readings = drive(rooms_world(), np.array([[2.0, 2.0], [5.0, 2.0], [5.0, 6.0]]), 0.1, noise=NOISY).readings
     readings = dataclasses.replace(readings, z=np.where(readings.sensor == 4, readings.z_max, readings.z))
+    counts = dict(zip(readings.sensor_names, zip(*readings.counts(), strict=True), strict=True))
     watch = SensorWatch()
-    before = watch.status('mapper', readings)
+    before = watch.status('mapper', counts)
     assert before.name == 'mapper: sensors' and before.level == DiagnosticStatus.OK
     assert values(before)['sonar_04'].endswith('readings, 100% max range')
     assert len(before.values) == 24
 
     maps = Mapper(Parameters()).run(readings)
-    watch.judge(None, lambda: True)
-    watch.judge(maps, lambda: False)
-    assert watch.status('mapper', readings).message == before.message
-    watch.judge(maps, lambda: True)
-    after = watch.status('mapper', readings)
+    watch.take(sensor_health(maps))
+    after = watch.status('mapper', counts)
     assert after.level == DiagnosticStatus.WARN
     assert 'sonar_04 (never hears anything)' in after.message and after.message.count('sonar_') == 1
     assert values(after)['sonar_04'].endswith('never hears anything')
     assert values(after)['sonar_05'].endswith(': ok')
 
     watch.clear()
-    assert watch.status('mapper', readings.select(slice(0))).level == DiagnosticStatus.OK
+    assert watch.status('mapper', {}).level == DiagnosticStatus.OK

@@ -54,7 +54,7 @@ class AssociationParameters:
     )
     pose_timeout: float = _param(
         2.0,
-        'How long, in message time, a reading waits for odometry after its stamp; keep it above max_pose_gap.',
+        'How long, in message time, a reading waits for odometry that has stopped; keep it above max_pose_gap.',
         's',
         0.01,
         600.0,
@@ -264,7 +264,8 @@ class NodeParameters:
     odom_topic: str = _param('odom', 'Topic of nav_msgs/Odometry.', read_only=True)
     range_reliability: str = _param(
         'best_effort',
-        'Quality of service of the Range subscriptions; reliable loses nothing and needs reliable publishers.',
+        'Quality of service of the Range subscriptions; reliable repeats what the network loses, and needs reliable '
+        'publishers.',
         choices=('best_effort', 'reliable'),
         read_only=True,
     )

@@ -53,6 +53,12 @@ class Readings:
         """Whether there was an echo, shape (N,)."""
         return self.z < self.z_max
 
+    def counts(self) -> tuple[list[int], list[int]]:
+        """Return how many readings each of `sensor_names` has, and how many of them are without echo."""
+        total = np.bincount(self.sensor, minlength=len(self.sensor_names))
+        silent = np.bincount(self.sensor[~self.echo], minlength=len(self.sensor_names))
+        return total.tolist(), silent.tolist()
+
     def select(self, which: NDArray[np.generic] | slice) -> Readings:
         """Return the readings that `which` (mask, indices or slice) picks."""
         columns = {f.name: getattr(self, f.name) for f in fields(self)}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shlex
+import shutil
 import sys
 from pathlib import Path
 
@@ -27,6 +28,15 @@ def quoted(word: Path | str) -> str:
     return f"$'{''.join(codes)}'"
 
 
+def _interpreter() -> str:
+    """Return what a shell in this folder calls the interpreter that runs: `python3`, where that is the same one."""
+    found = shutil.which('python3')
+    if not sys.executable or (found and Path(found).absolute() == Path(sys.executable).absolute()):
+        return 'python3'
+    path = Path(sys.executable)
+    return quoted(path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path)
+
+
 def command_line(command: str, *words: Path | str) -> str:
-    """Return the line that runs one of our commands with these arguments."""
-    return ' '.join(['python3 -m forward_grid_mapper', command, *map(quoted, words)])
+    """Return the line that runs one of our commands with these arguments, also where no environment is activated."""
+    return ' '.join([_interpreter(), '-m forward_grid_mapper', command, *map(quoted, words)])

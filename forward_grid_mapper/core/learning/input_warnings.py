@@ -14,6 +14,7 @@ from collections.abc import Iterable
 import numpy as np
 from numpy.typing import NDArray
 
+from ..common.grid import cone_boxes
 from ..common.readings import Floats, Readings
 
 ENOUGH = 30
@@ -75,13 +76,22 @@ SILENT = 0.05
 ECHOES = 200
 """Echoes from which on that is said."""
 
+HANDFUL, SWEEPS = 0.02, 2
+"""Part of readings, and rounds of all sensors, that may not make the map much larger; a wild pose places a round."""
+
+MULTIPLE = 4.0
+"""How many times as large the map is with them."""
+
+LARGE = 400.0
+"""Square metres that they add at least; a small map costs nothing."""
+
 
 def input_warnings(readings: Readings) -> list[str]:
     """Return what is wrong with readings that have a pose; empty if nothing seems to be."""
     if len(readings) < ENOUGH:
         return []
     by_time = readings.select(np.argsort(readings.stamp, kind='stable'))
-    checks = (_copies, _shared_frame, _standing, _stuck, _field_of_view, _reach)
+    checks = (_copies, _shared_frame, _standing, _stuck, _field_of_view, _reach, _extent)
     return [text for check in checks if (text := check(by_time))]
 
 
@@ -234,3 +244,43 @@ def _reach(readings: Readings) -> str:
         f'max_range is {limit:g} m, and no echo comes from beyond {metres:.1f} m: {unit} A reading without echo '
         f'is taken to say that all is free up to max_range; set the parameter max_range to what the sensor reaches'
     )
+
+
+def _extent(readings: Readings) -> str:
+    """Look for a handful of readings without which the map would be a fraction as large."""
+    few = min(SWEEPS * len(readings.sensor_names), int(HANDFUL * len(readings)))
+    if not few:
+        return ''
+    boxes = cone_boxes(readings.x, readings.y, readings.yaw, readings.half_angle, readings.z)
+    # how far each reading reaches to the left, right, bottom and top
+    reached = np.array([[-1.0], [1.0], [-1.0], [1.0]]) * boxes
+    ordered = np.sort(reached, axis=1)
+    whole, rest = ordered[:, -1], ordered[:, -few - 1]
+    if _area(whole) < MULTIPLE * _area(rest) or _area(whole) - _area(rest) < LARGE:
+        return ''
+    side = int(np.argmax(whole - rest))
+    middle = (rest[side] + whole[side]) / 2
+    one = int(np.argmax(reached[side]))
+    x, y, z = (float(column[one]) for column in (readings.x, readings.y, readings.z))
+    if (-x, x, -y, y)[side] > middle:
+        cause = (
+            f'their sensor is at ({x:.1f}, {y:.1f}) m, far from all others: did odometry jump? Choose another odometry '
+            f'topic, or set the parameter max_jump to less than that'
+        )
+    else:
+        cause = (
+            f'one at ({x:.1f}, {y:.1f}) m has a range of {z:.1f} m, more than all others: does the sensor reach so '
+            f'far? If not, set the parameter max_range to what it reaches'
+        )
+    return (
+        f'{np.count_nonzero(reached[side] > middle)} of {len(readings)} readings make the map {_size(whole)} instead '
+        f'of {_size(rest)}: {cause}'
+    )
+
+
+def _area(reached: Floats) -> float:
+    return float((reached[0] + reached[1]) * (reached[2] + reached[3]))
+
+
+def _size(reached: Floats) -> str:
+    return f'{reached[0] + reached[1]:.0f} x {reached[2] + reached[3]:.0f} m'

@@ -108,6 +108,10 @@ class LogOddsMap:
         self._parameters, self._least_depth = parameters, least_depth
         self.clear()
 
+    def change(self, parameters: Parameters) -> None:
+        """Use other parameters for the readings that come, of the same resolution."""
+        self._parameters = parameters
+
     def clear(self) -> None:
         """Forget everything."""
         resolution = self._parameters.grid.resolution

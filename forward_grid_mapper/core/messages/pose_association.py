@@ -7,8 +7,9 @@ messages give the same readings however fast they arrive. A clock is asked only 
 from __future__ import annotations
 
 import heapq
+import sys
 import time
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable
 
 import numpy as np
@@ -49,6 +50,9 @@ OTHERS = '(other frames)'
 MOST_WAITING = 100_000
 """Readings that may wait for odometry at once, so that memory stays bounded without any."""
 
+LONGEST_LAG = 60.0
+"""Seconds that a reading waits at the most for odometry that keeps coming and has not reached its stamp."""
+
 
 class PoseAssociator:
     """Takes Range and Odometry one at a time, in any interleaving, and keeps the readings it could place.
@@ -67,6 +71,10 @@ class PoseAssociator:
         The frames of the first odometry message; empty before it.
     time_jumps : int
         How often odometry's clock jumped back.
+    behind : bool
+        Whether more readings than `at_once` can be placed now: call `settle` before the next message is added.
+    settled : int
+        Readings placed, rejected or looked at again so far: how much work there was.
     limits : LimitWatch
         Warns of ranges and limits in different units.
     """
@@ -77,6 +85,7 @@ class PoseAssociator:
         parameters: Parameters | None = None,
         patient: bool = False,
         clock: Callable[[], float] = time.monotonic,
+        at_once: int = 0,
     ) -> None:
         """Prepare for messages.
 
@@ -91,6 +100,10 @@ class PoseAssociator:
         clock : callable
             Returns seconds. A reading times out when `pose_timeout` has passed both by the stamps that came after it
             and by this clock: so neither a bag that is replayed fast nor a simulation that stands still loses any.
+            While odometry keeps coming, no reading times out that only overtook it.
+        at_once : int
+            Readings that one call places or rejects at the most, so that odometry that comes after a long silence
+            holds up nobody; 0 is no bound.
         """
         self._clock = clock
         self._extrinsics = extrinsics
@@ -111,8 +124,13 @@ class PoseAssociator:
         self._path = RobotPath()
         self._history = PoseHistory()
         self._newest_range: int | None = None
-        self._held: list[tuple[Measurement, Pose2]] = []
+        self._held: deque[tuple[Measurement, Pose2]] = deque()
+        self._retrying = 0
         self._next_try = self._next_look = 0
+        self._at_once = at_once or sys.maxsize
+        self._odometry_arrival = self._odometry_sent = 0.0
+        self.behind = False
+        self.settled = 0
         self._other_frame = False
 
     @property
@@ -130,13 +148,17 @@ class PoseAssociator:
         """The readings to map from: all that were accepted, or `max_readings` of them."""
         return self.buffer.bounded()
 
+    def change(self, parameters: Parameters) -> None:
+        """Use other parameters from here on; those of the grid and of the buffer must be the same."""
+        self.parameters, self._all = parameters.association, parameters
+
     @property
     def odometry(self) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         """The poses of odometry that are held: stamps in ns, shape (M,), and x, y, yaw, shape (M, 3)."""
         return self._history.held()
 
-    def add_range(self, message: RangeMessage) -> None:
-        """Take one Range message."""
+    def add_range(self, message: RangeMessage, sent: int = 0) -> None:
+        """Take one Range message; `sent` is when it was published, nanoseconds of the system's clock, 0 if unknown."""
         self.received += 1
         self.limits.add(message)
         measured = measure(message, self.parameters)
@@ -147,15 +169,15 @@ class PoseAssociator:
         if self.waiting >= MOST_WAITING and not self._patient:
             self._reject(message.frame_id, 'too_many_waiting')
             return
-        measured.number, measured.arrival = self.received, self._clock()
+        measured.number, measured.arrival, measured.sent = self.received, self._clock(), sent
         heapq.heappush(self._waiting, measured)
         self._newest_range = max(message.stamp, self._newest_range or message.stamp)
         self._settle()
 
-    def reject(self, message: RangeMessage, reason: str) -> None:
-        """Take one Range message and reject it for a reason that is not its own."""
-        self.received += 1
-        self._reject(message.frame_id, reason)
+    def reject(self, message: RangeMessage, reason: str, count: int = 1) -> None:
+        """Take one Range message, or several like it, and reject it for a reason that is not its own."""
+        self.received += count
+        self._reject(message.frame_id, reason, count)
 
     def clear(self, parameters: Parameters | None = None) -> None:
         """Forget readings, counts and path; odometry is kept, so that the next reading gets a pose.
@@ -174,12 +196,14 @@ class PoseAssociator:
         self.unknown_frames.clear()
         self._waiting.clear()
         self._held.clear()
+        self._retrying = 0
+        self.behind = False
         self._path.clear()
         self.received = self.odometry_received = self.time_jumps = 0
         self._extent.clear()
 
-    def add_odometry(self, message: OdometryMessage) -> None:
-        """Take one Odometry message."""
+    def add_odometry(self, message: OdometryMessage, sent: int = 0) -> None:
+        """Take one Odometry message; `sent` is as in `add_range`."""
         self.odometry_received += 1
         if message.pose is None or not possible(message.pose):
             self.odometry_rejected['bad_pose'] += 1
@@ -199,6 +223,8 @@ class PoseAssociator:
         if newest is not None and message.stamp < newest - JUMP:
             self._jump_back(newest)
         self._history.add(message.stamp, message.pose)
+        self._odometry_arrival = self._clock()
+        self._odometry_sent = max(self._odometry_sent, sent)
         self._settle()
         if not self._patient:
             self._history.trim()
@@ -239,12 +265,12 @@ class PoseAssociator:
         """Add a point to the robot's path, if it lies far enough from the last one."""
         self._path.extend(point)
 
-    def _reject(self, frame_id: str, reason: str) -> None:
-        self.rejected[reason] += 1
+    def _reject(self, frame_id: str, reason: str, count: int = 1) -> None:
+        self.rejected[reason] += count
         known = self.rejected_by_frame
         new = len(known) < MOST_FRAMES and len(frame_id) <= LONGEST_NAME
         frame = frame_id if frame_id in known or new else OTHERS
-        self.rejected_by_frame.setdefault(frame, Counter())[reason] += 1
+        self.rejected_by_frame.setdefault(frame, Counter())[reason] += count
 
     def _reject_unknown(self, measured: Measurement) -> None:
         if len(self.unknown_frames) < MOST_FRAMES:
@@ -254,22 +280,32 @@ class PoseAssociator:
     def _jump_back(self, newest: int) -> None:
         self._settle_up_to(newest)
         self.time_jumps += 1
-        for measured in (*self._waiting, *(held for held, _ in self._held)):
-            self._reject(measured.frame_id, 'time_jump')
+        for frame_id, count in Counter(m.frame_id for m in (*self._waiting, *(held for held, _ in self._held))).items():
+            self._reject(frame_id, 'time_jump', count)
         self._waiting.clear()
         self._held.clear()
+        self._retrying, self.behind = 0, False
         self._next_try = self._next_look = 0
         self._history.clear()
         self._newest_range = None
 
+    def settle(self) -> None:
+        """Go on placing readings, where `behind` says that there are more."""
+        self._settle()
+
     def _settle(self) -> None:
-        """Place or reject every waiting reading whose fate is known."""
-        newest = self._history.newest
+        """Place or reject the waiting readings whose fate is known, `at_once` at the most."""
+        newest, left = self._history.newest, self._at_once
         if newest is not None:
             # odometry may be late by up to JUMP, and a file can wait for it
-            self._settle_up_to(newest - JUMP if self._patient else newest)
-        if self._patient:
-            return
+            left = self._settle_up_to(newest - JUMP if self._patient else newest, left)
+        if not self._patient:
+            left = self._time_out(newest, left) if left else 0
+            self.behind = not left
+            self.settled += self._at_once - left
+
+    def _time_out(self, newest: int | None, left: int) -> int:
+        """Reject readings that have waited too long, ask for poses again; return how much of `left` is left."""
         now = max(self._newest_range or 0, newest or 0)
         # a gap that would be bridged must not time out first
         patience = max(self.parameters.pose_timeout, self.parameters.max_pose_gap)
@@ -278,27 +314,39 @@ class PoseAssociator:
             self._next_look = newest + NANOSECONDS
             self._drop_the_future(newest, patience)
         if not ((self._waiting and self._waiting[0].stamp < limit) or self._held):
-            return
+            return left
         oldest = self._clock() - patience
-        while self._waiting and self._waiting[0].stamp < limit and self._waiting[0].arrival < oldest:
-            self._reject(heapq.heappop(self._waiting).frame_id, 'no_odometry')
+        # odometry that keeps coming is merely behind, or else `_drop_the_future` notices
+        waiting = self._waiting if newest is None or self._odometry_arrival < oldest else []
+        while left and waiting and waiting[0].stamp < limit and waiting[0].arrival < oldest:
+            self._reject(heapq.heappop(waiting).frame_id, 'no_odometry')
+            left -= 1
         if self._held and now >= self._next_try:
             self._next_try = now + RETRY
-            held, self._held = self._held, []
-            for measured, pose in held:
-                if measured.stamp < limit and measured.arrival < oldest:
-                    self._reject_unknown(measured)
-                else:
-                    self._add_extrinsics(measured, pose)
+            self._retrying = len(self._held)
+        while left and self._retrying:
+            self._retrying -= 1
+            left -= 1
+            measured, pose = self._held.popleft()
+            if measured.stamp < limit and measured.arrival < oldest:
+                self._reject_unknown(measured)
+            else:
+                self._add_extrinsics(measured, pose)
+        return left
 
     def _drop_the_future(self, newest: int, patience: float) -> None:
-        """Reject what odometry should have reached by now, by its own stamps and by the clock."""
-        oldest = self._clock() - patience
+        """Reject what odometry should have reached by now, by its own stamps and by the clock.
+
+        Odometry that was published before a reading, and was overtaken by it, says nothing of the reading's clock.
+        """
+        clock = self._clock()
+        oldest, published = clock - patience, self._odometry_sent and self._odometry_sent - patience * NANOSECONDS
         stay = []
         for measured in self._waiting:
             if measured.newest is None:
                 measured.newest = newest
-            if measured.arrival < oldest and newest - measured.newest > patience * NANOSECONDS:
+            overtook = measured.sent > published > 0 and measured.arrival > clock - LONGEST_LAG
+            if measured.arrival < oldest and newest - measured.newest > patience * NANOSECONDS and not overtook:
                 self._reject(measured.frame_id, 'from_the_future')
             else:
                 stay.append(measured)
@@ -306,9 +354,12 @@ class PoseAssociator:
             self._waiting = stay
             heapq.heapify(self._waiting)
 
-    def _settle_up_to(self, stamp: int) -> None:
-        while self._waiting and self._waiting[0].stamp <= stamp:
+    def _settle_up_to(self, stamp: int, left: int = sys.maxsize) -> int:
+        """Place the readings up to a stamp, `left` at the most; return how many more may be."""
+        while left and self._waiting and self._waiting[0].stamp <= stamp:
             self._place(heapq.heappop(self._waiting))
+            left -= 1
+        return left
 
     def _place(self, measured: Measurement) -> None:
         pose = self._history.at(measured.stamp, self.parameters.max_pose_gap)

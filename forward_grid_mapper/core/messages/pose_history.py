@@ -88,6 +88,9 @@ class PoseHistory:
     def at(self, stamp: int, max_gap: float) -> Pose2 | str:
         """Return the pose at a stamp, or the reason why there is none (`rep117.REASONS`).
 
+        A pose of the very stamp bridges no gap, but it must not have jumped from the two before: the one after it,
+        which would tell a wild pose from a correction, is not known yet while a robot drives.
+
         Parameters
         ----------
         stamp : int
@@ -97,13 +100,21 @@ class PoseHistory:
         """
         stamps, poses = self._stamps, self._poses
         after = bisect_left(stamps, stamp)
-        if stamps[after] == stamp:
-            return poses[after]
+        exact = stamps[after] == stamp
+        if exact:
+            before = range(max(after - 2, 0), after)
+            jumped = len(before) > 0 and all(self._jumped(k, after) for k in before)
+            return 'pose_jump' if jumped else poses[after]
         if after == 0:
             return 'before_odometry'
         gap = stamps[after] - stamps[after - 1]
         if gap > max_gap * NANOSECONDS:
             return 'pose_gap'
-        if math.dist(poses[after - 1][:2], poses[after][:2]) > STRIDE + FASTEST * gap / NANOSECONDS:
+        if self._jumped(after - 1, after):
             return 'pose_jump'
         return interpolate(poses[after - 1], poses[after], (stamp - stamps[after - 1]) / gap)
+
+    def _jumped(self, before: int, after: int) -> bool:
+        """Return whether no robot drives from one pose to another so fast."""
+        seconds = (self._stamps[after] - self._stamps[before]) / NANOSECONDS
+        return math.dist(self._poses[before][:2], self._poses[after][:2]) > STRIDE + FASTEST * seconds

@@ -5,11 +5,30 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable
 from dataclasses import fields
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..common.readings import Readings
 from .thinning import kept
+
+Columns = dict[str, NDArray[Any]]
+
+LARGE = 65_536
+"""Rows from which on columns are moved to larger ones little by little, so that no reading waits for the copy."""
+
+STEP = 1024
+"""Readings between two steps of the move."""
+
+
+class _Thinned(NamedTuple):
+    """The columns that stay of the first `size` readings, `stay` of them, in the buffer's state `version`."""
+
+    columns: Columns
+    stay: int
+    size: int
+    version: int
 
 
 class ReadingBuffer:
@@ -23,6 +42,9 @@ class ReadingBuffer:
         Readings that `bounded` returns at the most; up to an eighth more are held. 0 is no bound.
     before_thinning : list of callable
         Called before readings are dropped, by the thread that appends: the last moment to look at those that are new.
+    aside : callable, optional
+        Takes two functions, has another thread call the first, and gives what it returned to the second in the thread
+        that appends, or nothing if it failed. By default thinning keeps the caller of `append` waiting.
     """
 
     _TYPES = {f.name: np.float64 for f in fields(Readings) if f.name not in ('stamp', 'sensor', 'sensor_names')} | {
@@ -34,6 +56,9 @@ class ReadingBuffer:
     def __init__(self, bound: int = 0) -> None:
         self.bound = bound
         self.before_thinning: list[Callable[[], None]] = []
+        self.aside: Callable[[Callable[[], _Thinned], Callable[[_Thinned | None], None]], None] | None = None
+        self._version = 0
+        self._larger: Columns | None = None
         # held while columns are replaced, so that a snapshot never mixes old and new ones
         self._lock = threading.Lock()
         self.clear()
@@ -52,27 +77,35 @@ class ReadingBuffer:
         with self._lock:
             self._size = self._count = 0
             self._names: dict[str, int] = {}
-            self._columns = {name: np.empty(1024, kind) for name, kind in self._TYPES.items()}
+            self._columns: Columns = {name: np.empty(1024, kind) for name, kind in self._TYPES.items()}
+        self._counts: list[int] = []
+        self._silent: list[int] = []
+        self._begin_anew()
 
     def append(self, sensor: str, **values: float) -> None:
         """Add one reading of the sensor named `sensor`; `values` are the other columns of `Readings`."""
         if self._size == len(self._columns['z']):
             self._reserve(1)
-        values['sensor'] = self._names.setdefault(sensor, len(self._names))
-        values['number'] = self._count
+        number = self._number_of(sensor)
+        self._counts[number] += 1
+        self._silent[number] += values['z'] >= values['z_max']
+        values['sensor'], values['number'] = number, self._count
         for name, column in self._columns.items():
             column[self._size] = values[name]
         self._size += 1
         self._count += 1
+        if not self._size % STEP:
+            self._move_on()
         self._thin()
 
     def extend(self, readings: Readings) -> None:
         """Add many readings at once."""
         count = len(readings)
         self._reserve(count)
-        sensors = np.array(
-            [self._names.setdefault(name, len(self._names)) for name in readings.sensor_names] or [0], np.int32
-        )
+        sensors = np.array([self._number_of(name) for name in readings.sensor_names] or [0], np.int32)
+        for number, count_of, silent in zip(sensors.tolist(), *readings.counts(), strict=False):
+            self._counts[number] += count_of
+            self._silent[number] += silent
         end = self._size + count
         for name, column in self._columns.items():
             if name == 'sensor':
@@ -84,6 +117,17 @@ class ReadingBuffer:
         self._size = end
         self._count += count
         self._thin()
+
+    def counts(self) -> dict[str, tuple[int, int]]:
+        """Return, for each sensor, how many readings were ever appended, and how many of them were without echo."""
+        return dict(zip(list(self._names), zip(self._counts, self._silent, strict=False), strict=False))
+
+    def _number_of(self, sensor: str) -> int:
+        number = self._names.setdefault(sensor, len(self._names))
+        if number == len(self._counts):
+            self._counts.append(0)
+            self._silent.append(0)
+        return number
 
     def snapshot(self, start: int = 0) -> Readings:
         """Return what is held of readings number `start`, counted from 0 as `len` does, and later.
@@ -98,32 +142,99 @@ class ReadingBuffer:
 
     def bounded(self) -> Readings:
         """Return the readings to map from: all that is held, thinned to `bound`."""
-        readings = self.snapshot()
-        if not self.bound or len(readings) <= self.bound:
-            return readings
-        return readings.select(kept(readings, self.bound))
+        return bounded(self.snapshot(), self.bound)
 
     def _reserve(self, count: int) -> None:
         size = len(self._columns['z'])
         while size < self._size + count:
             size *= 2
         if size > len(self._columns['z']):
-            grown = {name: np.empty(size, column.dtype) for name, column in self._columns.items()}
-            for name, column in self._columns.items():
-                grown[name][: self._size] = column[: self._size]
+            if self._larger is None or len(self._larger['z']) < size:
+                self._larger, self._moved = _empty(self._columns, size), 0
+            self._move(self._size)
             with self._lock:
-                self._columns = grown
+                self._columns = self._larger
+            self._larger = None
+
+    def _move_on(self) -> None:
+        """Move some rows to larger columns if these are soon needed; a step for every `STEP` readings is enough."""
+        size = len(self._columns['z'])
+        if size < LARGE or self._size <= size - size // 4:
+            return
+        if self._larger is None:
+            self._larger, self._moved = _empty(self._columns, 2 * size), 0
+        self._move(min(self._moved + 5 * STEP, self._size))
+
+    def _move(self, end: int) -> None:
+        assert self._larger is not None
+        for name, column in self._columns.items():
+            self._larger[name][self._moved : end] = column[self._moved : end]
+        self._moved = end
+
+    def _begin_anew(self) -> None:
+        """Forget what was made of columns that are no longer those of the buffer."""
+        self._version += 1
+        self._larger, self._moved = None, 0
+        self._thinning, self._failed_at = False, 0
 
     def _thin(self) -> None:
         # not at every reading beyond the bound: thinning costs the same for many
-        if not self.bound or self._size <= self.bound + self.bound // 8:
+        slack = self.bound // 8
+        if not self.bound or self._thinning or self._size <= max(self.bound, self._failed_at) + slack:
+            return
+        self._thinning = True
+        columns, size, version, names = self._columns, self._size, self._version, tuple(self._names)
+
+        def thin() -> _Thinned:
+            views = {name: column[:size] for name, column in columns.items()}
+            held = Readings(**{name: view for name, view in views.items() if name != 'number'}, sensor_names=names)
+            stay = kept(held, self.bound)
+            # snapshots are views of the old columns, which therefore must not change
+            thinned = _empty(columns, len(columns['z']))
+            for name, view in views.items():
+                # indexing would keep the GIL
+                np.take(view, stay, out=thinned[name][: len(stay)], mode='clip')
+            return _Thinned(thinned, len(stay), size, version)
+
+        if self.aside is None:
+            self._take_thinned(thin())
+        else:
+            self.aside(thin, self._take_thinned)
+
+    def _take_thinned(self, thinned: _Thinned | None) -> None:
+        """Go on with thinned columns, and with what was appended since; without them, try again when there is more."""
+        if thinned is None:
+            self._thinning, self._failed_at = False, self._size
+            return
+        if thinned.version != self._version:
             return
         for look in self.before_thinning:
             look()
-        stay = kept(self.snapshot(), self.bound)
-        # snapshots are views of the old columns, which therefore must not change
-        thinned = {name: np.empty_like(column) for name, column in self._columns.items()}
+        columns, tail = thinned.columns, slice(thinned.size, self._size)
+        size = thinned.stay + self._size - thinned.size
+        if size > len(columns['z']):
+            columns = _grown(columns, thinned.stay, 2 * size)
         for name, column in self._columns.items():
-            thinned[name][: len(stay)] = column[stay]
+            columns[name][thinned.stay : size] = column[tail]
         with self._lock:
-            self._columns, self._size = thinned, len(stay)
+            self._columns, self._size = columns, size
+        self._begin_anew()
+        # so much may have come meanwhile that it is time again
+        self._thin()
+
+
+def bounded(readings: Readings, bound: int) -> Readings:
+    """Return the readings thinned to `bound`; 0 is no bound."""
+    return readings if not bound or len(readings) <= bound else readings.select(kept(readings, bound))
+
+
+def _empty(like: Columns, size: int) -> Columns:
+    return {name: np.empty(size, column.dtype) for name, column in like.items()}
+
+
+def _grown(columns: Columns, count: int, size: int) -> Columns:
+    """Return longer columns with the first `count` rows of `columns`."""
+    grown = _empty(columns, size)
+    for name, column in columns.items():
+        grown[name][:count] = column[:count]
+    return grown

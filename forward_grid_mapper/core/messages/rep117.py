@@ -52,12 +52,12 @@ LONGEST_NAME = 255
 class Measurement:
     """A Range that passed REP 117: what it says, before it has a pose. Order is that of stamps, then of arrival."""
 
-    __slots__ = ('arrival', 'frame_id', 'half_angle', 'newest', 'number', 'sigma', 'stamp', 'z', 'z_max')
+    __slots__ = ('arrival', 'frame_id', 'half_angle', 'newest', 'number', 'sent', 'sigma', 'stamp', 'z', 'z_max')
 
     def __init__(self, message: RangeMessage, z: float, z_max: float, half_angle: float, sigma: float) -> None:
         self.stamp, self.frame_id = message.stamp, message.frame_id
         self.z, self.z_max, self.half_angle, self.sigma = z, z_max, half_angle, sigma
-        self.number, self.arrival = 0, 0.0
+        self.number, self.arrival, self.sent = 0, 0.0, 0
         self.newest: int | None = None
 
     def __lt__(self, other: Measurement) -> bool:

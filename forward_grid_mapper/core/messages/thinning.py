@@ -37,11 +37,12 @@ def kept(readings: Readings, bound: int) -> NDArray[np.int64]:
         return np.arange(len(readings))
     bins = _bins(readings)
     order = np.lexsort((_ties(readings), ~readings.stamp, bins))
-    bins = bins[order]
+    bins = np.take(bins, order)
     first = np.ones(len(bins), np.bool_)
     first[1:] = bins[1:] != bins[:-1]
-    begins = np.flatnonzero(first)
-    rank = np.arange(len(bins)) - np.repeat(begins, np.diff(begins, append=len(bins)))
+    # these functions let go of the GIL, where np.repeat and indexing do not
+    number = np.arange(len(bins))
+    rank = number - np.maximum.accumulate(np.where(first, number, 0))
     # readings of rank r are the r-th newest of their bins; whole ranks stay until one does not fit
     remaining = bound - np.cumsum(np.bincount(rank))
     level = int(np.count_nonzero(remaining >= 0))

@@ -74,9 +74,11 @@ _remove_unused(Path(CACHE))
 
 
 def _compiled(function: F, **options: Any) -> F:
+    # without wrappers for C, from which nothing calls a kernel
+    options = {'cache': True, 'nogil': True, 'error_model': 'numpy', 'no_cfunc_wrapper': True, **options}
     before, config.CACHE_DIR = config.CACHE_DIR, CACHE
     try:
-        compiled: Any = numba.njit(cache=True, nogil=True, error_model='numpy', **options)(function)
+        compiled: Any = numba.njit(**options)(function)
     finally:
         config.CACHE_DIR = before
     return cast(F, compiled)

@@ -83,34 +83,30 @@ def highest(s: State, cells: NDArray[np.int64], gains: Floats, workspace: Floats
 
 
 @kernel
-def flip_in_order(s: State, prior: Prior, least: Least, cells: NDArray[np.int64], gains: Floats) -> tuple[int, float]:
-    """Flip those of `cells`, in order, that still gain enough; return their number and total gain.
-
-    `gains` is what they gained when the update began. A cell that lost much of that since, to the flip of another one,
-    waits for the next update, where it may find itself behind a better one.
-    """
+def _flip_above(s: State, prior: Prior, cells: NDArray[np.int64], needed: Floats) -> tuple[int, float]:
+    """Flip those of `cells`, in order, that gain more than `needed` when it is their turn."""
     flips, total = 0, 0.0
     for i in range(len(cells)):
         if s.stop[0]:
             break
         gain = gain_of(s, prior, cells[i])
-        if gain > max(least_gain(s, least, cells[i]), WORTH_WAITING * gains[i]):
+        if gain > needed[i]:
             flip(s, cells[i])
             flips += 1
             total += gain
     return flips, total
 
 
-@kernel
+def flip_in_order(s: State, prior: Prior, least: Least, cells: NDArray[np.int64], gains: Floats) -> tuple[int, float]:
+    """Flip those of `cells`, in order, that still gain enough; return their number and total gain.
+
+    `gains` is what they gained when the update began. A cell that lost much of that since, to the flip of another one,
+    waits for the next update, where it may find itself behind a better one.
+    """
+    return _flip_above(s, prior, cells, np.maximum(least[0] + least[1] * s.maps.seen[cells], WORTH_WAITING * gains))
+
+
 def free_unneeded(s: State, prior: Prior, least: Least, cells: NDArray[np.int64]) -> tuple[int, float]:
     """Free those of `cells`, occupied ones, that cost nothing but rounding to free; return their number and gain."""
-    flips, total = 0, 0.0
-    for c in cells:
-        if s.stop[0]:
-            break
-        gain = gain_of(s, prior, c)
-        if s.maps.seen[c] and gain >= -least[1] * s.maps.seen[c]:
-            flip(s, c)
-            flips += 1
-            total += gain
-    return flips, total
+    cells = cells[s.maps.seen[cells] > 0]
+    return _flip_above(s, prior, cells, np.nextafter(-least[1] * s.maps.seen[cells], -np.inf))

@@ -30,7 +30,8 @@ from ..common.constants import (
 from ..evidence.neighbourhood import DX, DY, NEIGHBOURS
 from ..evidence.state import State
 from ..evidence.updates import flip
-from ..runtime.jit import allocating_kernel, kernel
+from ..runtime.jit import kernel
+from ..sensor.cone_table import Floats
 from .flips import Least, gain_of
 from .prior import Prior
 
@@ -49,17 +50,20 @@ def _leaves(pattern: int, dx: int, dy: int) -> bool:
 
 
 @kernel
+def _is_end(s: State, prior: Prior, c: int) -> bool:
+    """Return whether cell c is occupied and no wall goes through it."""
+    return bool(s.maps.occupied[c] and prior.shape[s.maps.pattern[c]] < prior.shape[255])
+
+
+@kernel
 def _may_close(s: State, prior: Prior, c: int, dx: int, dy: int) -> bool:
-    """Return whether cell c and the one at (dx, dy) from it are ends of walls that lead to each other."""
-    occupied, pattern = s.maps.occupied, s.maps.pattern
-    height, width = s.lattice.height, s.lattice.width
+    """Return whether end c and the cell at (dx, dy) from it are ends of walls that lead to each other."""
+    pattern, width = s.maps.pattern, s.lattice.width
     row, column = c // width + dy, c % width + dx
-    if not (0 <= row < height and 0 <= column < width):
+    if not (0 <= row < s.lattice.height and 0 <= column < width):
         return False
-    o, through = row * width + column, prior.shape[255]
-    if not occupied[c] or not occupied[o] or prior.shape[pattern[c]] >= through or prior.shape[pattern[o]] >= through:
-        return False
-    return bool(_leaves(pattern[c], dx, dy) and _leaves(pattern[o], -dx, -dy))
+    o = row * width + column
+    return bool(_is_end(s, prior, o) and _leaves(pattern[c], dx, dy) and _leaves(pattern[o], -dx, -dy))
 
 
 @kernel
@@ -99,51 +103,92 @@ def _midway(dx: int, dy: int) -> bool:
 
 
 @kernel
-def _flip_all(s: State, prior: Prior, least: Least, path: Any, n: int) -> float:
-    """Flip the first n cells of `path`; flip them back, and return 0, if that does not gain enough."""
-    gain, needed = 0.0, 10.0 * least[0]
-    for i in range(n):
-        gain += gain_of(s, prior, path[i])
-        needed += least[1] * s.maps.seen[path[i]]
-        flip(s, path[i])
-    if gain > needed:
-        return gain
-    for i in range(n):
-        flip(s, path[i])
-    return 0.0
+def _is_gap(s: State, prior: Prior, gap: Any, path: Any) -> bool:
+    """Return whether a gap of `_list_gaps` may be closed, and write its cells to `path`."""
+    c, dx, dy = gap[0], gap[1], gap[2]
+    return bool(_is_end(s, prior, c) and _may_close(s, prior, c, dx, dy) and _path(s, c, dx, dy, gap[3] == 1, path))
 
 
 @kernel
-def _list_gaps(
-    s: State, prior: Prior, least: Least, cells: NDArray[np.int64], n: int, path: Any, gaps: Any, gains: Any
-) -> int:
-    """List the gaps of length n that gain if closed, and what they gain; return their number, at most that of `gaps`.
+def _list_gaps(s: State, prior: Prior, cells: NDArray[np.int64], n: int, gaps: Any, paths: Any) -> int:
+    """List the gaps of length n that may be closed; return their number, of which `gaps` and `paths` hold the first.
 
-    A row of `gaps` has the cell at one end, the way to the other one, and 1 where cells midway are taken `up`.
+    Parameters
+    ----------
+    gaps : int64, shape (most, 4)
+        The cell at one end, the way to the other one, and 1 where cells midway are taken `up`.
+    paths : int64, shape (most + 1, n - 1)
+        The cells between. The last row is to work in.
     """
-    m = 0
+    m, most = 0, len(gaps)
     for c in cells:
         if s.stop[0]:
             break
+        if not _is_end(s, prior, c):
+            continue
         # each pair once
         for dy in range(n + 1):
             for dx in range(-n, n + 1, 1 if dy == n else 2 * n):
                 if (dy == 0 and dx < 0) or not _may_close(s, prior, c, dx, dy):
                     continue
                 for up in range(0 if _midway(dx, dy) else 1, 2):
-                    if m == len(gaps) or not _path(s, c, dx, dy, up == 1, path):
-                        continue
-                    gain = _flip_all(s, prior, least, path, n - 1)
-                    if gain > 0.0:
-                        for i in range(n - 1):
-                            flip(s, path[i])
-                        gaps[m, 0], gaps[m, 1], gaps[m, 2], gaps[m, 3] = c, dx, dy, up
-                        gains[m] = gain
+                    if _path(s, c, dx, dy, up == 1, paths[min(m, most)]):
+                        if m < most:
+                            gaps[m, 0], gaps[m, 1], gaps[m, 2], gaps[m, 3] = c, dx, dy, up
                         m += 1
     return m
 
 
-@allocating_kernel
+@kernel
+def _flip_sets(s: State, prior: Prior, least: Least, cells: Any, starts: Any, keep: bool, gains: Any) -> None:
+    """Flip sets of cells at once, one set after the other.
+
+    Parameters
+    ----------
+    cells : int64
+        The cells of all sets.
+    starts : int64, shape (sets + 1,)
+        Where those of each set begin, and where the last one ends.
+    keep : bool
+        Whether sets that gain enough stay flipped; others are flipped back.
+    gains : float64, shape (sets,)
+        Filled with what each set gains, 0 where that is not enough.
+    """
+    for k in range(len(starts) - 1):
+        begin, end = starts[k], starts[k + 1]
+        gain, needed = 0.0, 10.0 * least[0]
+        if not s.stop[0]:
+            for i in range(begin, end):
+                gain += gain_of(s, prior, cells[i])
+                needed += least[1] * s.maps.seen[cells[i]]
+                flip(s, cells[i])
+            enough = gain > needed
+            if not (enough and keep):
+                for i in range(begin, end):
+                    flip(s, cells[i])
+            gain = gain if enough else 0.0
+        gains[k] = gain
+
+
+def _gain_of_sets(
+    s: State, prior: Prior, least: Least, cells: NDArray[np.int64], starts: NDArray[np.int64], keep: bool
+) -> Floats:
+    gains = np.zeros(len(starts) - 1)
+    _flip_sets(s, prior, least, cells, starts, keep, gains)
+    return gains
+
+
+def _gaps(s: State, prior: Prior, cells: NDArray[np.int64], n: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return what `_list_gaps` lists of gaps and their cells, all of them."""
+    most = 1024
+    while True:
+        gaps, paths = np.empty((most, 4), np.int64), np.empty((most + 1, n - 1), np.int64)
+        m = _list_gaps(s, prior, cells, n, gaps, paths)
+        if m <= most:
+            return gaps[:m], paths[:m]
+        most = m
+
+
 def close_gaps(s: State, prior: Prior, least: Least, cells: NDArray[np.int64], longest: int) -> tuple[int, float]:
     """Close the gaps that gain, the shortest first, and of one length the one first that gains most.
 
@@ -157,18 +202,15 @@ def close_gaps(s: State, prior: Prior, least: Least, cells: NDArray[np.int64], l
     longest : int
         Cells from one end of a gap to the other.
     """
-    path = np.empty(longest, np.int64)
-    gaps, gains = np.empty((2 * len(cells) + 64, 4), np.int64), np.empty(2 * len(cells) + 64)
     flips, total = 0, 0.0
     for n in range(2, longest + 1):
-        m = _list_gaps(s, prior, least, cells, n, path, gaps, gains)
-        for k in np.argsort(-gains[:m], kind='mergesort'):
-            c, dx, dy, up = gaps[k, 0], gaps[k, 1], gaps[k, 2], gaps[k, 3]
-            if _may_close(s, prior, c, dx, dy) and _path(s, c, dx, dy, up == 1, path):
-                gain = _flip_all(s, prior, least, path, n - 1)
-                if gain > 0.0:
-                    flips += n - 1
-                    total += gain
+        gaps, paths = _gaps(s, prior, cells, n)
+        gains = _gain_of_sets(s, prior, least, paths.ravel(), np.arange(len(gaps) + 1) * (n - 1), False)
+        for k in np.argsort(-gains, kind='stable')[: int((gains > 0.0).sum())]:
+            if _is_gap(s, prior, gaps[k], paths[k]):
+                gain = float(_gain_of_sets(s, prior, least, paths[k], np.array([0, n - 1]), True)[0])
+                flips += (n - 1) * (gain > 0.0)
+                total += gain
     return flips, total
 
 
@@ -194,7 +236,34 @@ def _connected(s: State, reached: Any, wall: Any) -> int:
     return n
 
 
-@allocating_kernel
+@kernel
+def _list_short_walls(s: State, cells: NDArray[np.int64], longest: int, reached: Any, walls: Any, starts: Any) -> int:
+    """List the cells of all walls of 2 to `longest` cells, and where those of each wall begin; return their number.
+
+    Parameters
+    ----------
+    reached : uint8, shape (cells of the map,)
+        To work in; all 0.
+    walls : int64
+        As long as there are occupied cells.
+    starts : int64
+        One longer; the entry after the last wall is where that one ends.
+    """
+    n, end = 0, 0
+    starts[0] = 0
+    for c in cells:
+        if s.stop[0]:
+            break
+        if reached[c] or not s.maps.occupied[c]:
+            continue
+        walls[end] = c
+        size = _connected(s, reached, walls[end:])
+        if 1 < size <= longest:
+            n, end = n + 1, end + size
+            starts[n] = end
+    return n
+
+
 def remove_short_walls(
     s: State, prior: Prior, least: Least, cells: NDArray[np.int64], longest: int
 ) -> tuple[int, float]:
@@ -209,19 +278,8 @@ def remove_short_walls(
     longest : int
         Cells of a wall that counts as short.
     """
-    reached = np.zeros(len(s.maps.occupied), np.uint8)
-    wall = np.empty(int(s.maps.occupied.sum()), np.int64)
-    flips, total = 0, 0.0
-    for c in cells:
-        if s.stop[0]:
-            break
-        if reached[c] or not s.maps.occupied[c]:
-            continue
-        wall[0] = c
-        n = _connected(s, reached, wall)
-        if 1 < n <= longest:
-            gain = _flip_all(s, prior, least, wall, n)
-            if gain > 0.0:
-                flips += n
-                total += gain
-    return flips, total
+    occupied = int(np.count_nonzero(s.maps.occupied))
+    walls, starts = np.empty(occupied, np.int64), np.empty(occupied + 1, np.int64)
+    n = _list_short_walls(s, cells, longest, np.zeros(len(s.maps.occupied), np.uint8), walls, starts)
+    gains = _gain_of_sets(s, prior, least, walls, starts[: n + 1], True)
+    return int(np.diff(starts[: n + 1])[gains > 0.0].sum()), float(gains.sum())

@@ -205,8 +205,11 @@ class Search:
         """Return the occupied cells in the window."""
         bottom, top, left, right = self._window
         width = self.evidence.grid.width
-        rows, columns = np.nonzero(self.evidence.state.maps.occupied.reshape(-1, width)[bottom:top, left:right])
-        return np.asarray((rows + bottom) * width + columns + left)
+        # among numbers of type bool, numpy finds those that are set several times faster
+        cells = np.flatnonzero(self.evidence.state.maps.occupied[bottom * width : top * width].view(np.bool_))
+        cells += bottom * width
+        column = cells % width
+        return cells[(left <= column) & (column < right)]
 
     def _promising(self) -> tuple[NDArray[np.int64], Floats]:
         """Return the cells whose flip gains, the best first, and what they gain."""

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from ..common.grid import Grid
 from ..common.parameters import ModelParameters
 from ..common.readings import Readings
-from ..runtime.jit import allocating_kernel
+from ..runtime.jit import allocating_kernel, kernel
 from .cone_table import Cones, Floats, cone_table, walk_resized
 from .density import Causes, causes_of, density
 from .surface_normals import SurfaceNormals, exceeds_incidence_angle, no_normals
@@ -54,6 +54,22 @@ class _Given(NamedTuple):
     resolution: float
 
 
+@kernel
+def _sort(values: Any, n: int) -> None:
+    """Sort the first n values in place, by insertion into strides that shrink: they are few, and partly in order."""
+    stride = 1
+    while stride < n // 3:
+        stride = 3 * stride + 1
+    while stride > 0:
+        for k in range(stride, n):
+            value, at = values[k], k
+            while at >= stride and values[at - stride] > value:
+                values[at] = values[at - stride]
+                at -= stride
+            values[at] = value
+        stride //= 3
+
+
 @allocating_kernel
 def _expect(given: _Given, occupied: Any, out: Any) -> None:
     """Fill `out` (8, N) with the rows of `Expectations`, in its order."""
@@ -74,12 +90,12 @@ def _expect(given: _Given, occupied: Any, out: Any) -> None:
                     continue
             distances[m] = distances[k]
             m += 1
-        hits = np.sort(distances[:m])
+        _sort(distances, m)
         sigma = cones[t].sigma
         weight = causes.mixture_weight
         hit, rank, squared = 0.0, 0.0, 0.0
         for k in range(m):
-            error = (cones[t].z - hits[k]) / sigma
+            error = (cones[t].z - distances[k]) / sigma
             term = weight * causes.p_hit * density(error, sigma * given.resolution)
             hit += term
             rank += (k + 1) * term

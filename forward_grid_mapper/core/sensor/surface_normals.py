@@ -72,6 +72,20 @@ def on_larger_grid(normals: SurfaceNormals, inner: Grid, outer: Grid) -> Surface
     )
 
 
+def known_normals(known: NDArray[np.uint8], x: NDArray[Any], y: NDArray[Any], angle: float) -> SurfaceNormals:
+    """Return normals that were kept.
+
+    Parameters
+    ----------
+    known : uint8, shape (height, width)
+    x, y : float32, shape (height, width)
+    angle : float
+        As for `normals_of`.
+    """
+    flat_x, flat_y = (np.ascontiguousarray(values, np.float32).ravel() for values in (x, y))
+    return SurfaceNormals(known.ravel(), flat_x, flat_y, _before(known), math.cos(angle) ** 2)
+
+
 def no_normals() -> SurfaceNormals:
     """Return normals at which no reading exceeds the incidence angle."""
     none = np.zeros(0, np.float32)

@@ -75,9 +75,9 @@ JUDGED_ON, HELD_OUT = 60, 40
 LEAST_SIGMAS = 2.3
 """Standard errors by which readings must be foreseen better than with odometry: by chance it is so in one of 100."""
 
-LEAST_OVER_ODOMETRY, LEAST_SIGMAS_WITH_WALLS = 10.0, 0.5
+LEAST_OVER_ODOMETRY, LEAST_SIGMAS_WITH_WALLS = 10.0, -1.0
 """Nats by which the votes of walls must be likelier than with odometry's yaw to be a witness of their own, and the
-standard errors that are then enough."""
+standard errors that are then enough: readings must not be foreseen worse. Little drift hardly shows in a few metres."""
 
 MOST_WORSE = 1.0
 """Standard errors by which matching may foresee what was held out worse."""

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from forward_grid_mapper.core.common.grid import Grid, part_of
+from forward_grid_mapper.core.common.grid import UNKNOWN, Grid, cone_boxes, part_of, united
 
 FINE, COARSE = Grid(0.05, 0, 0, 8, 6), Grid(0.1, 0, 0, 4, 3)
 
@@ -44,3 +44,122 @@ def test_sizes_are_not_negative_but_places_may_be() -> None:
     with pytest.raises(ValueError, match='width -1'):
         Grid(0.1, 0, 0, -1, 1)
     assert Grid(0.1, np.int64(-3), -4, np.int32(2), 0).size == 0
+
+
+PLACE = Grid(0.5, -3, 4, 5, 2)
+"""From (-1.5, 2) to (1, 3) metres."""
+
+
+def test_where_a_grid_lies() -> None:
+    assert PLACE.origin == (-1.5, 2.0)
+    assert PLACE.extent == (-1.5, 1.0, 2.0, 3.0)
+    assert (PLACE.shape, PLACE.size) == ((2, 5), 10)
+    x, y = PLACE.centers()
+    assert x.dtype == y.dtype == np.float64
+    assert x.tolist() == [-1.25, -0.75, -0.25, 0.25, 0.75]
+    assert y.tolist() == [2.25, 2.75]
+
+
+def test_a_point_belongs_to_the_cell_above_and_right_of_a_corner() -> None:
+    rows, columns = PLACE.cells_of(np.array([-1.5, -1.6, 0.9, 1.0, 0.0]), np.array([2.0, 1.9, 2.9, 3.0, 2.6]))
+    assert (rows.dtype, columns.dtype) == (np.int64, np.int64)
+    assert rows.tolist() == [0, -1, 1, 2, 1]
+    assert columns.tolist() == [0, -1, 4, 5, 3]
+    x, y = PLACE.centers()
+    rows, columns = PLACE.cells_of(x[:, None] + 0 * y, y + 0 * x[:, None])
+    assert columns[:, 0].tolist() == [0, 1, 2, 3, 4] and rows[0].tolist() == [0, 1]
+
+
+def test_grids_are_values() -> None:
+    with pytest.raises(AttributeError):
+        PLACE.row = 3
+    assert {PLACE: 1}[Grid(0.5, -3, 4, 5, 2)] == 1
+
+
+@pytest.mark.parametrize('seed', range(20))
+def test_a_union_is_the_smallest_that_holds_both(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    one, other = (Grid(0.1, *rng.integers(-9, 9, 2).tolist(), *rng.integers(1, 9, 2).tolist()) for _ in range(2))
+    both = {(grid.row + r, grid.column + c) for grid in (one, other) for r, c in np.ndindex(grid.shape)}
+    rows, columns = ([cell[axis] for cell in both] for axis in (0, 1))
+    whole = one.union(other)
+    assert (whole.row, whole.row + whole.height - 1) == (min(rows), max(rows))
+    assert (whole.column, whole.column + whole.width - 1) == (min(columns), max(columns))
+    for grid in (one, other):
+        window = whole.window(grid)
+        cells = np.full(whole.shape, 0)
+        cells[window] = 1
+        assert cells[window].shape == grid.shape
+        assert (whole.row + window[0].start, whole.column + window[1].start) == (grid.row, grid.column)
+
+
+def test_an_empty_grid_adds_nothing() -> None:
+    empty, line = Grid(0.5, 90, 90, 0, 0), Grid(0.5, 90, 90, 3, 0)
+    assert PLACE.union(empty) == PLACE.union(line) == line.union(PLACE) == PLACE
+    assert empty.union(line) == line
+
+
+@pytest.mark.parametrize(
+    ('column', 'row', 'width', 'height'), [(-4, 4, 1, 1), (-3, 3, 1, 1), (1, 4, 2, 1), (1, 5, 1, 2)]
+)
+def test_what_sticks_out_is_not_inside(column: int, row: int, width: int, height: int) -> None:
+    with pytest.raises(ValueError, match='not inside'):
+        PLACE.window(Grid(0.5, column, row, width, height))
+
+
+def test_the_whole_and_its_last_cell_are_inside() -> None:
+    assert PLACE.window(PLACE) == (slice(0, 2), slice(0, 5))
+    assert PLACE.window(Grid(0.5, 1, 5, 1, 1)) == (slice(1, 2), slice(4, 5))
+
+
+def test_the_grid_that_covers_a_box_has_the_cells_it_touches() -> None:
+    assert Grid.covering((-1.3, 0.7, 2.1, 2.4), 0.5) == Grid(0.5, -3, 4, 5, 1)
+    assert Grid.covering((-1.3, 0.7, 2.1, 2.6), 0.5) == PLACE
+    assert Grid.covering((0.0, 0.0, 0.0, 0.0), 0.5) == Grid(0.5, 0, 0, 1, 1)
+    assert Grid.covering((7.6, 9.1, -3.2, -2.8), 1.0) == Grid(1.0, 7, -4, 3, 2)
+
+
+@pytest.mark.parametrize('seed', range(8))
+def test_boxes_of_sectors_are_those_of_their_points(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    count = 40
+    x, y, reach = rng.uniform(-5, 5, count), rng.uniform(-5, 5, count), rng.uniform(0.1, 4, count)
+    yaw, half = rng.uniform(-7, 7, count), rng.uniform(0.01, 1.5, count)
+    box = cone_boxes(x, y, yaw, half, reach)
+    angles = yaw + half * np.linspace(-1, 1, 4001)[:, None]
+    arc_x, arc_y = x + reach * np.cos(angles), y + reach * np.sin(angles)
+    expected = [
+        np.minimum(arc_x.min(0), x),
+        np.maximum(arc_x.max(0), x),
+        np.minimum(arc_y.min(0), y),
+        np.maximum(arc_y.max(0), y),
+    ]
+    assert box.shape == (4, count)
+    np.testing.assert_allclose(box, expected, atol=1e-5)
+    assert (box[[0, 2]] <= np.array(expected)[[0, 2]] + 1e-12).all(), 'no point of an arc lies outside'
+    assert (box[[1, 3]] >= np.array(expected)[[1, 3]] - 1e-12).all()
+
+
+def test_boxes_reach_as_far_as_an_axis() -> None:
+    quarter = math.pi / 2
+    for k, (side, sign) in enumerate(((1, 1), (3, 1), (0, -1), (2, -1))):
+        for yaw in (k * quarter, k * quarter - 4 * quarter, k * quarter + 0.2):
+            box = cone_boxes(*np.array([[1.0], [2.0], [yaw], [0.2 + 1e-9], [3.0]]))[:, 0]
+            assert box[side] == (1.0 if side < 2 else 2.0) + sign * 3.0
+
+
+def test_windows_are_united() -> None:
+    assert united() is None
+    assert united(None, None) is None
+    assert united((1, 2, 3, 4), None) == (1, 2, 3, 4)
+    assert united((1, 2, 3, 9), (0, 1, 5, 6), None, (4, 7, 4, 5)) == (0, 7, 3, 9)
+
+
+def test_the_rest_of_a_part_is_unknown() -> None:
+    assert UNKNOWN == -1
+    values = np.arange(10, dtype=np.int8).reshape(PLACE.shape)
+    part = part_of(PLACE, values, Grid(0.5, 0, 5, 3, 2))
+    assert part.tolist() == [[8, 9, -1], [-1, -1, -1]] and part.dtype == np.int8
+    assert part_of(PLACE, values, PLACE).tolist() == values.tolist()
+    part[:] = 7
+    assert values[1, 4] == 9, 'a part is a copy'

@@ -101,6 +101,24 @@ def stuck(frame: int, value: float) -> Messages:
     return circling().with_ranges(lambda m: m._replace(range=value) if m.frame_id == name else m)
 
 
+def astray(seconds: float) -> Messages:
+    """Odometry that is 300 m away for some seconds, after a gap in which a robot might have driven so far."""
+    begin = drive().odometry[0].stamp + 40_000_000_000
+    back = begin + round(seconds * 1e9)
+    odometry = [
+        m._replace(pose=m.pose._replace(x=m.pose.x + 300, y=m.pose.y + 200)) if begin <= m.stamp < back else m
+        for m in drive().odometry
+        if not (begin - 5e9 < m.stamp < begin or back <= m.stamp < back + 5e9)
+    ]
+    return drive()._replace(odometry=odometry)
+
+
+def far_echo() -> Messages:
+    """Sound ranges in a room, of a sensor that states a limit of 90 m, and one echo that comes near it."""
+    one = circling().ranges[2000]
+    return circling().with_ranges(lambda m: m._replace(max_range=90.0, range=80.0 if m is one else min(m.range, 5.0)))
+
+
 SCENARIOS: dict[str, tuple[Callable[[], Messages], str]] = {
     'every message twice': (twice, r'copies of others.*recorded twice.*Leave one'),
     'one frame, one stamp a sweep': (lambda: one_frame(0), r'frame sonar take turns.*one frame_id.*Give each its own'),
@@ -129,6 +147,11 @@ SCENARIOS: dict[str, tuple[Callable[[], Messages], str]] = {
         ),
         r'does the driver state no limit.*set the parameter max_range',
     ),
+    'odometry far away for a moment': (
+        lambda: astray(0.3),
+        r'readings make the map 3\d\d x 2\d\d m instead of .* far from all others.*max_jump',
+    ),
+    'one echo far away': (far_echo, r'1 of 4808 readings make the map .* range of 80.0 m.*set the parameter max_range'),
     'ranges in centimetres': (lambda: scaled(100, 1), r'are the ranges in centimetres and the limits in metres'),
     'ranges in millimetres': (lambda: scaled(1000, 1), r'are the ranges in millimetres and the limits in metres'),
     'ranges in feet': (lambda: scaled(3.281, 1), r'are the ranges in feet and the limits in metres'),

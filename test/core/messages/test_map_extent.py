@@ -7,11 +7,13 @@ import math
 import numpy as np
 import pytest
 
+from forward_grid_mapper.core.common.constants import arc_depth
 from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.common.readings import Readings
-from forward_grid_mapper.core.messages.map_extent import MapExtent, reach_of
+from forward_grid_mapper.core.messages.map_extent import FARTHEST, LARGEST_CONE, MapExtent, reach_of
 from forward_grid_mapper.core.messages.message_types import Pose2, RangeMessage
 from forward_grid_mapper.core.messages.rep117 import Measurement, measure
+from forward_grid_mapper.core.sensor.density import CUT
 
 PARAMETERS = Parameters.from_flat({'max_cells': 10_000, 'max_jump': 20.0})
 
@@ -84,3 +86,76 @@ def test_restored_readings_are_those_that_were_admitted() -> None:
 def test_reach_is_that_of_the_echo_and_not_of_the_sensor() -> None:
     assert reach_of(measured(1.0, 3e38), PARAMETERS) < 2.0
     assert reach_of(measured(4.0, 4.0), PARAMETERS) == pytest.approx(4.0 + max(0.05, 0.05) + 0.2)
+
+
+def test_how_far_a_reading_reaches() -> None:
+    """Up to four standard deviations beyond its range, or the arc that an echo marks, and two cells; σ is stated."""
+    cell = PARAMETERS.grid.resolution
+    sigma = PARAMETERS.model.sigma
+    assert reach_of(measured(1.0, 9.0), PARAMETERS) == pytest.approx(1.0 + CUT * sigma + 2 * cell)
+    assert reach_of(measured(4.0, 4.0), PARAMETERS) == pytest.approx(4.0 + arc_depth(cell) + 2 * cell)
+    stated = measure(RangeMessage(0, 'sonar', 1.0, 0.1, 9.0, 0.3, 0.25), PARAMETERS.association)
+    assert isinstance(stated, Measurement)
+    assert reach_of(stated, PARAMETERS) == pytest.approx(1.0 + CUT * 0.5 + 2 * cell)
+    # no finer than half a cell
+    coarse = Parameters.from_flat({'resolution': 1.0})
+    assert reach_of(measured(1.0, 90.0), coarse) == pytest.approx(1.0 + CUT * 0.5 + 2.0)
+
+
+def largest(count: int, **values: float) -> Parameters:
+    return Parameters.from_flat({'max_cells': count, 'max_jump': 1e7, **values})
+
+
+@pytest.mark.parametrize('across', [True, False])
+def test_as_many_cells_as_are_admitted_and_no_more(across: bool) -> None:
+    """Two readings 90 m apart: as many cells in a row as the box has, and one more since it may begin in a cell."""
+    reach = reach_of(measured(), PARAMETERS)
+    cell = PARAMETERS.grid.resolution
+    pose = Pose2(90.0, 0, 0) if across else Pose2(0, 90.0, 0)
+    cells = ((90.0 + 2 * reach) / cell + 1) * (2 * reach / cell + 1)
+    assert cells > 10_000
+    for count, expected in ((math.ceil(cells) + 1, ''), (math.floor(cells) - 1, 'too_far_away')):
+        extent = MapExtent()
+        assert extent.admit(Pose2(0, 0, 0), measured(), largest(count)) == ''
+        assert extent.admit(pose, measured(), largest(count)) == expected
+        restored = Readings.from_columns(
+            x=[0.0, pose.x], y=[0.0, pose.y], yaw=0.0, z=[1.0, 1.0], z_max=4.0, half_angle=0.15
+        )
+        assert MapExtent().restore(restored, largest(count))['too_far_away'].tolist() == [False, bool(expected)]
+
+
+@pytest.mark.parametrize('restored', [True, False])
+@pytest.mark.parametrize(('x', 'y'), [(1, 0), (-1, 0), (0, 1), (0, -1)])
+def test_how_far_a_reading_may_be_from_the_map(x: int, y: int, restored: bool) -> None:
+    """From the edge of the map, not from its middle, on each side."""
+    parameters = Parameters.from_flat({'max_jump': 20.0})
+    reach = reach_of(measured(), parameters)
+    for distance, expected in ((reach + 19.9, ''), (reach + 20.1, 'far_from_map')):
+        extent = MapExtent()
+        if restored:
+            one = Readings.from_columns(x=[50.0], y=[70.0], yaw=0.0, z=[1.0], z_max=4.0, half_angle=0.15)
+            assert not any(mask.any() for mask in extent.restore(one, parameters).values())
+        else:
+            assert extent.admit(Pose2(50.0, 70.0, 0), measured(), parameters) == ''
+        assert extent.admit(Pose2(50.0 + x * distance, 70.0 + y * distance, 0), measured(), parameters) == expected
+
+
+def test_cones_of_as_many_cells_as_one_reading_may_touch() -> None:
+    wide = largest(10**9)
+    for z, expected in ((138.0, ''), (142.0, 'large_cone')):
+        # 2e6 = 1.0 rad · (141.4 m / 0.1 m)²
+        one = measured(z - 0.6, 1000.0, 2.0)
+        assert MapExtent().admit(Pose2(0, 0, 0), one, wide) == expected
+        restored = Readings.from_columns(x=0.0, y=0.0, yaw=0.0, z=[z - 0.6], z_max=1000.0, half_angle=1.0)
+        assert MapExtent().restore(restored, wide)['large_cone'].tolist() == [bool(expected)]
+    assert FARTHEST == 2e7 and LARGEST_CONE == 2_000_000
+
+
+def test_the_sigma_of_restored_readings_is_theirs_or_the_model_s() -> None:
+    """With 1 m the map of two readings 9 m apart is too large, with that of the model it is not."""
+    few = largest(10_000)
+    for sigma, refused in ((0.0, False), (0.1, False), (1.0, True)):
+        restored = Readings.from_columns(
+            x=[0.0, 5.0], y=[0.0, 5.0], yaw=0.0, z=[1.0, 1.0], z_max=9.0, half_angle=0.15, sigma=sigma
+        )
+        assert MapExtent().restore(restored, few)['too_far_away'].any() == refused

@@ -7,7 +7,15 @@ import math
 import pytest
 
 from forward_grid_mapper.core.messages.message_types import NANOSECONDS, Pose2
-from forward_grid_mapper.core.messages.pose_history import HISTORY, MOST_POSES, PoseHistory, interpolate
+from forward_grid_mapper.core.messages.pose_history import (
+    FASTEST,
+    FEWEST,
+    HISTORY,
+    MOST_POSES,
+    STRIDE,
+    PoseHistory,
+    interpolate,
+)
 
 SECOND = NANOSECONDS
 
@@ -42,13 +50,83 @@ def test_reasons_why_there_is_no_pose() -> None:
     assert isinstance(made.at(round(3.15 * SECOND), 9.0), Pose2), '10.9 m in 0.1 s: a drive and one correction'
 
 
+def test_a_wild_pose_gives_no_reading_a_place_not_even_one_of_its_own_stamp() -> None:
+    made = history((1.0, Pose2(0, 0, 0)), (1.1, Pose2(600, 400, 0)), (1.2, Pose2(0.1, 0, 0)), (1.3, Pose2(0.2, 0, 0)))
+    assert made.at(round(1.1 * SECOND), 1.0) == 'pose_jump'
+    assert made.at(round(1.15 * SECOND), 1.0) == 'pose_jump'
+    assert made.at(round(1.2 * SECOND), 1.0) == Pose2(0.1, 0, 0), 'back where it was before'
+    assert made.at(round(1.3 * SECOND), 1.0) == Pose2(0.2, 0, 0)
+
+
+def test_a_correction_costs_the_readings_of_one_stamp() -> None:
+    made = history(*((0.1 * k, Pose2(0.1 * k + (50.0 if k >= 5 else 0.0), 0, 0)) for k in range(10)))
+    found = [made.at(round(0.1 * k * SECOND), 1.0) for k in range(10)]
+    assert [k for k, pose in enumerate(found) if pose == 'pose_jump'] == [5]
+
+
+def test_the_first_pose_is_taken_as_it_is() -> None:
+    made = history((1.0, Pose2(600, 0, 0)), (1.1, Pose2(0, 0, 0)), (1.2, Pose2(0.1, 0, 0)))
+    assert made.at(SECOND, 1.0) == Pose2(600, 0, 0)
+    assert made.at(round(1.1 * SECOND), 1.0) == 'pose_jump'
+    assert made.at(round(1.2 * SECOND), 1.0) == Pose2(0.1, 0, 0)
+
+
+def test_a_turn_over_a_right_angle_goes_the_same_way() -> None:
+    assert interpolate(Pose2(0, 0, 0.0), Pose2(0, 0, 3.0), 0.5).yaw == pytest.approx(1.5)
+    assert interpolate(Pose2(0, 0, 0.0), Pose2(0, 0, -3.0), 0.5).yaw == pytest.approx(-1.5)
+
+
 def test_old_poses_go() -> None:
+    """By halves, the latest of more than `HISTORY` stays, and each stamp keeps its pose."""
     made = PoseHistory()
+    longest = 0
     for k in range(MOST_POSES + 1):
         made.add(k, Pose2(k, 0, 0))
         made.trim()
-    assert len(made) <= MOST_POSES // 2 + 3
-    made = history(*((10.0 * k, Pose2(k, 0, 0)) for k in range(200)))
-    made.trim()
-    assert len(made) * 10 * SECOND <= HISTORY + 20 * SECOND
+        longest = max(longest, len(made))
+    assert longest == MOST_POSES - 1
+    first = MOST_POSES // 2 - 1
+    assert len(made) == MOST_POSES + 1 - first
+    assert made.at(first, 1.0) == Pose2(first, 0, 0)
+    assert made.at(first - 1, 1.0) == 'before_odometry'
+
+    made = PoseHistory()
+    for k in range(200):
+        made.add(10 * k * SECOND, Pose2(k, 0, 0))
+        made.trim()
+        oldest = 10 * k * SECOND - HISTORY
+        if oldest > 0:
+            assert made.at(oldest, 10.0) == Pose2(k - 60, 0, 0)
+        assert len(made) <= 2 * FEWEST + 2
     assert made.newest == 1990 * SECOND
+    assert made.at(100 * SECOND, 10.0) == 'before_odometry'
+
+
+def test_few_poses_are_kept_however_old() -> None:
+    made = history(*((100.0 * k, Pose2(k, 0, 0)) for k in range(FEWEST + 1)))
+    made.trim()
+    assert len(made) == FEWEST + 1
+    made.add(100 * (FEWEST + 20) * SECOND, Pose2(0, 0, 0))
+    made.trim()
+    assert len(made) == 2
+
+
+def test_what_a_robot_may_do_at_most() -> None:
+    farthest = STRIDE + 2 * FASTEST
+    made = history((1.0, Pose2(0, 0, 0)), (3.0, Pose2(farthest, 0, 0)), (5.0, Pose2(2 * farthest + 0.1, 0, 0)))
+    assert made.at(2 * SECOND, 2.0) == Pose2(farthest / 2, 0, 0)
+    assert made.at(4 * SECOND, 2.0) == 'pose_jump'
+    assert (FASTEST, STRIDE, HISTORY) == (100.0, 1.0, 600 * SECOND)
+
+
+def test_a_wild_pose_is_undone_by_the_next_of_its_stamp() -> None:
+    made = history((1.0, Pose2(0, 0, 0)), (1.1, Pose2(900, 0, 0)), (1.1, Pose2(0.1, 0, 0)))
+    assert (len(made), made.at(round(1.1 * SECOND), 1.0)) == (2, Pose2(0.1, 0, 0))
+    # three that agree with each other, after a correction
+    made = history(*((1.0 + 0.1 * k, Pose2(50.0 * (k > 2), 0, 0)) for k in range(6)))
+    assert made.at(round(1.3 * SECOND), 1.0) == 'pose_jump'
+    assert made.at(round(1.4 * SECOND), 1.0) == Pose2(50, 0, 0)
+    # two wild poses, then back: those before them are too long ago
+    made = history(*((1.0 + 0.1 * k, Pose2(50.0 * (k in (1, 2)) * k, 0, 0)) for k in range(5)))
+    assert made.at(round(1.3 * SECOND), 1.0) == 'pose_jump'
+    assert made.at(round(1.4 * SECOND), 1.0) == Pose2(0, 0, 0)

@@ -25,3 +25,24 @@ def test_points_are_a_step_apart_again_after_clearing() -> None:
     for x in (0.0, 0.9 * STEP, 1.1 * STEP):
         path.extend((x, 0.0))
     assert path.points == [(0.0, 0.0), (1.1 * STEP, 0.0)]
+
+
+def test_every_other_point_goes_when_there_are_too_many() -> None:
+    path = RobotPath()
+    for k in range(MOST_POINTS):
+        path.extend((1.0 * k, 2.0))
+    assert len(path.points) == MOST_POINTS
+    path.extend((1.0 * MOST_POINTS, 2.0))
+    assert path.points == [(1.0 * k, 2.0) for k in range(0, MOST_POINTS + 1, 2)]
+    last = 1.0 * MOST_POINTS
+    for x in (last + 1.9 * STEP, last + 2.1 * STEP):
+        path.extend((x, 2.0))
+    assert path.points[-2:] == [(last, 2.0), (last + 2.1 * STEP, 2.0)], 'the step is twice as long'
+
+
+def test_a_point_is_farther_than_a_step_from_the_last() -> None:
+    path = RobotPath()
+    for point in ((0.0, 0.0), (STEP, 0.0), (0.8 * STEP, 0.8 * STEP), (0.8 * STEP, 0.1 * STEP), (0.8 * STEP, -STEP)):
+        path.extend(point)
+    assert path.points == [(0.0, 0.0), (0.8 * STEP, 0.8 * STEP), (0.8 * STEP, -STEP)]
+    assert STEP == 0.05

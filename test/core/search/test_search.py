@@ -230,7 +230,7 @@ def test_the_search_finds_the_best_map_of_all_mostly(record_property: object) ->
         assert found <= best + 1e-9
         reached += found > best - 1e-3
         lost.append(best - found)
-    record_property('share_of_optima_reached', reached / cases)
+    record_property('share_of_optima_reached', float(reached / cases))
     print(f'\nthe best of all maps was reached in {reached} of {cases} cases; largest shortfall {max(lost):.2f} nats')
     assert reached >= 0.7 * cases
 

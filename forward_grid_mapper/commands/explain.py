@@ -1,0 +1,143 @@
+"""`explain`: why a cell of a map is what it is, reading by reading, in words."""
+
+from __future__ import annotations
+
+import argparse
+import math
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core.common.errors import InputError
+from ..core.common.readings import Readings
+from ..core.maps.cell_evidence import CellEvidence, cell_evidence
+from ..core.messages.message_types import NANOSECONDS
+from ..files.map_archive import MapArchive, read_npz
+from ..files.reading_archive import read_readings
+from .console import run
+
+COMMAND = 'explain'
+STATES = {1: 'occupied', 0: 'free', -1: 'not observed'}
+SHOWN = 5
+
+
+def parser() -> argparse.ArgumentParser:
+    """Return the parser of the command line."""
+    made = argparse.ArgumentParser(
+        COMMAND,
+        description='Say why a cell of the maximum likelihood map is what it is: which readings speak for an obstacle '
+        'there and which against it, by how much, and what would change it.',
+        epilog='example: explain MY_BAG_maps 1.75 -0.4',
+    )
+    made.add_argument('maps', metavar='MAPS', help='folder that process_bag or save_maps wrote')
+    made.add_argument('x', type=float, help='in the map frame, metres')
+    made.add_argument('y', type=float)
+    made.add_argument(
+        '-n', '--readings', type=int, default=SHOWN, metavar='N', help=f'readings to list (default {SHOWN})'
+    )
+    return made
+
+
+def explain(options: argparse.Namespace) -> int:
+    """Do what the command line asks for."""
+    folder = Path(options.maps)
+    maps = read_npz(folder / 'maps.npz')
+    readings, normals = read_readings(folder / 'readings.npz', maps.grid, maps.parameters)
+    left, right, bottom, top = maps.grid.extent
+    if not (left <= options.x < right and bottom <= options.y < top):
+        raise InputError(
+            f'({options.x:g}, {options.y:g}) is not on the map, which spans x = {left:.2f} … {right:.2f} m and '
+            f'y = {bottom:.2f} … {top:.2f} m'
+        )
+    found = cell_evidence(readings, maps.grid, maps.ml, maps.parameters, normals, (options.x, options.y))
+    print('\n'.join(explanation(maps, readings, found, max(options.readings, 0))))
+    return 0
+
+
+def explanation(maps: MapArchive, readings: Readings, found: CellEvidence, shown: int = SHOWN) -> Iterator[str]:
+    """Yield the lines of the explanation."""
+    cell, state = (found.row, found.column), int(maps.ml[found.row, found.column])
+    x, y = (values[k] for values, k in zip(maps.grid.centers(), reversed(cell), strict=True))
+    yield f'cell at x = {x:.2f} m, y = {y:.2f} m (row {found.row}, column {found.column}): {STATES[state]}'
+    yield f'  obstacle: {_percent(maps.uncertainty[cell])} (uncertainty map), {_percent(maps.live[cell])} (live map)'
+    count = len(found.readings)
+    yield f'  {_nats(found.data)} nats from {count} readings, {_nats(found.prior)} from the prior of walls'
+    groups = (
+        ('end here', found.ends_here),
+        ('reach farther', ~found.ends_here & ~found.silent & (_range(readings, found) > found.distance)),
+        ('heard no echo', found.silent),
+        ('end before it', ~found.ends_here & ~found.silent & (_range(readings, found) <= found.distance)),
+    )
+    for text, mask in groups:
+        if mask.any():
+            who = _sensors(readings, found.readings[mask])
+            yield f'    {_nats(found.nats[mask].sum()):>7}  {int(mask.sum())} readings {text}: {who}'
+    if state == 1:
+        yield f'  {_nats(found.wall)} nats for the cell with its occupied neighbours, which share their readings'
+    yield f'  {_what_decides(maps, found, state)}'
+    if shown and count:
+        yield ''
+        yield f'  {"nats":>7}  {"range":>8}  {"cell at":>8}  {"stamp":>19}  sensor'
+    for k in range(min(shown, count)):
+        i = found.readings[k]
+        z = 'no echo' if found.silent[k] else f'{readings.z[i]:.2f} m'
+        stamp = f'{readings.stamp[i] / NANOSECONDS:.3f} s'
+        yield f'  {_nats(found.nats[k], 2):>7}  {z:>8}  {found.distance[k]:6.2f} m  {stamp:>19}  {_name(readings, i)}'
+
+
+def _range(readings: Readings, found: CellEvidence) -> NDArray[np.float64]:
+    return readings.z[found.readings]
+
+
+def _nats(value: float, digits: int = 1) -> str:
+    """Return nats with their sign; what rounds to nothing has none to speak of."""
+    return f'{round(float(value), digits) + 0.0:+.{digits}f}'
+
+
+def _percent(probability: float) -> str:
+    return 'unknown' if math.isnan(probability) else f'{probability:.0%}'
+
+
+def _name(readings: Readings, i: int) -> str:
+    return (readings.sensor_names or ('',))[readings.sensor[i]] or 'a sensor without a name'
+
+
+def _sensors(readings: Readings, which: NDArray[np.int64]) -> str:
+    """Return the sensors of some readings, those with most readings first."""
+    counts = Counter(_name(readings, int(i)) for i in which)
+    named = [name if n == 1 else f'{name} ({n})' for name, n in counts.most_common(SHOWN)]
+    more = f' and {len(counts) - SHOWN} more' if len(counts) > SHOWN else ''
+    return ', '.join(named) + more
+
+
+def _what_decides(maps: MapArchive, found: CellEvidence, state: int) -> str:
+    """Say in one sentence what made the cell what it is, and what would make it something else."""
+    total = found.data + found.prior
+    if found.traversed:
+        return 'a sensor was moved over it, so it is free whatever the readings say'
+    if not len(found.readings):
+        return 'no reading says anything of it'
+    if state < 0:
+        return (
+            f'too little is known: fewer than {maps.parameters.search.least_passed:g} readings are expected to have '
+            f'passed through it, and nothing makes it occupied'
+        )
+    if (total > 0) != (state == 1):
+        return (
+            'by itself it would be the other way: it belongs to a wall that is closed, drawn out or removed as a whole'
+        )
+    against = found.nats[(found.nats < 0) if state == 1 else (found.nats > 0)]
+    typical = float(np.abs(against).max(initial=0.0))
+    other = STATES[1 - state]
+    if typical > 0:
+        more = math.ceil(abs(total) / typical)
+        return f'to be {other} it takes {abs(total):.1f} nats more: {more} more readings like the strongest against it'
+    return f'to be {other} it takes {abs(total):.1f} nats; so far no reading says so'
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command; return its exit code."""
+    return run(parser(), explain, arguments)

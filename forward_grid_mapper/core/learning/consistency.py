@@ -1,0 +1,300 @@
+"""What contradicts the readings: extrinsics or odometry mirrored, turned or out of scale, cones too wide, stamps late.
+
+Such input gives a map without any error, only a wrong one. But each of these faults can be undone: mirrored sensors
+are mirrored back, stamps are shifted back. So a small map is made of a stretch of the drive for each assumed fault,
+with the fault undone, and all are compared with the map of the readings as they are. Of a sound drive, no map with a
+fault undone explains the readings better.
+
+Poses and cones are changed, never ranges, so the likelihoods of all these maps can be compared. Ranges that are too
+large by a factor look like odometry that is too small by it.
+
+The cost is that of some twenty maps of at most `MOST` readings each, whatever the length of the drive.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from operator import itemgetter
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..common.errors import InputError
+from ..common.parameters import Parameters
+from ..common.readings import Floats, Readings, in_canonical_order
+from ..evidence.evidence import Evidence
+from ..maps.log_odds_map import map_grid
+from ..maps.traversed import traversed_cells
+from ..messages.message_types import NANOSECONDS, Pose2
+from ..runtime.memory import memory_for_pairs
+from ..runtime.threads import cores
+from ..search.search import Search
+
+MOST, ENOUGH = 800, 300
+"""Readings of the stretch that is mapped, and those below which nothing is said."""
+
+CELL, REACH = 0.1, 60.0
+"""Metres of a cell of these maps at least, and the cells that most ranges reach at most: they bound the cost."""
+
+GAIN = 0.1
+"""Nats a reading by which the map with a fault undone must be better. Of sound drives, none is by more than .05."""
+
+LEAST_SHIFT, SHIFT_GAIN = 0.2, 0.15
+"""Seconds by which the stamps of real sensors may be late, and nats that a shift by so little must gain; in a sound
+drive it gains .11 at the most."""
+
+TOTAL = 50.0
+"""Nats by which it must be better altogether."""
+
+SHIFTS = (LEAST_SHIFT, 0.5, 1.0)
+"""Seconds by which stamps are shifted, either way."""
+
+FACTORS = (0.3048, 0.5, 2.0, 3.281)
+"""Scales of odometry: feet, and a wheel's radius taken for its diameter, both ways."""
+
+WIDTHS = (0.25, 0.5, 2.0, 3.0)
+"""By how much the field of view is wider than stated."""
+
+WIDEST = 1.5
+"""Radians of half a field of view, at most."""
+
+STEP = 0.05
+"""Metres of driving in which the direction of travel is measured."""
+
+STEPS = 40
+"""Such steps from which on directions of travel are looked at."""
+
+ALIGNED, AWRY = 0.9, 0.7
+"""Mean resultant lengths: at least that of angles that are one and the same, at most that of angles that are not."""
+
+SAME_YAW = 0.01
+"""Radians within which the yaw of odometry never changes."""
+
+REP_103 = 'REP 103 has x forward, y to the left and yaw counter-clockwise'
+
+
+@dataclass(frozen=True)
+class _Drive:
+    """Readings with the robot's pose at each of them, by stamp.
+
+    `robot` and `extrinsics` have shape (3, N): x, y in metres and yaw in radians, of the robot in the map frame and of
+    the sensor in the robot's.
+    """
+
+    readings: Readings
+    robot: Floats
+    extrinsics: Floats
+
+    def part(self, which: slice) -> _Drive:
+        return _Drive(self.readings.select(which), self.robot[:, which], self.extrinsics[:, which])
+
+    def placed(self, robot: Floats | None = None, extrinsics: Floats | None = None) -> Readings:
+        """Return the readings with other poses of the robot, or of the sensors on it."""
+        x, y, yaw = self.robot if robot is None else robot
+        forward, left, turn = self.extrinsics if extrinsics is None else extrinsics
+        cos, sin = np.cos(yaw), np.sin(yaw)
+        return replace(
+            self.readings, x=x + cos * forward - sin * left, y=y + sin * forward + cos * left, yaw=yaw + turn
+        )
+
+    def robot_at(self, seconds: float) -> Floats:
+        """Return the robot's poses so many seconds after the stamps, shape (3, N)."""
+        stamp = (self.readings.stamp - self.readings.stamp[0]) / NANOSECONDS
+        known, first = np.unique(stamp, return_index=True)
+        columns = (self.robot[0], self.robot[1], np.unwrap(self.robot[2]))
+        return np.stack([np.interp(stamp + seconds, known, column[first]) for column in columns])
+
+
+def consistency_warnings(
+    readings: Readings, extrinsics: Mapping[str, Pose2], parameters: Parameters | None = None
+) -> list[str]:
+    """Return what is wrong with poses, stamps or cones of readings; empty if nothing seems to be.
+
+    Parameters
+    ----------
+    readings : Readings
+    extrinsics : mapping
+        Fixed poses of the sensors on the robot, by `sensor_names`; sensors without one are left out.
+    parameters : Parameters, optional
+
+    Notes
+    -----
+    A drive straight ahead says nothing of left and right, and a slow one little of stamps.
+    """
+    drive = _drive(readings, extrinsics)
+    if drive is None:
+        return []
+    if told := _axes(drive):
+        return [told]
+    drive = _stretch(drive)
+    p = _coarse(parameters or Parameters(), drive.readings)
+    count, given = len(drive.readings), _objective(drive.readings, p)
+    gains = (((_objective(fault.undone, p) - given) / count, fault) for fault in _faults(drive))
+    gain, fault = max(gains, key=itemgetter(0))
+    if gain < max(fault.least, TOTAL / count):
+        return []
+    return [f'{fault.told} (with this undone, a map explains {count} readings better by {gain:.2f} nats each)']
+
+
+def _drive(readings: Readings, extrinsics: Mapping[str, Pose2]) -> _Drive | None:
+    """Return the readings of known sensors by stamp, with the poses of the robot; None if there are too few."""
+    known = np.array([name in extrinsics for name in readings.sensor_names] or [False])
+    chosen = np.flatnonzero(known[readings.sensor])
+    if len(chosen) < ENOUGH:
+        return None
+    readings = readings.select(chosen[np.argsort(readings.stamp[chosen], kind='stable')])
+    nowhere = Pose2(0.0, 0.0, 0.0)
+    table = np.array([extrinsics.get(name, nowhere) for name in readings.sensor_names], np.float64)
+    forward, left, turn = mounted = table[readings.sensor].T
+    yaw = readings.yaw - turn
+    cos, sin = np.cos(yaw), np.sin(yaw)
+    robot = np.stack([readings.x - cos * forward + sin * left, readings.y - sin * forward - cos * left, yaw])
+    return _Drive(readings, robot, mounted)
+
+
+def _stretch(drive: _Drive) -> _Drive:
+    """Return the stretch of `MOST` readings with the most driving and turning, where wrong poses show most."""
+    count = len(drive.readings)
+    if count <= MOST:
+        return drive
+    x, y, yaw = drive.robot
+    moved = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(x), np.diff(y)) + np.abs(np.diff(np.unwrap(yaw))))])
+    # turns that are seen in the path alone count as well
+    at, directions = _travel(drive)
+    if len(at) > 1:
+        turns = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(np.unwrap(directions))))])
+        moved += np.interp(np.arange(count), at, turns)
+    first = int(np.argmax(moved[MOST - 1 :] - moved[: count - MOST + 1]))
+    return drive.part(slice(first, first + MOST))
+
+
+def _coarse(parameters: Parameters, readings: Readings) -> Parameters:
+    """Return the parameters of the small maps: of coarse cells where ranges are long."""
+    reach = float(np.quantile(readings.z, 0.9))
+    cell = max(parameters.grid.resolution, CELL, reach / REACH)
+    return replace(parameters, grid=replace(parameters.grid, resolution=cell))
+
+
+def _objective(readings: Readings, parameters: Parameters) -> float:
+    """Return the objective of the map of some readings, as the search leaves it; -inf if the map would be too large."""
+    readings = in_canonical_order(readings)
+    try:
+        grid = map_grid(readings, parameters)
+    except InputError:
+        return -math.inf
+    search = parameters.search
+    evidence = Evidence(grid, parameters.model, memory_for_pairs(parameters), search.threads or cores())
+    evidence.extend(readings)
+    found = Search(evidence, search, traversed_cells(readings, grid).ravel()).run(lambda progress: None)
+    return float(evidence.tempered_log_likelihood + found.log_prior)
+
+
+class _Fault(NamedTuple):
+    """What may be wrong: the text that says so, the readings with it undone, and the least gain that tells."""
+
+    told: str
+    undone: Readings
+    least: float = GAIN
+
+
+def _faults(drive: _Drive) -> Iterator[_Fault]:
+    """Yield every fault that may be."""
+    yield from _of_axes(drive)
+    x, y, yaw = drive.robot
+    for factor in FACTORS:
+        much = f'{factor:.3g} times as far as' if factor > 1 else f'1/{1 / factor:.3g} as far as'
+        yield _Fault(
+            f'by the readings the robot drives {much} odometry says; are odometry or ranges in feet, or is the radius '
+            f'of the wheels wrong? Correct the driver: messages must state metres',
+            drive.placed(robot=np.stack([factor * x, factor * y, yaw])),
+        )
+    for width in WIDTHS:
+        half = np.minimum(width * drive.readings.half_angle, WIDEST)
+        stated, fitting = (round(math.degrees(2 * float(np.median(h)))) for h in (drive.readings.half_angle, half))
+        yield _Fault(
+            f'the field of view is stated as {stated} degrees, and the readings look as if it were about {fitting}; '
+            f'is it half of the angle, or twice? Correct the driver, or set the parameter field_of_view',
+            replace(drive.readings, half_angle=half),
+        )
+    for shift in SHIFTS:
+        for sign, word in ((-1, 'late'), (1, 'early')):
+            yield _Fault(
+                f'the stamps of the readings seem to be about {shift:g} s {word} against those of odometry; drivers '
+                f'must stamp a reading when it is measured, by one clock',
+                drive.placed(robot=drive.robot_at(sign * shift)),
+                SHIFT_GAIN if shift == LEAST_SHIFT else GAIN,
+            )
+
+
+def _of_axes(drive: _Drive) -> Iterator[_Fault]:
+    """Yield the faults of signs and axes."""
+    x, y, yaw = drive.robot
+    forward, left, turn = drive.extrinsics
+    check = 'check the poses of the sensors on the robot (parameters, --sensor or transforms)'
+    yield _Fault(
+        f'left and right of the sensors seem to be swapped; {check}, or the signs of y and yaw in odometry. {REP_103}',
+        drive.placed(extrinsics=np.stack([forward, -left, -turn])),
+    )
+    yield _Fault(
+        f'the yaw of the sensors seems to have the wrong sign; {check}. {REP_103}',
+        drive.placed(extrinsics=np.stack([forward, left, -turn])),
+    )
+    yield _Fault(
+        f'y or yaw of odometry seems to have the wrong sign; correct its driver. {REP_103}',
+        drive.placed(robot=np.stack([x, y, -yaw])),
+    )
+    for degrees, word in ((90, ' to the left'), (-90, ' to the right'), (180, '')):
+        angle = math.radians(-degrees)
+        cos, sin = math.cos(angle), math.sin(angle)
+        by = f'{abs(degrees)} degrees{word}'
+        yield _Fault(
+            f'the sensors seem to be turned by {by}; {check}, or the axes of odometry. {REP_103}',
+            drive.placed(extrinsics=np.stack([cos * forward - sin * left, sin * forward + cos * left, turn + angle])),
+        )
+    at, directions = _travel(drive)
+    if np.ptp(yaw) < SAME_YAW and len(at) >= 2:
+        yield _Fault(
+            'the yaw of odometry never changes, though the robot turns as it drives; is the orientation left out? '
+            'Correct the driver',
+            drive.placed(robot=np.stack([x, y, np.interp(np.arange(len(x)), at, np.unwrap(directions))])),
+        )
+
+
+def _travel(drive: _Drive) -> tuple[NDArray[np.int64], Floats]:
+    """Return numbers of readings between which the robot drove `STEP`, and its direction of travel there, radians."""
+    x, y, _ = drive.robot
+    driven = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(x), np.diff(y)))])
+    at = np.unique(np.searchsorted(driven, np.arange(STEP, driven[-1], STEP)))
+    return at[:-1], np.arctan2(np.diff(y[at]), np.diff(x[at]))
+
+
+def _axes(drive: _Drive) -> str:
+    """Compare the direction of travel with the yaw: where they turn against each other, an axis is wrong.
+
+    A robot drives the way it looks, or backwards, or, if it is a special one, anywhere. None drives to the right
+    whenever it looks to the left, and to the left whenever it looks to the right.
+    """
+    at, directions = _travel(drive)
+    if len(at) < STEPS:
+        return ''
+    yaw = drive.robot[2, at]
+    # doubled angles, of which backwards is the same as forwards, tell nothing where all walls are at right angles
+    for times in (1, 2):
+        with_yaw = abs(np.mean(np.exp(1j * times * (directions - yaw))))
+        against_yaw = np.mean(np.exp(1j * times * (directions + yaw)))
+        if abs(against_yaw) >= ALIGNED and with_yaw <= AWRY:
+            break
+    else:
+        return ''
+    angle = abs(np.angle(against_yaw)) / times
+    if math.pi / 4 < angle < 3 * math.pi / 4:
+        cause = 'x and y seem to be swapped'
+    else:
+        cause = 'y, or yaw, seems to have the wrong sign' if angle < math.pi / 4 else 'x seems to have the wrong sign'
+    return (
+        f'odometry turns to one side and drives to the other: {cause} in it. {REP_103}; correct its driver, or choose '
+        f'another odometry topic'
+    )

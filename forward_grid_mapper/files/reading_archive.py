@@ -1,0 +1,79 @@
+"""`readings.npz`: the readings that maps were made from, so that a map can be asked for its reasons."""
+
+from __future__ import annotations
+
+import io
+from dataclasses import fields
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from ..core.common.errors import InputError
+from ..core.common.grid import Grid
+from ..core.common.parameters import Parameters
+from ..core.common.readings import Readings
+from ..core.maps.map_set import MapSet
+from ..core.sensor.surface_normals import SurfaceNormals, known_normals, no_normals
+from .output_folder import output_errors
+
+COLUMNS = tuple(field.name for field in fields(Readings) if field.name != 'sensor_names')
+
+
+class ReadingArchive(NamedTuple):
+    """What `readings.npz` holds."""
+
+    readings: Readings
+    normals: SurfaceNormals
+
+
+def write_readings(path: Path | str, maps: MapSet) -> None:
+    """Write the readings and the surface normals of a map as compressed arrays, none of them pickled.
+
+    The names are those of `Readings`: metres, radians, nanoseconds, in the map frame; `sensor_names` is what `sensor`
+    counts. `normals` is float32, shape (2, height, width): unit vectors along the normals, 0 where none is known.
+
+    Raises
+    ------
+    OutputError
+        If the file cannot be written.
+    """
+    path = Path(path)
+    known = len(maps.normals.known) > 0
+    normals = np.stack([maps.normals.x, maps.normals.y]) if known else np.zeros((2, maps.grid.size), np.float32)
+    packed = io.BytesIO()
+    np.savez_compressed(
+        packed,
+        **{name: getattr(maps.readings, name) for name in COLUMNS},
+        sensor_names=np.array(maps.readings.sensor_names or ('',)),
+        normals=normals.reshape(2, *maps.grid.shape),
+    )
+    with output_errors(path):
+        path.write_bytes(packed.getvalue())
+
+
+def read_readings(path: Path | str, grid: Grid, parameters: Parameters) -> ReadingArchive:
+    """Read what `write_readings` wrote beside the maps of a grid.
+
+    Raises
+    ------
+    InputError
+        If the file is missing, damaged, something else or of other maps.
+    """
+    path = Path(path)
+    try:
+        with path.open('rb') as file, np.load(file, allow_pickle=False) as data:
+            names = tuple(str(name) for name in data['sensor_names'])
+            readings = Readings.from_columns(names, **{name: data[name] for name in COLUMNS})
+            x, y = data['normals']
+    except FileNotFoundError as error:
+        raise InputError(f'{path} does not exist: the maps were made by an earlier version; make them anew') from error
+    except Exception as error:  # zipfile, zlib and numpy have many kinds for damaged bytes
+        raise InputError(f'{path} is not an archive of readings, or is damaged: {error}') from error
+    if x.shape != grid.shape or not (
+        0 <= readings.sensor.min(initial=0) <= readings.sensor.max(initial=0) < len(names)
+    ):
+        raise InputError(f'{path} is not of the maps beside it')
+    known = ((x != 0) | (y != 0)).astype(np.uint8)
+    found = known_normals(known, x, y, parameters.model.max_incidence_angle) if known.any() else no_normals()
+    return ReadingArchive(readings, found)

@@ -1,0 +1,247 @@
+"""Mapping without ROS: arrays of poses and ranges become the three maps, by the code of the node and of the bags."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from .core.common.errors import InputError
+from .core.common.parameters import Parameters
+from .core.learning.input_warnings import input_warnings
+from .core.mapping import Mapper, Watch
+from .core.maps.map_set import MapSet
+from .core.messages.message_types import NANOSECONDS, OdometryMessage, Pose2, RangeMessage
+from .core.messages.pose_association import PoseAssociator
+from .core.messages.quaternions import yaw_of
+from .core.messages.rep117 import REASONS
+from .files.quality_warning import quality_warning
+from .files.results import write_results
+
+__all__ = ['Sonar', 'SonarMaps', 'make_maps', 'poses_from_tum']
+
+_TUM_COLUMNS = 8
+
+
+@dataclass(frozen=True)
+class Sonar:
+    """One sensor: where it sits on the robot, and what its data sheet says.
+
+    Attributes
+    ----------
+    x, y : float
+        Of the sensor in the robot's base frame (REP 103: x ahead, y to the left), metres.
+    yaw : float
+        Where it looks, radians, counter-clockwise from x.
+    field_of_view : float
+        The full angle of its cone, radians.
+    max_range, min_range : float
+        Metres. A range that is infinite, or not below `max_range`, says that nothing returned an echo.
+    """
+
+    x: float
+    y: float
+    yaw: float
+    field_of_view: float
+    max_range: float
+    min_range: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not all(map(math.isfinite, (self.x, self.y, self.yaw, self.max_range, self.min_range))):
+            raise InputError(f'{self}: pose and limits must be finite')
+        if not 0.0 < self.field_of_view < math.pi:
+            degrees = f'; did you mean radians({self.field_of_view:g})?' if 0 < self.field_of_view < 180 else ''
+            raise InputError(f'field_of_view = {self.field_of_view:g} is no angle between 0 and pi rad{degrees}')
+        if not 0.0 <= self.min_range < self.max_range:
+            raise InputError(f'min_range = {self.min_range:g} m and max_range = {self.max_range:g} m leave no range')
+
+
+@dataclass(frozen=True)
+class SonarMaps:
+    """What `make_maps` returns.
+
+    Attributes
+    ----------
+    maps : MapSet
+        The three maps, `maps.live`, `maps.ml` and `maps.uncertainty`, on the grid `maps.grid`.
+    received : int
+        Ranges given.
+    rejected : dict of str to int
+        How many of them were not used, by reason (`core.messages.rep117.REASONS` has them in words).
+    warnings : tuple of str
+        What is wrong with the input although it raises no error, and what to do about it.
+    path : float64, shape (P, 2)
+        Where the robot drove, metres.
+    """
+
+    maps: MapSet
+    received: int
+    rejected: dict[str, int]
+    warnings: tuple[str, ...]
+    path: NDArray[np.float64]
+
+    def save(self, folder: Path | str, title: str = 'Sonar maps') -> dict[str, Any]:
+        """Write maps for map_server, archive, picture and report into a new folder; return the report.
+
+        Raises
+        ------
+        OutputError
+            If the folder exists, or cannot be written.
+        """
+        counts = {'received': self.received, 'accepted': len(self.maps.readings), 'rejected': self.rejected}
+        return write_results(folder, self.maps, {'counts': counts}, self.path, title)
+
+
+def _column(name: str, values: ArrayLike, length: int | None = None) -> NDArray[np.float64]:
+    """Return numbers as float64, shape (length,)."""
+    try:
+        column = np.asarray(values, np.float64)
+    except (TypeError, ValueError) as error:
+        raise InputError(f'{name} must be numbers: {error}') from None
+    if column.ndim != 1 or (length is not None and len(column) != length):
+        wanted = '(N,)' if length is None else f'({length},)'
+        raise InputError(f'{name} has the shape {column.shape}, not {wanted}')
+    return column
+
+
+def _stamps(name: str, values: ArrayLike, length: int | None = None) -> NDArray[np.int64]:
+    """Return stamps in nanoseconds."""
+    seconds = _column(name, values, length)
+    if not np.isfinite(seconds).all() or (np.abs(seconds) > 2**62 / NANOSECONDS).any():
+        raise InputError(f'{name} must be seconds, all finite; nanoseconds must be divided by 1e9')
+    return np.round(seconds * NANOSECONDS).astype(np.int64)
+
+
+def _poses(stamps: NDArray[np.int64], poses: ArrayLike) -> list[OdometryMessage]:
+    try:
+        array = np.asarray(poses, np.float64)
+    except (TypeError, ValueError) as error:
+        raise InputError(f'poses must be numbers: {error}') from None
+    if array.shape != (len(stamps), 3):
+        raise InputError(f'poses has the shape {array.shape}, not ({len(stamps)}, 3): x, y and yaw of each stamp')
+    if not np.isfinite(array).all():
+        raise InputError(f'{int((~np.isfinite(array)).any(axis=1).sum())} poses are not finite; leave them out')
+    order = np.argsort(stamps, kind='stable')
+    rows = zip(stamps[order].tolist(), array[order].tolist(), strict=True)
+    return [OdometryMessage(stamp, 'map', 'base', Pose2(*row)) for stamp, row in rows]
+
+
+def make_maps(
+    pose_stamps: ArrayLike,
+    poses: ArrayLike,
+    range_stamps: ArrayLike,
+    ranges: ArrayLike,
+    sensors: Mapping[str, Sonar],
+    sensor_of: Sequence[str] | str,
+    parameters: Mapping[str, Any] | None = None,
+    watch: Watch = lambda stage, progress: None,
+) -> SonarMaps:
+    """Map what sonars on a robot measured.
+
+    Poses between two stamps are interpolated. Ranges are taken as in REP 117: +inf, or at least `max_range`, is "no
+    echo", NaN and what is below `min_range` is rejected and counted.
+
+    Parameters
+    ----------
+    pose_stamps : float, shape (M,)
+        Seconds, of any clock that the ranges share, in any order.
+    poses : float, shape (M, 3)
+        x and y of the robot's base in metres and its yaw in radians, in the map frame (REP 103).
+    range_stamps : float, shape (N,)
+        Seconds.
+    ranges : float, shape (N,)
+        Metres.
+    sensors : mapping of str to Sonar
+    sensor_of : str or sequence of str, length N
+        The name of the sensor of each range, or of all.
+    parameters : mapping, optional
+        Values of `docs/parameters.md` by name, such as `{'resolution': 0.05}`.
+    watch : callable, optional
+        Called with stage and progress as the work goes on, by `core.mapping.Mapper.run`.
+
+    Returns
+    -------
+    SonarMaps
+
+    Raises
+    ------
+    InputError
+        If shapes, units or names make no sense, or not a single range could be used; says why.
+    ParameterError
+        For an unknown name or a value out of range.
+    """
+    chosen = Parameters.from_flat(parameters or {})
+    odometry = _poses(_stamps('pose_stamps', pose_stamps), poses)
+    stamps = _stamps('range_stamps', range_stamps)
+    values = _column('ranges', ranges, len(stamps))
+    names = [sensor_of] * len(values) if isinstance(sensor_of, str) else [str(name) for name in sensor_of]
+    if len(names) != len(values):
+        raise InputError(f'sensor_of has {len(names)} names for {len(values)} ranges')
+    if unknown := sorted(set(names) - set(sensors)):
+        raise InputError(f'no sensor is called {", ".join(unknown[:6])}; there are: {", ".join(sorted(sensors))}')
+    if not odometry or not len(values):
+        raise InputError(f'there are {len(odometry)} poses and {len(values)} ranges; it takes some of both')
+    mounted = {name: Pose2(s.x, s.y, s.yaw) for name, s in sensors.items()}
+    associator = PoseAssociator(lambda base, frame, stamp: mounted.get(frame), chosen, patient=True)
+    for pose in odometry:
+        associator.add_odometry(pose)
+    for i in np.argsort(stamps, kind='stable').tolist():
+        s = sensors[names[i]]
+        associator.add_range(
+            RangeMessage(int(stamps[i]), names[i], float(values[i]), s.min_range, s.max_range, s.field_of_view)
+        )
+    associator.finish()
+    if not len(associator.buffer):
+        reasons = '; '.join(f'{n} {reason} ({REASONS[reason]})' for reason, n in associator.rejected.most_common())
+        spans = f'poses span {odometry[0].stamp / 1e9:.3f} … {odometry[-1].stamp / 1e9:.3f} s'
+        raise InputError(
+            f'none of {len(values)} ranges could be used: {reasons}; {spans}, ranges '
+            f'{stamps.min() / 1e9:.3f} … {stamps.max() / 1e9:.3f} s'
+        )
+    maps = Mapper(chosen).run(associator.readings, watch)
+    found = [*associator.limits.warnings(), *input_warnings(maps.readings), *filter(None, [quality_warning(maps)])]
+    path = np.array(associator.path, np.float64).reshape(-1, 2)
+    return SonarMaps(maps, associator.received, dict(associator.rejected), tuple(found), path)
+
+
+def poses_from_tum(path: Path | str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Read a trajectory in the format of the TUM benchmark, as evo and most SLAM tools write it.
+
+    Returns
+    -------
+    stamps : float64, shape (M,)
+        Seconds.
+    poses : float64, shape (M, 3)
+        x, y in metres and yaw in radians: the trajectory projected on the plane.
+
+    Raises
+    ------
+    InputError
+        If a line has not the eight numbers `stamp x y z qx qy qz qw`, or no orientation of a robot on a floor.
+    """
+    stamps, poses = [], []
+    try:
+        lines = Path(path).read_text(encoding='utf-8').splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f'{path} cannot be read: {error}') from None
+    for number, line in enumerate(lines, 1):
+        words = line.partition('#')[0].split()
+        if not words:
+            continue
+        try:
+            row = [float(word) for word in words]
+        except ValueError:
+            row = []
+        if len(row) != _TUM_COLUMNS or not all(map(math.isfinite, row)):
+            raise InputError(f'{path}, line {number}: not the eight numbers "stamp x y z qx qy qz qw"')
+        yaw = yaw_of(*row[4:])
+        if yaw is None:
+            raise InputError(f'{path}, line {number}: the quaternion is not normalised, or the robot stands on end')
+        stamps.append(row[0])
+        poses.append((row[1], row[2], yaw))
+    return np.array(stamps), np.array(poses).reshape(-1, 3)

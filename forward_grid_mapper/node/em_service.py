@@ -1,0 +1,155 @@
+"""EM as the node's callers see it: the service run_em, and the maps of the latest run."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+from ..core.common.parameters import Parameters
+from ..core.mapping import Mapper
+from ..core.maps.map_set import MapSet
+from ..core.messages.pose_association import PoseAssociator
+from ..core.messages.reading_buffer import bounded
+from ..files.quality_warning import quality_warning
+from .background import Inbox
+from .deferred import Reply
+from .em import EmWorker, Outcome, Run, summary
+from .kernels import Kernels
+from .map_publishers import MapPublishers
+from .online import OnlineWorker
+from .sensor_status import SensorWatch
+
+
+class EmService:
+    """Runs EM on what was accepted so far, and publishes and keeps what it finds. The executor owns it.
+
+    Attributes
+    ----------
+    maps : MapSet or None
+        Of the latest run since the last reset.
+    explained : int
+        Readings that had been accepted when it began.
+    last_run : str
+        How the last run ended.
+    wrong_input : list of str
+        What is wrong with its readings.
+    sensors : SensorWatch
+    online : OnlineWorker or None
+        Gives the map to start from, and takes what was found.
+    """
+
+    def __init__(
+        self,
+        parameters: Callable[[], Parameters],
+        associator: PoseAssociator,
+        publishers: MapPublishers,
+        inbox: Inbox,
+        kernels: Kernels,
+        logger: Any,
+    ) -> None:
+        self.maps: MapSet | None = None
+        self.explained = 0
+        self.last_run = 'none yet'
+        self.wrong_input: list[str] = []
+        self.sensors = SensorWatch()
+        self.online: OnlineWorker | None = None
+        self._parameters, self._associator, self._publishers = parameters, associator, publishers
+        self._inbox, self._logger = inbox, logger
+        self._watched = 0.0
+        self._generation = 0
+        self.worker = EmWorker(self._watch, logger.error, inbox.put, lambda stop: kernels.wait('EM', stop))
+
+    @property
+    def current(self) -> Run | None:
+        """The run that goes on, or None."""
+        return self.worker.current
+
+    def run_em(self, reply: Reply) -> None:
+        """Answer the service."""
+        begin = time.monotonic()
+
+        def done(outcome: Outcome) -> None:
+            if outcome.maps is None:
+                reply.send(False, outcome.message)
+            else:
+                reply.send(True, summary(outcome.maps, time.monotonic() - begin))
+
+        run = self.current
+        if run is not None:
+            reply.send(False, f'EM runs already ({run}); call again when it has ended')
+        else:
+            self._start(done)
+
+    def when_there_are_maps(self, done: Callable[[Outcome], object]) -> None:
+        """Have `done` called with the latest maps: at once, when the run that goes on has ended, or after a new one."""
+        run = self.current
+        if self.maps is not None:
+            done(Outcome(self.maps, ''))
+        elif run is not None and not run.cancelled:
+            run.waiting.append(done)
+        elif run is not None:
+            done(Outcome(None, 'EM is being cancelled; call again when it has ended'))
+        else:
+            self._start(done)
+
+    def reset(self) -> None:
+        """Forget the maps, and cancel the run that goes on."""
+        self.worker.cancel()
+        self._generation = self._publishers.generation
+        self.maps, self.wrong_input, self.last_run = None, [], 'none since the reset'
+        self.sensors.clear()
+
+    def close(self, seconds: float) -> None:
+        """Cancel the run that goes on, and wait so long for its end."""
+        self.worker.close(seconds)
+
+    def _start(self, done: Callable[[Outcome], object]) -> None:
+        generation, buffer, bound = self._publishers.generation, self._associator.buffer, self._associator.buffer.bound
+        count, held = len(buffer), buffer.snapshot()
+
+        def found(maps: MapSet) -> None:
+            self._publishers.publish('ml_map', generation, maps.grid, maps.ml)
+            self._publishers.publish('uncertainty_map', generation, maps.grid, maps.uncertainty)
+
+        def finish(outcome: Outcome) -> None:
+            if generation != self._publishers.generation:
+                # whoever waits is told the same
+                outcome.maps, outcome.message = None, 'EM was cancelled by reset'
+            self._finish(outcome, count)
+
+        parameters = self._parameters()
+        start = self.online.so_far() if self.online else None
+        run = Run(Mapper(parameters), parameters, lambda: bounded(held, bound), found, start)
+        self._generation = generation
+        self.worker.start(run, finish)
+        run.waiting.append(done)
+
+    def _finish(self, outcome: Outcome, count: int) -> None:
+        maps = outcome.maps
+        if maps is None:
+            self.last_run = outcome.message
+            self._logger.warning(f'EM: {outcome.message}')
+            return
+        self.maps, self.explained = maps, count
+        self.wrong_input = outcome.warnings
+        self.sensors.take(outcome.health)
+        if self.online:
+            self.online.adopt(maps)
+        for warning in filter(None, [*outcome.warnings, quality_warning(maps)]):
+            self._logger.warning(f'EM: {warning}')
+        self.last_run = summary(maps, sum(maps.statistics['seconds'].values()))
+        self._logger.info(f'EM: {self.last_run}')
+
+    def _watch(self, run: Run) -> None:
+        """Show the map found so far, and the progress, at most `publish_rate` times a second; in the run's thread."""
+        now = time.monotonic()
+        rate = self._parameters().node.publish_rate
+        if run.progress is None or now - max(self._watched, run.begin) < 1.0 / rate:
+            return
+        self._watched = now
+        generation = self._generation
+        found = run.mapper.so_far()
+        if found is not None and not run.cancelled:
+            self._logger.info(f'EM: {run}')
+            self._publishers.publish('ml_map', generation, *found)

@@ -1,0 +1,233 @@
+"""From subscriptions to the associator, in portions, and with an account of what was lost on the way."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+from nav_msgs.msg import Odometry
+from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import Range
+
+from ..core.common.parameters import Parameters
+from ..core.messages.message_types import OdometryMessage, RangeMessage, odometry_message, range_message
+from ..core.messages.pose_association import MOST_WAITING, PoseAssociator
+from .frames import MapFrame
+from .losses import LASTING, Losses
+
+QUEUE = 2000
+"""Messages that may wait for the node in the middleware, so that a pause of a second loses none."""
+
+AT_ONCE = 200
+"""Messages, or readings, after which the executor gets its turn: two milliseconds or so."""
+
+
+class Intake:
+    """Takes messages as they come, or holds them back while the associator is not ready.
+
+    Attributes
+    ----------
+    paused : bool
+    reliable : bool
+        Whether lost messages are a fault, or to be expected.
+    range_losses : list of Losses
+        Of each Range topic.
+    """
+
+    def __init__(
+        self,
+        node: Any,
+        parameters: Parameters,
+        associator: PoseAssociator,
+        map_frame: MapFrame,
+        on_taken: Callable[[int], object],
+    ) -> None:
+        """Subscribe; messages are held back until `begin`.
+
+        Parameters
+        ----------
+        node : Node
+        parameters : Parameters
+        associator : PoseAssociator
+        map_frame : MapFrame
+        on_taken : callable
+            Given the time at which each Range was published, nanoseconds of the system's clock.
+        """
+        own = parameters.node
+        self._node, self._associator, self._map_frame, self._on_taken = node, associator, map_frame, on_taken
+        self.paused = self._ready = False
+        self.reliable = own.range_reliability == 'reliable'
+        self._held: deque[tuple[RangeMessage | OdometryMessage, int, bool]] = deque()
+        self._ranges_held = self._refused = self._told_of = 0
+        self._last_refused: RangeMessage | None = None
+        self._next_warning = 0.0
+        self._more = node.create_guard_condition(self.work)
+        self.subscriptions: dict[str, QoSProfile] = {}
+        self.range_losses: list[Losses] = []
+        for topic in dict.fromkeys(own.range_topics):
+            losses = self._losses(topic)
+            self.range_losses.append(losses)
+            self._subscribe(Range, topic, own.range_reliability, partial(self.on_range, losses), losses)
+        self._odometry_losses = self._losses(own.odom_topic)
+        self._subscribe(Odometry, own.odom_topic, own.odom_reliability, self.on_odometry, self._odometry_losses)
+
+    def _losses(self, topic: str) -> Losses:
+        return Losses(lambda: int(self._node.count_publishers(self._node.resolve_topic_name(topic))))
+
+    def _subscribe(self, kind: Any, topic: str, reliability: str, callback: Any, losses: Losses) -> None:
+        quality = QoSProfile(depth=QUEUE, reliability=ReliabilityPolicy[reliability.upper()])
+        events = SubscriptionEventCallbacks(message_lost=losses.told)
+        self._node.create_subscription(kind, topic, callback, quality, event_callbacks=events)
+        self.subscriptions[self._node.resolve_topic_name(topic)] = quality
+
+    # the account
+
+    @property
+    def received(self) -> int:
+        """Number of Range messages that came: accepted + waiting + rejected."""
+        return self._associator.received + self._ranges_held + self._refused
+
+    @property
+    def waiting(self) -> int:
+        """Number of readings that wait, for a pose or for the associator."""
+        return self._associator.waiting + self._ranges_held
+
+    @property
+    def lost(self) -> int:
+        """Number of Range messages lost in the middleware, estimated."""
+        return sum(losses.lost for losses in self.range_losses)
+
+    @property
+    def odometry_lost(self) -> int:
+        """Number of Odometry messages lost in the middleware, estimated."""
+        return self._odometry_losses.lost
+
+    def faults(self) -> list[str]:
+        """Return what to warn of; the log is told as well, now and then."""
+        now = time.monotonic()
+        recent = max(losses.recent for losses in (*self.range_losses, self._odometry_losses))
+        if now > recent + LASTING:
+            return []
+        remedy = (
+            'this node was stopped or its machine has too much to do: send less, or give it more time'
+            if self.reliable
+            else 'the network or this machine is too slow for them; range_reliability and odom_reliability: reliable '
+            'repeats what the network loses'
+        )
+        text = (
+            f'{self.lost} Range and {self.odometry_lost} odometry messages so far were lost before this node could '
+            f'take them (estimated): {remedy}'
+        )
+        if now > self._next_warning and self.lost + self.odometry_lost > self._told_of:
+            self._next_warning, self._told_of = now + LASTING, self.lost + self.odometry_lost
+            self._node.get_logger().warning(text)
+        return [text]
+
+    def loss_note(self) -> list[str]:
+        """Return what a report is to say of lost messages."""
+        if not self.lost + self.odometry_lost:
+            return []
+        return [
+            f'{self.lost} Range and {self.odometry_lost} odometry messages were lost before the node could take them '
+            f'(estimated); the maps lack them'
+        ]
+
+    # messages
+
+    def on_range(self, losses: Losses, message: Range, info: dict[str, Any]) -> None:
+        """Take a Range."""
+        made, sent = range_message(message), info['source_timestamp']
+        losses.taken(info, made.frame_id, made.stamp)
+        self._on_taken(sent)
+        if self._ready and not self._held and not self._associator.behind:
+            self._take(made, sent, self.paused)
+        elif self._ranges_held >= MOST_WAITING:
+            self._refuse(made)
+        else:
+            self._ranges_held += 1
+            self._hold(made, sent)
+        self._wake()
+
+    def on_odometry(self, message: Odometry, info: dict[str, Any]) -> None:
+        """Take an Odometry."""
+        made, sent = odometry_message(message), info['source_timestamp']
+        self._odometry_losses.taken(info, made.frame_id, made.stamp)
+        if self._ready and not self._held and not self._associator.behind:
+            self._take(made, sent, self.paused)
+        elif len(self._held) - self._ranges_held < MOST_WAITING:
+            self._hold(made, sent)
+        self._wake()
+
+    def begin(self) -> None:
+        """Give the associator what was held back, and what comes."""
+        self._ready = True
+        if self._last_refused is not None:
+            self._associator.reject(self._last_refused, 'too_many_waiting', self._refused)
+            self._refused = 0
+        self._wake()
+
+    def work(self) -> None:
+        """Go on with what is left to do, a portion of it; called by the executor."""
+        if not self._ready:
+            return
+        done = self._associator.settled + AT_ONCE
+        for _ in range(AT_ONCE):
+            if self._associator.settled >= done or not self.busy:
+                break
+            if self._associator.behind:
+                self._associator.settle()
+                continue
+            message, sent, paused = self._held.popleft()
+            self._ranges_held -= isinstance(message, RangeMessage)
+            self._take(message, sent, paused)
+        self._wake()
+
+    def forget(self) -> None:
+        """Forget what was held back, with the account of all messages."""
+        self._held.clear()
+        self._ranges_held = 0
+        for losses in (*self.range_losses, self._odometry_losses):
+            losses.clear()
+        self._told_of = 0
+
+    @property
+    def busy(self) -> bool:
+        """Whether something is left to do before the next message is taken."""
+        return bool(self._held) or self._associator.behind
+
+    def _hold(self, message: RangeMessage | OdometryMessage, sent: int) -> None:
+        self._held.append((message, sent, self.paused))
+
+    def _refuse(self, message: RangeMessage) -> None:
+        if self._ready:
+            self._associator.reject(message, 'too_many_waiting')
+        else:
+            # the associator is another thread's for now
+            self._last_refused = message
+            self._refused += 1
+
+    def _take(self, message: RangeMessage | OdometryMessage, sent: int, paused: bool) -> None:
+        if isinstance(message, OdometryMessage):
+            self._take_odometry(message, sent)
+        elif paused:
+            self._associator.reject(message, 'paused')
+        else:
+            self._associator.add_range(message, sent)
+
+    def _take_odometry(self, message: OdometryMessage, sent: int) -> None:
+        jumps = self._associator.time_jumps
+        converted = self._map_frame.convert(message)
+        for first in converted[:1]:
+            self._associator.add_odometry(first, sent)
+        # the others are messages like any that waits
+        self._held.extendleft((other, sent, False) for other in reversed(converted[1:]))
+        if self._associator.time_jumps != jumps:
+            self._node.get_logger().warning('the clock jumped back: readings that waited were dropped, the map is kept')
+
+    def _wake(self) -> None:
+        if self._ready and self.busy:
+            self._more.trigger()

@@ -1,0 +1,86 @@
+"""Compilation in the background while the node listens already: what is needed first, first."""
+
+from __future__ import annotations
+
+import gc
+import importlib
+import threading
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from functools import partial
+
+from ..core import warm_up
+from ..core.common.errors import Cancelled
+from .background import Worker
+
+
+class Kernels:
+    """Says of each step of `warm_up.STEPS` whether its kernels are there.
+
+    Attributes
+    ----------
+    stage : str
+        What is being compiled; empty when all is there.
+    """
+
+    def __init__(self, log: Callable[[str], object], error: Callable[[str], object], online: bool) -> None:
+        """`log` takes notes, `error` what went wrong; without `online`, the kernels of the online map are left out."""
+        self._log = log
+        self.worker = Worker('kernels', error, lasting=True)
+        self._steps = {name: step for name, step in warm_up.STEPS.items() if online or name != 'online map'}
+        self._done = {name: threading.Event() for name in self._steps}
+        self.stage = next(iter(self._steps))
+
+    def begin(self, ready: Callable[[], None]) -> None:
+        """Begin to compile; `ready` is called, in another thread, when the live map has its kernels."""
+        self._log('preparing kernels; the first start compiles them, which takes half a minute and more')
+        begin = time.monotonic()
+        # the collector would go through all that the compiler made again and again, and keep the executor waiting
+        gc.disable()
+        for name in self._steps:
+            self.worker.put(partial(self._compile, name, ready, begin), lambda why: self._give_up(ready))
+
+    def wait(self, name: str, stop: Callable[[], bool] = lambda: False) -> None:
+        """Wait for the kernels of a step.
+
+        Raises
+        ------
+        Cancelled
+            When `stop` returns true.
+        """
+        while not self._done[name].wait(0.1):
+            if stop():
+                raise Cancelled('cancelled while kernels were compiled')
+
+    def has(self, name: str) -> bool:
+        """Return whether the kernels of a step are there."""
+        return self._done[name].is_set()
+
+    def _compile(self, name: str, ready: Callable[[], None], begin: float) -> None:
+        self.stage = name
+        self._steps[name]()
+        self._log(f'kernels of the {name} are ready after {time.monotonic() - begin:.1f} s')
+        self._done[name].set()
+        if name == 'live map':
+            ready()
+        if all(done.is_set() for done in self._done.values()):
+            self._end()
+
+    def _give_up(self, ready: Callable[[], None]) -> None:
+        """Let everybody go on: whoever needs a kernel compiles it, and says so if it fails."""
+        first = not self.has('live map')
+        for done in self._done.values():
+            done.set()
+        if first:
+            ready()
+        self._end()
+
+    def _end(self) -> None:
+        self.stage = ''
+        # what a picture needs is a hundred thousand objects more, and there as well by now
+        with suppress(ImportError):
+            importlib.import_module('..files.drawing', __package__)
+        # what is there by now stays; the collector need not look at it again
+        gc.freeze()
+        gc.enable()

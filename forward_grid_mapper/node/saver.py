@@ -1,0 +1,81 @@
+"""The service save_maps: writes the latest maps to files, one call after the other."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ..core.common.errors import MapperError
+from ..core.maps.map_set import MapSet
+from ..files.output_folder import free_name
+from ..files.quality_warning import thinned
+from ..files.results import write_results
+from .background import Worker
+from .deferred import Reply
+from .em import Outcome
+from .em_service import EmService
+from .live import LiveMap
+
+
+class Account(NamedTuple):
+    """What a report says of the node and its readings, as they were when the maps were asked for.
+
+    `source` is as `write_results` takes it, `accepted` counts readings, `path` is the robot's.
+    """
+
+    source: dict[str, Any]
+    accepted: int
+    path: list[tuple[float, float]]
+    folder: str
+    title: str
+
+
+class Saver:
+    """Writes maps in a thread of its own, so that each call finds a folder name that is free."""
+
+    def __init__(self, em: EmService, live: LiveMap, account: Callable[[], Account], logger: Any) -> None:
+        """Prepare; `account` is called by the executor."""
+        self.worker = Worker('save_maps', logger.error)
+        self._em, self._live, self._account, self._logger = em, live, account, logger
+
+    def save_maps(self, reply: Reply) -> None:
+        """Answer the service; where EM has not run, run it first."""
+        self._em.when_there_are_maps(lambda outcome: self._save(outcome, reply))
+
+    def _save(self, outcome: Outcome, reply: Reply) -> None:
+        maps = outcome.maps
+        if maps is None:
+            reply.send(False, f'there is no map to save: {outcome.message}')
+            return
+        account, explained, generation = self._account(), self._em.explained, self._live.generation
+
+        def work() -> None:
+            try:
+                live = self._live.snapshot()
+                if live.generation != generation:
+                    raise MapperError('there is no map to save: they were forgotten by reset')
+                both = maps.with_live(live.grid, live.probability)
+                reply.send(True, self._write(both, account, explained))
+            except MapperError as error:
+                reply.send(False, str(error))
+
+        self.worker.put(work, lambda why: reply.send(False, f'save_maps failed: {why}'))
+
+    def _write(self, maps: MapSet, account: Account, explained: int) -> str:
+        newer = account.accepted - explained
+        warnings = account.source['warnings']
+        if newer > 0:
+            warnings.append(f'{newer} readings came after EM: only the live map has them; call run_em before save_maps')
+        if note := thinned(len(maps.readings), explained):
+            warnings.append(note)
+        parent = Path(account.folder).expanduser().resolve()
+        folder = free_name(parent, f'maps_{time.strftime("%Y-%m-%d_%H-%M-%S")}')
+        path_xy = np.array(account.path, np.float64).reshape(-1, 2)
+        report = write_results(folder, maps, account.source, path_xy, account.title)
+        for warning in report['warnings']:
+            self._logger.warning(f'save_maps: {warning}')
+        return ', '.join(str(folder / name) for name in sorted(path.name for path in folder.iterdir()))

@@ -1,0 +1,98 @@
+"""`explain`: a saved map says why a cell is what it is, and what is wrong with a question."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from drive_samples import code_of, mapped, tape, write_tape
+
+from forward_grid_mapper.commands import explain
+from forward_grid_mapper.core.maps.cell_evidence import cell_evidence
+from forward_grid_mapper.files import drawing
+from forward_grid_mapper.files.map_archive import MapArchive, read_npz
+from forward_grid_mapper.files.reading_archive import read_readings
+
+
+@pytest.fixture(scope='module')
+def maps(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The maps of a drive past a door."""
+    folder = tmp_path_factory.mktemp('explain')
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(drawing, 'draw', lambda path, picture: None)
+        mapped(write_tape(folder / 'bag', tape()), folder / 'maps')
+    return folder / 'maps'
+
+
+def place(archive: MapArchive, state: int) -> tuple[float, float]:
+    """The centre of some cell of this state."""
+    rows, columns = np.nonzero(archive.ml == state)
+    x, y = archive.grid.centers()
+    k = len(rows) // 2
+    return round(float(x[columns[k]]), 3), round(float(y[rows[k]]), 3)
+
+
+@pytest.mark.parametrize(('state', 'word'), [(1, 'occupied'), (0, 'free'), (-1, 'not observed')])
+def test_a_cell_is_explained(maps: Path, state: int, word: str, capsys: pytest.CaptureFixture[str]) -> None:
+    archive = read_npz(maps / 'maps.npz')
+    x, y = place(archive, state)
+    assert code_of(explain.main, maps, x, y) == 0
+    said = capsys.readouterr().out
+    assert said.splitlines()[0].endswith(f': {word}')
+    readings, normals = read_readings(maps / 'readings.npz', archive.grid, archive.parameters)
+    found = cell_evidence(readings, archive.grid, archive.ml, archive.parameters, normals, (x, y))
+    total = re.search(r'([+-][\d.]+) nats from (\d+) readings', said)
+    assert total and (float(total[1]), int(total[2])) == (pytest.approx(found.data, abs=0.051), len(found.readings))
+    groups = re.findall(r'^ +([+-][\d.]+)  (\d+) readings \w+', said, re.MULTILINE)
+    assert sum(int(count) for _, count in groups) == len(found.readings)
+    assert len(re.findall(r' s  \S+$', said, re.MULTILINE)) == min(explain.SHOWN, len(found.readings))
+
+
+def test_readings_are_kept_as_they_were(maps: Path) -> None:
+    archive = read_npz(maps / 'maps.npz')
+    readings, normals = read_readings(maps / 'readings.npz', archive.grid, archive.parameters)
+    assert len(readings) > 0
+    assert set(readings.sensor_names) == {frame for frame, _ in tape().extrinsics}
+    assert normals.known.any()
+    lengths = np.hypot(normals.x, normals.y)
+    assert lengths == pytest.approx(normals.known.astype(float), abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ('words', 'said'),
+    [
+        (['1000', '0'], 'is not on the map, which spans'),
+        (['nan', '0'], 'is not on the map'),
+        (['here', '0'], 'invalid float'),
+    ],
+)
+def test_a_place_that_is_none_is_named(
+    maps: Path, words: list[str], said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert code_of(explain.main, maps, *words) != 0
+    assert said in capsys.readouterr().err
+
+
+def test_a_negative_place_is_no_option(maps: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    code_of(explain.main, maps, '-0.4', '-0.2')
+    assert 'unrecognized' not in capsys.readouterr().err
+
+
+def test_folders_without_maps_or_readings_are_named(
+    maps: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert code_of(explain.main, tmp_path, 0, 0) == 1
+    assert 'maps.npz does not exist' in capsys.readouterr().err
+    (tmp_path / 'maps.npz').write_bytes((maps / 'maps.npz').read_bytes())
+    assert code_of(explain.main, tmp_path, 0, 0) == 1
+    assert 'readings.npz does not exist' in capsys.readouterr().err
+    for content, reason in ((b'PK\3\4nothing', 'is damaged'), (None, 'is not of the maps beside it')):
+        if content is None:
+            with np.load(maps / 'readings.npz', allow_pickle=False) as data:
+                np.savez(tmp_path / 'readings.npz', **{**data, 'normals': data['normals'][:, 1:]})
+        else:
+            (tmp_path / 'readings.npz').write_bytes(content)
+        assert code_of(explain.main, tmp_path, 0, 0) == 1
+        assert reason in capsys.readouterr().err

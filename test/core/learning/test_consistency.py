@@ -1,0 +1,254 @@
+"""Poses and stamps that contradict the readings: warned of with the cause, and sound drives never."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import re
+import sys
+import time
+from collections.abc import Callable, Iterator
+from functools import lru_cache
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+
+from forward_grid_mapper.core.common.parameters import Parameters
+from forward_grid_mapper.core.common.readings import Readings
+from forward_grid_mapper.core.learning.consistency import consistency_warnings
+from forward_grid_mapper.core.mapping import Mapper
+from forward_grid_mapper.core.messages.message_types import NANOSECONDS, OdometryMessage, Pose2, RangeMessage
+from forward_grid_mapper.core.messages.pose_association import PoseAssociator
+from forward_grid_mapper.files.quality_warning import quality_warning
+from forward_grid_mapper.simulation.drive import Recording, building_drive, corridor_drive, door_drive, drive
+from forward_grid_mapper.simulation.sonar import NOISE_FREE, NOISY, front_array, sonar_ring
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[3] / 'benchmarks'))
+
+from quality_worlds import OWN, ROUGHER, ring
+
+
+class Messages(NamedTuple):
+    """What a robot sends, and where its sensors are said to be."""
+
+    extrinsics: dict[str, Pose2]
+    odometry: list[OdometryMessage]
+    ranges: list[RangeMessage]
+
+    def mounted(self, change: Callable[[Pose2], Pose2]) -> Messages:
+        return self._replace(extrinsics={frame: change(pose) for frame, pose in self.extrinsics.items()})
+
+    def driven(self, change: Callable[[Pose2], Pose2]) -> Messages:
+        return self._replace(odometry=[m._replace(pose=change(m.pose)) for m in self.odometry])
+
+    def late(self, seconds: float) -> Messages:
+        by = round(seconds * NANOSECONDS)
+        return self._replace(ranges=[m._replace(stamp=m.stamp + by) for m in self.ranges])
+
+    def wide(self, factor: float) -> Messages:
+        return self._replace(ranges=[m._replace(field_of_view=factor * m.field_of_view) for m in self.ranges])
+
+    def in_feet(self) -> Messages:
+        def feet(m: RangeMessage) -> RangeMessage:
+            return m._replace(range=3.281 * m.range, min_range=3.281 * m.min_range, max_range=3.281 * m.max_range)
+
+        return self._replace(ranges=[feet(m) for m in self.ranges])
+
+
+@lru_cache(maxsize=1)
+def office() -> Messages:
+    """Through the rooms of a building, with eight sonars in front."""
+    made = building_drive(0, 1, NOISY, True, front_array())
+    return Messages(dict(made.extrinsics), list(made.odometry), list(made.ranges))
+
+
+def told(messages: Messages) -> list[str]:
+    associator = PoseAssociator(lambda base, frame, stamp: messages.extrinsics.get(frame), Parameters(), patient=True)
+    merged: list[OdometryMessage | RangeMessage] = [*messages.odometry, *messages.ranges]
+    for message in sorted(merged, key=lambda m: m.stamp):
+        if isinstance(message, RangeMessage):
+            associator.add_range(message)
+        else:
+            associator.add_odometry(message)
+    associator.finish()
+    return consistency_warnings(associator.readings, messages.extrinsics)
+
+
+def turned(degrees: float) -> Callable[[Pose2], Pose2]:
+    return Pose2(0.0, 0.0, math.radians(degrees)).compose
+
+
+SCENARIOS: dict[str, tuple[Callable[[Messages], Messages], str]] = {
+    'left and right of the sensors swapped': (
+        lambda m: m.mounted(lambda p: Pose2(p.x, -p.y, -p.yaw)),
+        r'left and right of the sensors seem to be swapped; check the poses.*y to the left and yaw counter-clockwise',
+    ),
+    'yaw of the sensors clockwise': (
+        lambda m: m.mounted(lambda p: Pose2(p.x, p.y, -p.yaw)),
+        r'the yaw of the sensors seems to have the wrong sign; check the poses of the sensors',
+    ),
+    'sensors turned to the left': (
+        lambda m: m.mounted(turned(90)),
+        r'seem to be turned by 90 degrees to the left',
+    ),
+    'sensors turned to the right': (
+        lambda m: m.mounted(turned(-90)),
+        r'sensors seem to be turned by 90 degrees to the right',
+    ),
+    'sensors front to back': (lambda m: m.mounted(turned(180)), r'the sensors seem to be turned by 180 degrees; check'),
+    'yaw of odometry clockwise': (
+        lambda m: m.driven(lambda p: Pose2(p.x, p.y, -p.yaw)),
+        r'y, or yaw, seems to have the wrong sign in it.*correct its driver',
+    ),
+    'y of odometry to the right': (
+        lambda m: m.driven(lambda p: Pose2(p.x, -p.y, p.yaw)),
+        r'y, or yaw, seems to have the wrong sign in it.*correct its driver',
+    ),
+    'x of odometry backwards': (
+        lambda m: m.driven(lambda p: Pose2(-p.x, p.y, p.yaw)),
+        r'(x|y, or yaw,) seems to have the wrong sign in it.*correct its driver',
+    ),
+    'x and y of odometry swapped': (
+        lambda m: m.driven(lambda p: Pose2(p.y, p.x, p.yaw)),
+        r'x and y seem to be swapped in it.*correct its driver',
+    ),
+    'odometry without orientation': (
+        lambda m: m.driven(lambda p: Pose2(p.x, p.y, 0.0)),
+        r'yaw of odometry never changes, though the robot turns.*is the orientation left out',
+    ),
+    'ranges half a second late': (
+        lambda m: m.late(0.5),
+        r'seem to be about 0\.5 s late.*must stamp a reading when',
+    ),
+    'ranges a second late': (lambda m: m.late(1.0), r'readings seem to be about 1 s late against those of odometry'),
+    'odometry half a second late': (lambda m: m.late(-0.5), r'readings seem to be about 0\.5 s early'),
+    'odometry a second late': (
+        lambda m: m.late(-1.0),
+        r'seem to be about 1 s early against those of',
+    ),
+    'cones of 60 degrees for 15': (
+        lambda m: m.wide(4.0),
+        r'field of view is stated as 60 degrees.*as if it were about 15;.*set the parameter field_of_view',
+    ),
+    'half of the field of view': (lambda m: m.wide(0.5), r'field of view is stated as 7 degrees.*if it were about 15'),
+    'odometry in feet': (
+        lambda m: m.driven(lambda p: Pose2(3.281 * p.x, 3.281 * p.y, p.yaw)),
+        r'the robot drives 1/3\.28 as far as odometry says.*in feet.*must state metres',
+    ),
+    'ranges and limits in feet': (
+        lambda m: m.in_feet(),
+        r'the robot drives 3\.28 times as far as odometry says.*in feet.*must state metres',
+    ),
+    'diameter of the wheels for their radius': (
+        lambda m: m.driven(lambda p: Pose2(2 * p.x, 2 * p.y, p.yaw)),
+        r'the robot drives 1/2 as far as odometry says.*is the radius of the wheels wrong',
+    ),
+}
+
+
+@pytest.mark.parametrize('name', sorted(SCENARIOS))
+def test_wrong_poses_are_warned_of(name: str) -> None:
+    change, expected = SCENARIOS[name]
+    warnings = told(change(office()))
+    assert len(warnings) == 1, 'one cause, one warning'
+    assert re.search(expected, warnings[0]), warnings
+
+
+def drives() -> Iterator[tuple[str, Callable[[], Recording]]]:
+    """Every simulated world, with either array."""
+    for sonars in (front_array, sonar_ring):
+        for seen in (1, 3, 16):
+            yield f'door {seen} {sonars.__name__}', lambda n=seen, s=sonars: door_drive(n, NOISY, 0, s())
+        yield f'corridor {sonars.__name__}', lambda s=sonars: corridor_drive(0, 1, NOISY, True, s())
+        yield f'building {sonars.__name__}', lambda s=sonars: building_drive(0, 1, NOISY, True, s())
+    wide = sonar_ring(field_of_view=math.radians(30.0))
+    yield 'corridor 30°', lambda: corridor_drive(1, sonars=wide)
+    yield 'door noise-free', lambda: door_drive(3, NOISE_FREE, 0)
+    for name, (make, way) in OWN.items():
+        for degrees, spacing, noise, person in ((15, 0.08, NOISY, False), (30, 0.15, ROUGHER, True)):
+            yield (
+                f'{name} {degrees}°',
+                lambda w=make, p=way, d=degrees, s=spacing, n=noise, o=person: drive(
+                    w(), np.array(p), s, ring(d), n, 11, person=o
+                ),
+            )
+
+
+DRIVES = dict(drives())
+
+
+@pytest.mark.parametrize('name', sorted(DRIVES))
+def test_no_alarm_in_the_simulated_worlds(name: str) -> None:
+    recording = DRIVES[name]()
+    assert consistency_warnings(recording.readings, dict(recording.extrinsics)) == []
+
+
+@pytest.mark.parametrize('odometry', ['/odom', '/odom_corrected'])
+@pytest.mark.parametrize('name', ['office_a', 'office_b', 'building_a', 'building_b', 'building_c'])
+def test_no_alarm_on_the_recordings(shared: Path, name: str, odometry: str) -> None:
+    from forward_grid_mapper.recordings.read_drive import read_drive
+
+    bag = shared / 'data' / name / 'bag'
+    if not bag.exists():
+        pytest.skip(f'{bag} is not there')
+    found = read_drive(bag, Parameters(), {}, None, odometry)
+    assert len(found.source['extrinsics']) >= 8
+    assert consistency_warnings(found.associator.readings, found.source['extrinsics']) == []
+
+
+def test_nothing_is_said_of_few_readings_or_unknown_sensors() -> None:
+    recording = building_drive(0, 1, NOISY, True, front_array())
+    backwards = {frame: turned(180)(pose) for frame, pose in recording.extrinsics}
+    r, count = recording.readings, len(recording.readings)
+    wrong = {name: pose for name, pose in backwards.items() if name == r.sensor_names[0]}
+    assert consistency_warnings(r.select(slice(0, 250)), backwards) == []
+    assert consistency_warnings(r, {}) == []
+    assert consistency_warnings(r.select(r.sensor != 0), wrong) == []
+    assert consistency_warnings(Readings.from_columns(x=[], y=[], yaw=[], z=[], z_max=[], half_angle=[]), {}) == []
+    assert count > 1000
+
+
+def test_a_robot_that_stands_is_no_fault() -> None:
+    rng = np.random.default_rng(0)
+    frames = list(office().extrinsics)
+    pose = office().odometry[0].pose
+    odometry = [OdometryMessage(k * NANOSECONDS // 10, 'odom', 'base_link', pose) for k in range(101)]
+    ranges = [
+        RangeMessage(k * NANOSECONDS // 10, frame, 2.0 + 0.2 * n + rng.normal(0, 0.02), 0.1, 5.0, 0.26)
+        for k in range(100)
+        for n, frame in enumerate(frames)
+    ]
+    assert told(Messages(office().extrinsics, odometry, ranges)) == []
+
+
+def test_the_cost_depends_on_neither_length_nor_range() -> None:
+    """Each bound is a multiple of what it takes, in processor time."""
+    recording = building_drive(0, 1, NOISY, True, front_array())
+    r, extrinsics = recording.readings, dict(recording.extrinsics)
+
+    def cost(readings: Readings) -> float:
+        begin = time.process_time()
+        consistency_warnings(readings, extrinsics)
+        return time.process_time() - begin
+
+    cost(r)
+    usual = cost(r)
+    far = dataclasses.replace(r, z=10 * r.z, z_max=10 * r.z_max)
+    again = np.tile(np.arange(len(r)), 20)
+    often = dataclasses.replace(
+        r.select(again), stamp=r.stamp[again] + np.repeat(np.arange(20), len(r)) * np.ptp(r.stamp)
+    )
+    assert cost(far) < 4 * usual
+    assert cost(often) < 4 * usual
+
+
+def test_all_sensors_bad() -> None:
+    """Ranges that have nothing to do with the walls, of every sensor: none of them stands out from the others."""
+    recording = building_drive(0, 1, NOISY, True, front_array())
+    r = recording.readings
+    random = dataclasses.replace(r, z=np.random.default_rng(0).uniform(0.2, 1.0, len(r)) * r.z_max)
+    maps = Mapper(Parameters()).run(random)
+    assert re.search(r'of \d+ readings are most likely random.*poses of the sensors, odometry', quality_warning(maps))
+    assert not quality_warning(Mapper(Parameters()).run(r))

@@ -1,0 +1,229 @@
+"""No message waits for work on all readings: placing, moving and thinning go in portions, or aside."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from forward_grid_mapper.core.common.parameters import Parameters
+from forward_grid_mapper.core.messages import reading_buffer
+from forward_grid_mapper.core.messages.message_types import NANOSECONDS, OdometryMessage, Pose2, RangeMessage
+from forward_grid_mapper.core.messages.pose_association import LATER, PoseAssociator
+from forward_grid_mapper.core.messages.reading_buffer import STEP, ReadingBuffer
+
+AT_ONCE = 50
+
+
+def sonar(seconds: float, frame: str = 'sonar') -> RangeMessage:
+    return RangeMessage(round(seconds * NANOSECONDS), frame, 1.0, 0.1, 4.0, 0.3)
+
+
+def odometry(seconds: float) -> OdometryMessage:
+    return OdometryMessage(round(seconds * NANOSECONDS), 'odom', 'base_link', Pose2(0.0, 0.0, 0.0))
+
+
+def settled(p: PoseAssociator) -> int:
+    return len(p.buffer) + sum(p.rejected.values())
+
+
+def portions(p: PoseAssociator, most: int = AT_ONCE) -> int:
+    """Let it go on until nothing is left; no call may settle more than `most` readings."""
+    count = 0
+    while p.behind:
+        before = settled(p)
+        p.settle()
+        assert settled(p) - before <= most
+        count += 1
+        assert count < 10_000
+    return count
+
+
+def test_odometry_after_a_long_silence_places_readings_in_portions() -> None:
+    p = PoseAssociator(lambda base, frame, stamp: Pose2(0.0, 0.0, 0.0), at_once=AT_ONCE, clock=lambda: 0.0)
+    p.add_odometry(odometry(0.0))
+    for k in range(5000):
+        p.add_range(sonar(0.001 + k * 1e-4))
+    p.add_odometry(odometry(0.6))
+    assert p.behind and settled(p) == AT_ONCE
+    assert portions(p) >= 5000 // AT_ONCE - 1
+    assert len(p.buffer) == 5000
+    assert np.all(np.diff(p.readings.stamp) > 0)
+
+
+def test_readings_that_time_out_together_go_in_portions() -> None:
+    now = [0.0]
+    p = PoseAssociator(lambda base, frame, stamp: None, at_once=AT_ONCE, clock=lambda: now[0])
+    for k in range(1000):
+        p.add_range(sonar(0.0 + k * 1e-4))
+    now[0] = 100.0
+    p.add_range(sonar(100.0))
+    assert p.behind and p.rejected['no_odometry'] == AT_ONCE
+    portions(p)
+    assert p.rejected['no_odometry'] == 1000
+
+
+@pytest.mark.parametrize('known', [True, False])
+def test_poses_that_become_known_are_asked_for_in_portions(known: bool) -> None:
+    now, asked = [0.0], [0]
+    answer: list[Any] = [LATER]
+
+    def pose(base: str, frame: str, stamp: int) -> Any:
+        asked[0] += 1
+        return answer[0]
+
+    p = PoseAssociator(pose, at_once=AT_ONCE, clock=lambda: now[0])
+    p.add_odometry(odometry(0.0))
+    p.add_odometry(odometry(0.9))
+    for k in range(800):
+        p.add_range(sonar(0.1 + k * 1e-4))
+        portions(p)
+    assert p.waiting == 800
+    if known:
+        answer[0] = Pose2(0.0, 0.0, 0.0)
+    now[0] = 50.0
+    asked[0] = 0
+    p.add_odometry(odometry(1.5 if known else 50.0))
+    assert p.behind and asked[0] <= AT_ONCE
+    portions(p)
+    assert p.waiting == 0
+    assert (len(p.buffer), p.rejected['unknown_extrinsics']) == ((800, 0) if known else (0, 800))
+
+
+def test_a_jump_back_counts_what_waits_by_frame() -> None:
+    p = PoseAssociator(lambda base, frame, stamp: Pose2(0.0, 0.0, 0.0), at_once=AT_ONCE, clock=lambda: 0.0)
+    p.add_odometry(odometry(100.0))
+    for k in range(300):
+        p.add_range(sonar(100.1, f'sonar_{k % 3}'))
+    p.add_odometry(odometry(10.0))
+    assert p.rejected == {'time_jump': 300}
+    assert {frame: dict(counts) for frame, counts in p.rejected_by_frame.items()} == {
+        f'sonar_{k}': {'time_jump': 100} for k in range(3)
+    }
+
+
+def append(buffer: ReadingBuffer, first: int, count: int) -> None:
+    for k in range(first, first + count):
+        buffer.append('s', x=k, y=0.0, yaw=0.0, z=1.0 + k % 2, z_max=2.0, half_angle=0.1, sigma=0.0, stamp=k)
+
+
+def test_columns_grow_without_one_large_copy(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(reading_buffer, 'LARGE', 4096)
+    moved: list[int] = []
+    move = ReadingBuffer._move
+
+    def counted(self: ReadingBuffer, end: int) -> None:
+        before = self._moved
+        move(self, end)
+        if len(self._columns['z']) >= 4096:
+            moved.append(end - before)
+
+    monkeypatch.setattr(ReadingBuffer, '_move', counted)
+    buffer = ReadingBuffer()
+    append(buffer, 0, 100_000)
+    assert max(moved) <= 5 * STEP
+    assert np.array_equal(buffer.snapshot().x, np.arange(100_000))
+    assert buffer.counts() == {'s': (100_000, 50_000)}
+
+
+def test_thinning_aside_keeps_nobody_waiting_and_loses_nothing() -> None:
+    """What is held is the same whether appending waits for it or not, and whatever comes meanwhile."""
+    bound = 200
+    aside: list[tuple[Callable[[], Any], Callable[[Any], None]]] = []
+    ours, waiting = ReadingBuffer(bound), ReadingBuffer(bound)
+    ours.aside = lambda thin, done: aside.append((thin, done))
+    looked: list[int] = []
+    ours.before_thinning.append(lambda: looked.append(len(ours)))
+    for first in range(0, 3000, 100):
+        append(ours, first, 100)
+        append(waiting, first, 100)
+        if first % 300 == 0 and aside:
+            thin, done = aside.pop()
+            thinned = thin()
+            append(ours, 10_000 + first, 7)
+            append(waiting, 10_000 + first, 7)
+            done(thinned)
+            assert looked[-1] == len(ours)
+            assert ours.held < 10 * bound
+    assert not aside or len(aside) == 1
+    assert len(ours) == len(waiting)
+    assert np.array_equal(ours.bounded().x, waiting.bounded().x)
+
+
+def test_thinning_that_fails_or_comes_too_late() -> None:
+    aside: list[tuple[Callable[[], Any], Callable[[Any], None]]] = []
+    buffer = ReadingBuffer(100)
+    buffer.aside = lambda thin, done: aside.append((thin, done))
+    append(buffer, 0, 113)
+    _, done = aside.pop()
+    done(None)
+    assert buffer.held == 113
+    append(buffer, 113, 12)
+    assert not aside
+    append(buffer, 125, 1)
+    thin, done = aside.pop()
+    thinned = thin()
+    buffer.clear()
+    append(buffer, 0, 5)
+    done(thinned)
+    assert np.array_equal(buffer.snapshot().x, np.arange(5))
+
+
+class Clock:
+    """A clock that the test moves."""
+
+    now = 0.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+def test_ranges_that_overtake_odometry_wait_as_long_as_it_comes() -> None:
+    """Odometry that is 20 s behind in the middleware, and keeps coming."""
+    clock = Clock()
+    p = PoseAssociator(lambda base, frame, stamp: Pose2(0.0, 0.0, 0.0), Parameters(), clock=clock)
+    lag = 20.0
+    for k in range(400):
+        clock.now = now = 0.1 * k
+        p.add_range(sonar(100.0 + now), sent=round((100.0 + now) * NANOSECONDS))
+        published = 100.0 + now - lag
+        p.add_odometry(odometry(published), sent=round(published * NANOSECONDS))
+    assert sum(p.rejected.values()) == 0
+    assert len(p.buffer) > 190
+    assert p.waiting == 400 - len(p.buffer)
+
+
+def test_a_clock_that_is_ahead_is_told_from_odometry_that_is_behind() -> None:
+    clock = Clock()
+    p = PoseAssociator(lambda base, frame, stamp: Pose2(0.0, 0.0, 0.0), Parameters(), clock=clock)
+    for k in range(200):
+        clock.now = now = 0.1 * k
+        sent = round((100.0 + now) * NANOSECONDS)
+        p.add_range(sonar(120.0 + now), sent=sent)
+        p.add_odometry(odometry(100.0 + now), sent=sent)
+    assert p.rejected['from_the_future'] > 150
+    assert p.waiting < 50
+
+
+def test_readings_time_out_once_odometry_stops() -> None:
+    clock = Clock()
+    p = PoseAssociator(lambda base, frame, stamp: Pose2(0.0, 0.0, 0.0), Parameters(), clock=clock)
+    p.add_odometry(odometry(100.0))
+    for k in range(100):
+        clock.now = 0.1 * k
+        p.add_range(sonar(100.1 + clock.now))
+    assert p.rejected['no_odometry'] > 60
+
+
+def test_an_hour_of_lag_does_not_pile_up() -> None:
+    """A range whose publisher's clock, but not its stamps, is an hour ahead of odometry's."""
+    clock = Clock()
+    p = PoseAssociator(lambda base, frame, stamp: Pose2(0.0, 0.0, 0.0), Parameters(), clock=clock)
+    for k in range(1000):
+        clock.now = now = 0.1 * k
+        p.add_range(sonar(3700.0 + now), sent=round((3700.0 + now) * NANOSECONDS))
+        p.add_odometry(odometry(100.0 + now), sent=round((100.0 + now) * NANOSECONDS))
+    assert p.rejected['from_the_future'] > 350
+    assert p.waiting < 650

@@ -1,0 +1,80 @@
+"""The rotation of a quaternion, against the product of quaternions, and the heading of its x axis."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from forward_grid_mapper.core.messages.quaternions import (
+    STEEPEST,
+    TOLERANCE,
+    elevation_of,
+    heading_of,
+    rotation_of,
+    yaw_of,
+)
+
+XYZW = tuple[float, float, float, float]
+
+
+def product(a: XYZW, b: XYZW) -> XYZW:
+    """Hamilton's product."""
+    av, bv = np.array(a[:3]), np.array(b[:3])
+    vector = a[3] * bv + b[3] * av + np.cross(av, bv)
+    return (*vector.tolist(), a[3] * b[3] - float(av @ bv))
+
+
+@pytest.mark.parametrize('seed', range(10))
+def test_a_vector_is_turned_as_by_the_product(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    x, y, z, w = (rng.normal(size=4)).tolist()
+    length = math.sqrt(x * x + y * y + z * z + w * w)
+    q = (x / length, y / length, z / length, w / length)
+    rotation = rotation_of(*q)
+    assert rotation is not None
+    back = (-q[0], -q[1], -q[2], q[3])
+    for axis in np.eye(3):
+        turned = product(product(q, (*axis.tolist(), 0.0)), back)
+        assert np.array(rotation) @ axis == pytest.approx(np.array(turned[:3]))
+
+
+@pytest.mark.parametrize('scale', [1.0 - 0.49 * TOLERANCE, 1.0 + 0.49 * TOLERANCE])
+def test_a_length_of_nearly_one_is_made_one(scale: float) -> None:
+    half = 0.3
+    rotation = rotation_of(0.0, 0.0, scale * math.sin(half), scale * math.cos(half))
+    assert rotation is not None
+    expected = [[math.cos(0.6), -math.sin(0.6), 0.0], [math.sin(0.6), math.cos(0.6), 0.0], [0.0, 0.0, 1.0]]
+    assert np.array(rotation) == pytest.approx(np.array(expected))
+
+
+@pytest.mark.parametrize('scale', [0.0, 1.0 - 0.51 * TOLERANCE, 1.0 + 0.51 * TOLERANCE, 2.0, math.nan, math.inf])
+def test_other_lengths_are_refused(scale: float) -> None:
+    q = tuple(scale * 0.5 for _ in range(4))
+    assert rotation_of(*q) is None and yaw_of(*q) is None
+    assert TOLERANCE == 0.01
+
+
+def test_elevation_and_heading() -> None:
+    assert elevation_of(3.0, 4.0, 5.0) == pytest.approx(math.pi / 4)
+    assert elevation_of(3.0, 4.0, -5.0) == pytest.approx(-math.pi / 4)
+    assert heading_of(-1.0, 2.0, 0.1) == math.atan2(2.0, -1.0)
+    assert pytest.approx(math.radians(60)) == STEEPEST
+    for sign in (-1, 1):
+        assert heading_of(0.0, 1.0, sign * math.tan(STEEPEST - 1e-6)) == pytest.approx(math.pi / 2)
+        assert heading_of(0.0, 1.0, sign * math.tan(STEEPEST + 1e-6)) is None
+
+
+@pytest.mark.parametrize('yaw', [-3.0, -1.0, 0.0, 0.5, 2.0])
+@pytest.mark.parametrize('pitch', [-1.0, 0.0, 0.4])
+def test_the_yaw_is_that_of_the_x_axis(yaw: float, pitch: float) -> None:
+    turn = (0.0, 0.0, math.sin(yaw / 2), math.cos(yaw / 2))
+    nod = (0.0, math.sin(pitch / 2), 0.0, math.cos(pitch / 2))
+    roll = (math.sin(0.7), 0.0, 0.0, math.cos(0.7))
+    assert yaw_of(*product(product(turn, nod), roll)) == pytest.approx(yaw)
+
+
+def test_an_x_axis_that_stands_on_end_has_no_yaw() -> None:
+    assert yaw_of(0.0, math.sin(0.6), 0.0, math.cos(0.6)) is None
+    assert yaw_of(0.0, math.sin(0.5), 0.0, math.cos(0.5)) == pytest.approx(0.0)

@@ -1,0 +1,97 @@
+"""What a Range message says at the very limits of what is admitted."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from forward_grid_mapper.core.common.parameters import Parameters
+from forward_grid_mapper.core.messages.message_types import RangeMessage
+from forward_grid_mapper.core.messages.rep117 import LONGEST_NAME, NEAREST, Measurement, measure
+
+PLAIN = RangeMessage(7, 'sonar', 1.0, 0.1, 4.0, 0.3)
+
+
+def said(message: RangeMessage, **values: object) -> Measurement:
+    made = measure(message, Parameters.from_flat(values).association)
+    assert isinstance(made, Measurement), made
+    return made
+
+
+def refused(message: RangeMessage, **values: object) -> str:
+    made = measure(message, Parameters.from_flat(values).association)
+    assert isinstance(made, str)
+    return made
+
+
+def test_what_a_plain_message_says() -> None:
+    made = said(PLAIN)
+    assert (made.stamp, made.frame_id, made.z, made.z_max) == (7, 'sonar', 1.0, 4.0)
+    assert (made.half_angle, made.sigma) == (0.15, 0.0)
+    assert (made.number, made.arrival, made.newest) == (0, 0.0, None)
+
+
+@pytest.mark.parametrize('variance', [0.0, -1.0, -0.5, math.inf, math.nan])
+def test_a_variance_that_states_nothing(variance: float) -> None:
+    assert said(PLAIN._replace(variance=variance)).sigma == 0.0
+
+
+def test_a_variance_is_the_square_of_sigma() -> None:
+    assert said(PLAIN._replace(variance=0.25)).sigma == 0.5
+
+
+def test_names_up_to_255_characters() -> None:
+    assert LONGEST_NAME == 255
+    assert said(PLAIN._replace(frame_id='x' * 255)).frame_id == 'x' * 255
+    assert refused(PLAIN._replace(frame_id='x' * 256)) == 'long_frame_id'
+
+
+def test_a_fixed_distance_ranger() -> None:
+    """-inf is something within max_range, 0 and below is nothing that it says, and +inf is no echo."""
+    fixed = PLAIN._replace(min_range=3.0, max_range=3.0)
+    something = said(fixed._replace(range=-math.inf, variance=0.01))
+    assert (something.z, something.sigma) == (1.5, 0.25)
+    assert refused(fixed._replace(range=-0.5)) == 'below_min_range'
+    assert refused(fixed._replace(range=0.0)) == 'too_near'
+    assert said(fixed._replace(range=math.inf)).z == 3.0
+
+
+def test_the_least_and_the_largest_range() -> None:
+    assert said(PLAIN._replace(range=NEAREST, min_range=0.0)).z == NEAREST
+    assert said(PLAIN._replace(range=0.1)).z == 0.1
+    assert said(PLAIN._replace(range=4.0), over_range='no_echo').z == 4.0
+    assert refused(PLAIN._replace(range=4.0), over_range='discard') == 'over_range'
+    assert said(PLAIN._replace(range=3.999), over_range='discard').z == 3.999
+
+
+@pytest.mark.parametrize(
+    'changes',
+    [
+        {'max_range': math.inf},
+        {'max_range': -1.0},
+        {'max_range': 0.05},
+        {'min_range': -0.001},
+        {'min_range': -2.0, 'max_range': -1.0},
+        {'min_range': math.inf, 'max_range': math.inf},
+    ],
+)
+def test_limits_that_make_no_sense(changes: dict[str, float]) -> None:
+    assert refused(PLAIN._replace(**changes)) == 'bad_limits'
+
+
+def test_a_largest_range_given_by_parameter_at_the_least_one() -> None:
+    assert refused(PLAIN._replace(min_range=2.0), max_range=2.0) == 'bad_limits'
+    assert said(PLAIN._replace(min_range=2.0, range=2.5), max_range=2.6).z_max == 2.6
+
+
+@pytest.mark.parametrize('angle', [math.pi, 0.0, -0.1])
+def test_cones_of_no_angle_or_half_of_the_plane(angle: float) -> None:
+    assert refused(PLAIN._replace(field_of_view=angle)) == 'bad_field_of_view'
+    assert said(PLAIN._replace(field_of_view=math.nextafter(math.pi, 0))).half_angle < math.pi / 2
+
+
+def test_the_order_is_that_of_stamps_and_then_of_arrival() -> None:
+    first, second, later = said(PLAIN), said(PLAIN), said(PLAIN._replace(stamp=8))
+    second.number = 1
+    assert first < second < later and not second < first and not first < said(PLAIN)

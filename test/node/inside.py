@@ -1,0 +1,141 @@
+"""The node in the process of the test, which turns its executor and looks into its parts."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+pytest.importorskip('rclpy', reason='the tests of the node need rclpy')
+
+import rclpy
+from nav_msgs.msg import Odometry
+from rclpy.context import Context
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.parameter import Parameter
+from sensor_msgs.msg import Range
+
+from forward_grid_mapper.core.messages.message_types import NANOSECONDS
+from forward_grid_mapper.node.mapper_node import MapperNode
+
+
+class Answer:
+    """What a handler of a service answers with."""
+
+    def __init__(self, request: Any = None) -> None:
+        self.request = request
+        self.sent: list[tuple[Any, ...]] = []
+
+    def send(self, *fields: Any) -> None:
+        self.sent.append(fields)
+
+
+class Inside:
+    """A node whose callbacks the test calls, and whose executor it turns."""
+
+    def __init__(self, domain: int, folder: Path, **parameters: Any) -> None:
+        os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
+        self.context = Context()
+        rclpy.init(args=['mapper', '--ros-args', '--log-level', 'FATAL'], context=self.context, domain_id=domain)
+        values = {'sensors.sonar.pose': [0.1, 0.0, 0.4], 'save_directory': str(folder / 'maps'), **parameters}
+        overrides = [Parameter(name, value=value) for name, value in values.items()]
+        self.node = MapperNode(context=self.context, parameter_overrides=overrides)
+        self.executor = SingleThreadedExecutor(context=self.context)
+        self.executor.add_node(self.node)
+        self.logged: list[str] = []
+        self.sent = 0
+        self._closed = False
+
+    def start(self) -> Inside:
+        """Start the node, and wait until it maps."""
+        self.node.start()
+        self.until(lambda: self.node.failure or (self.node.mapping and self.node.kernels.has('EM')))
+        assert not self.node.failure
+        return self
+
+    def until(self, condition: Callable[[], Any], seconds: float = 60.0) -> Any:
+        """Turn the executor until something is so."""
+        end = time.monotonic() + seconds
+        while not (value := condition()):
+            assert time.monotonic() < end, f'it did not happen: {condition}'
+            self.executor.spin_once(timeout_sec=0.01)
+        return value
+
+    def odometry(self, seconds: float, x: float = 0.0) -> None:
+        """Hand the node an odometry message."""
+        made = Odometry(child_frame_id='base_link')
+        made.header.frame_id = 'odom'
+        made.pose.pose.position.x, made.pose.pose.orientation.w = x, 1.0
+        self._stamp(made.header, seconds)
+        self.node.intake.on_odometry(made, {'source_timestamp': time.time_ns()})
+
+    def range(self, seconds: float, value: float = 2.0, number: int | None = None) -> None:
+        """Hand the node a Range."""
+        made = Range(min_range=0.1, max_range=5.0, field_of_view=0.3, range=value)
+        made.header.frame_id = 'sonar'
+        self._stamp(made.header, seconds)
+        intake = self.node.intake
+        self.sent += 1
+        info = {'source_timestamp': time.time_ns(), 'publication_sequence_number': number or self.sent}
+        intake.on_range(intake.range_losses[0], made, info)
+
+    @staticmethod
+    def _stamp(header: Any, seconds: float) -> None:
+        header.stamp.sec, header.stamp.nanosec = divmod(round(seconds * NANOSECONDS), NANOSECONDS)
+
+    def drive(self, first: int, count: int) -> None:
+        """Hand the node so many readings of a robot that drives slowly, an odometry message with each."""
+        for k in range(first, first + count):
+            self.odometry(100.0 + 0.05 * k, 0.001 * k)
+            self.range(100.0 + 0.05 * k)
+        self.until(lambda: not self.node.intake.busy)
+
+    def set(self, **values: Any) -> None:
+        """Set parameters of the node."""
+        results = self.node.set_parameters([Parameter(name, value=value) for name, value in values.items()])
+        assert all(result.successful for result in results), results
+
+    def status(self, part: str) -> dict[str, Any]:
+        """Have the node report, and return what it says of a part."""
+        found: dict[str, Any] = {}
+        reporter: Any = self.node.reporter
+        publish, reporter._out.publish = (
+            reporter._out.publish,
+            lambda array: found.update(
+                {
+                    status.name.rpartition(': ')[2]: {
+                        **{pair.key: pair.value for pair in status.values},
+                        'message': status.message,
+                        'level': status.level,
+                    }
+                    for status in array.status
+                }
+            ),
+        )
+        try:
+            reporter.report()
+        finally:
+            reporter._out.publish = publish
+        return dict(found[part])
+
+    def call(self, handler: Callable[[Any], None], request: Any = None) -> tuple[Any, ...]:
+        """Call a service, and turn the executor until it answers."""
+        answer = Answer(request)
+        handler(answer)
+        self.until(lambda: answer.sent)
+        assert len(answer.sent) == 1
+        return answer.sent[0]
+
+    def close(self) -> None:
+        """End the node; no more than once."""
+        if self._closed:
+            return
+        self._closed = True
+        self.node.close()
+        self.executor.shutdown()
+        self.node.destroy_node()
+        rclpy.shutdown(context=self.context)

@@ -1,0 +1,174 @@
+"""Workers: whatever their work raises, whoever waits is told, and the next piece is done."""
+
+from __future__ import annotations
+
+import queue
+import threading
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+
+from forward_grid_mapper.core.common.errors import InputError, MapperError
+from forward_grid_mapper.node.background import AT_ONCE, Inbox, Worker
+
+logged: list[str] = []
+
+
+@pytest.fixture
+def worker() -> Iterator[Worker]:
+    logged.clear()
+    made = Worker('digger', logged.append)
+    yield made
+    made.close(10.0)
+
+
+def raising(error: BaseException) -> Callable[[], None]:
+    def work() -> None:
+        raise error
+
+    return work
+
+
+def test_work_is_done_in_order_by_one_thread(worker: Worker) -> None:
+    done: list[int] = []
+    threads: set[int] = set()
+    for k in range(1000):
+        worker.put(lambda k=k: (done.append(k), threads.add(threading.get_ident())))
+    worker.ask(lambda: None)
+    assert done == list(range(1000))
+    assert len(threads) == 1 and threading.get_ident() not in threads
+
+
+@pytest.mark.parametrize(
+    ('error', 'why'),
+    [
+        (MemoryError(), 'there is not enough memory'),
+        (InputError('no reading can be mapped'), 'no reading can be mapped'),
+        (KeyError('odd'), "KeyError('odd')"),
+        (SystemExit(2), 'SystemExit(2)'),
+        (KeyboardInterrupt(), 'KeyboardInterrupt()'),
+    ],
+)
+def test_whatever_is_raised_is_told_logged_and_shown(worker: Worker, error: BaseException, why: str) -> None:
+    told: list[str] = []
+    worker.put(raising(error), told.append)
+    with pytest.raises(MapperError, match='no second try'):
+        worker.ask(raising(InputError('no second try')))
+    assert told == [why]
+    assert logged == [f'digger: {why}', 'digger: no second try']
+    assert worker.trouble == 'no second try'
+    assert worker.ask(lambda: 7) == 7
+    assert worker.ask(lambda: worker.trouble) == ''
+
+
+def test_trouble_that_lasts_does_so_until_it_is_forgiven() -> None:
+    worker = Worker('digger', logged.append, lasting=True)
+    worker.put(raising(KeyError('odd')))
+    assert worker.ask(lambda: 1) == 1
+    assert worker.trouble == "KeyError('odd')"
+    worker.forgive()
+    assert worker.trouble == ''
+    worker.close(10.0)
+
+
+def test_a_listener_and_a_log_that_fail_end_nothing() -> None:
+    worker = Worker('digger', raising_log)
+    worker.put(raising(KeyError('odd')), lambda why: raising(ValueError('deaf'))())
+    assert worker.ask(lambda: 3) == 3
+    worker.close(10.0)
+
+
+def raising_log(text: str) -> None:
+    raise MemoryError
+
+
+def test_a_thread_that_cannot_start_is_told_to_all_who_wait(worker: Worker, monkeypatch: pytest.MonkeyPatch) -> None:
+    told: list[str] = []
+
+    def fail(self: threading.Thread) -> None:
+        raise RuntimeError("can't start new thread")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(threading.Thread, 'start', fail)
+        worker.put(lambda: None, told.append)
+        with pytest.raises(MapperError, match='new thread'):
+            worker.ask(lambda: None)
+    assert len(told) == 1 and "can't start new thread" in told[0]
+    assert 'new thread' in worker.trouble
+    assert worker.ask(lambda: 5) == 5
+
+
+def test_closing_waits_for_what_was_begun_and_leaves_the_rest(worker: Worker) -> None:
+    begun, go_on, done = threading.Event(), threading.Event(), []
+
+    def work() -> None:
+        begun.set()
+        go_on.wait(60.0)
+        done.append('first')
+
+    worker.put(work)
+    worker.put(lambda: done.append('second'))
+    assert begun.wait(60.0)
+    assert worker.waiting == 2
+    closing = threading.Thread(target=worker.close, args=(60.0,))
+    closing.start()
+    assert done == [] and closing.is_alive()
+    go_on.set()
+    closing.join(60.0)
+    assert done == ['first']
+    worker.put(lambda: done.append('third'))
+    assert done == ['first']
+
+
+class Guard:
+    def __init__(self, callback: Callable[[], None]) -> None:
+        self.callback, self.triggered = callback, 0
+
+    def trigger(self) -> None:
+        self.triggered += 1
+
+
+class Executor:
+    """As much of a node as an inbox needs."""
+
+    def create_guard_condition(self, callback: Callable[[], None]) -> Guard:
+        self.guard = Guard(callback)
+        return self.guard
+
+    def run(self) -> int:
+        """Do what was asked for; return in how many turns."""
+        turns = 0
+        while self.guard.triggered:
+            self.guard.triggered = 0
+            turns += 1
+            self.guard.callback()
+        return turns
+
+
+def test_results_come_back_in_order_and_a_few_at_a_time() -> None:
+    executor = Executor()
+    inbox, done = Inbox(executor), queue.Queue[Any]()
+    threads = [
+        threading.Thread(target=lambda n=n: [inbox.put(lambda k=k: done.put((n, k))) for k in range(100)])
+        for n in range(3)
+    ]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert executor.run() == -(-300 // AT_ONCE)
+    found = [done.get() for _ in range(300)]
+    for n in range(3):
+        assert [k for m, k in found if m == n] == list(range(100))
+
+
+def test_a_result_that_fails_does_not_hold_up_the_others() -> None:
+    executor = Executor()
+    inbox, done = Inbox(executor), []
+    inbox.put(raising(KeyError('odd')))
+    inbox.put(lambda: done.append(1))
+    with pytest.raises(KeyError):
+        executor.run()
+    executor.run()
+    assert done == [1]

@@ -1,0 +1,180 @@
+"""The library: arrays in, the maps of the node and of the bags out, and errors in words."""
+
+from __future__ import annotations
+
+import math
+import re
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import forward_grid_mapper
+from forward_grid_mapper import Sonar, SonarMaps, make_maps, poses_from_tum
+from forward_grid_mapper.core.common.errors import InputError, ParameterError
+from forward_grid_mapper.core.common.parameters import Parameters
+from forward_grid_mapper.core.mapping import Mapper
+from forward_grid_mapper.core.messages.pose_association import PoseAssociator
+from forward_grid_mapper.simulation.drive import door_drive
+from forward_grid_mapper.simulation.sonar import NOISY, front_array
+
+PAGE = Path(__file__).resolve().parents[1] / 'docs' / 'library.md'
+
+
+def given() -> dict[str, Any]:
+    """A drive past a door, as arrays."""
+    drive = door_drive(1, NOISY, 0, front_array())
+    first = {m.frame_id: m for m in reversed(drive.ranges)}
+    sensors = {
+        name: Sonar(*pose, first[name].field_of_view, first[name].max_range, first[name].min_range)
+        for name, pose in drive.extrinsics
+    }
+    return {
+        'pose_stamps': [m.stamp / 1e9 for m in drive.odometry],
+        'poses': [m.pose for m in drive.odometry],
+        'range_stamps': [m.stamp / 1e9 for m in drive.ranges],
+        'ranges': [m.range for m in drive.ranges],
+        'sensors': sensors,
+        'sensor_of': [m.frame_id for m in drive.ranges],
+    }
+
+
+def expected() -> Any:
+    """The maps of the same drive as messages."""
+    drive = door_drive(1, NOISY, 0, front_array())
+    poses = dict(drive.extrinsics)
+    associator = PoseAssociator(lambda base, frame, stamp: poses.get(frame), Parameters(), patient=True)
+    for odometry in drive.odometry:
+        associator.add_odometry(odometry)
+    for message in drive.ranges:
+        associator.add_range(message)
+    associator.finish()
+    return Mapper(Parameters()).run(associator.readings)
+
+
+@pytest.mark.parametrize('shuffled', [False, True])
+def test_arrays_give_the_maps_of_the_messages(shuffled: bool) -> None:
+    arrays, maps = given(), expected()
+    if shuffled:
+        for names in (('pose_stamps', 'poses'), ('range_stamps', 'ranges', 'sensor_of')):
+            order = np.random.default_rng(0).permutation(len(arrays[names[0]]))
+            for name in names:
+                arrays[name] = [arrays[name][i] for i in order]
+    found = make_maps(**arrays)
+    assert found.received == len(arrays['ranges'])
+    assert sum(found.rejected.values()) == found.received - len(found.maps.readings)
+    assert found.maps.grid == maps.grid
+    assert np.array_equal(found.maps.ml, maps.ml)
+    assert np.array_equal(found.maps.live, maps.live, equal_nan=True)
+    assert np.array_equal(found.maps.uncertainty, maps.uncertainty, equal_nan=True)
+
+
+def test_ranges_are_taken_as_rep_117_has_them() -> None:
+    arrays = given()
+    arrays['ranges'][:4] = [math.nan, -1.0, math.inf, 1e9]
+    found = make_maps(**arrays)
+    assert (found.rejected['nan_range'], found.rejected['below_min_range']) == (1, 1)
+    assert found.received == len(found.maps.readings) + sum(found.rejected.values())
+
+
+def test_results_are_saved_with_their_counts(tmp_path: Path) -> None:
+    arrays = given()
+    arrays['ranges'][0] = math.nan
+    report = make_maps(**arrays).save(tmp_path / 'maps')
+    assert report['counts']['rejected']['nan_range'] == 1
+    assert {path.name for path in (tmp_path / 'maps').iterdir()} >= {'ml_map.pgm', 'maps.npz', 'report.txt'}
+
+
+def test_what_is_wrong_without_an_error_is_a_warning() -> None:
+    arrays = given()
+    arrays['sensors'] = {
+        name: Sonar(s.x, s.y, s.yaw, s.field_of_view, s.max_range * 1000) for name, s in arrays['sensors'].items()
+    }
+    arrays['ranges'] = [1000 * z for z in arrays['ranges']]
+    assert any('mm' in warning or 'millimetre' in warning for warning in make_maps(**arrays).warnings)
+
+
+@pytest.mark.parametrize(
+    ('change', 'said'),
+    [
+        ({'poses': np.zeros((3, 2))}, 'poses has the shape (3, 2), not'),
+        ({'ranges': [1.0]}, 'ranges has the shape (1,), not'),
+        ({'ranges': 'far'}, 'ranges must be numbers'),
+        ({'pose_stamps': [[0.0, 1.0]]}, 'pose_stamps has the shape (1, 2), not (N,)'),
+        ({'sensor_of': ['sonar']}, 'sensor_of has 1 names for'),
+        ({'sensor_of': 'sonar'}, 'no sensor is called sonar; there are: '),
+        ({'pose_stamps': [], 'poses': np.zeros((0, 3))}, 'there are 0 poses'),
+    ],
+)
+def test_arrays_that_make_no_sense_are_named(change: dict[str, Any], said: str) -> None:
+    with pytest.raises(InputError, match=re.escape(said)):
+        make_maps(**{**given(), **change})
+
+
+def test_units_are_checked() -> None:
+    arrays = given()
+    with pytest.raises(InputError, match='must be divided by 1e9'):
+        make_maps(**{**arrays, 'range_stamps': np.array(arrays['range_stamps']) * 1e9 + 1.7e18})
+    with pytest.raises(InputError, match=re.escape('did you mean radians(30)?')):
+        Sonar(0.0, 0.0, 0.0, 30.0, 3.0)
+    with pytest.raises(InputError, match='leave no range'):
+        Sonar(0.0, 0.0, 0.0, 0.5, 3.0, 4.0)
+    with pytest.raises(InputError, match='must be finite'):
+        Sonar(0.0, math.nan, 0.0, 0.5, 3.0)
+    poses = np.array(arrays['poses'])
+    poses[3, 2] = math.nan
+    with pytest.raises(InputError, match='1 poses are not finite'):
+        make_maps(**{**arrays, 'poses': poses})
+    with pytest.raises(ParameterError, match='p_hti'):
+        make_maps(**arrays, parameters={'p_hti': 0.5})
+
+
+def test_stamps_that_do_not_overlap_are_shown() -> None:
+    arrays = given()
+    late = np.array(arrays['range_stamps']) + 1e6
+    with pytest.raises(InputError, match=r'none of .* after_odometry .*poses span'):
+        make_maps(**{**arrays, 'range_stamps': late})
+
+
+def test_a_trajectory_of_tum_is_read(tmp_path: Path) -> None:
+    path = tmp_path / 'poses.txt'
+    half = math.sqrt(0.5)
+    path.write_text(f'# stamp x y z qx qy qz qw\n\n1.5 2 3 0.1 0 0 0 1\n2.5 4 5 0.1 0 0 {half} {half}\n')
+    stamps, poses = poses_from_tum(path)
+    assert stamps.tolist() == [1.5, 2.5]
+    np.testing.assert_allclose(poses, [[2, 3, 0], [4, 5, math.pi / 2]], atol=1e-12)
+
+
+@pytest.mark.parametrize('line', ['1 2 3', '1 2 3 4 5 6 7 x', '1 2 3 0 0 0 0 0', 'nan 2 3 0 0 0 0 1'])
+def test_a_line_that_is_no_pose_is_named(tmp_path: Path, line: str) -> None:
+    path = tmp_path / 'poses.txt'
+    path.write_text(f'1.5 2 3 0.1 0 0 0 1\n{line}\n')
+    with pytest.raises(InputError, match=r'poses\.txt, line 2: '):
+        poses_from_tum(path)
+    with pytest.raises(InputError, match='cannot be read'):
+        poses_from_tum(tmp_path / 'absent.txt')
+
+
+def test_the_example_of_the_page_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (example,) = re.findall(r'```python\n(.*?)```', PAGE.read_text(encoding='utf-8'), re.DOTALL)
+    monkeypatch.chdir(tmp_path)
+    names: dict[str, Any] = {}
+    exec(compile(example, str(PAGE), 'exec'), names)
+    found: SonarMaps = names['found']
+    grid, ml = found.maps.grid, found.maps.ml
+    assert found.rejected == {}
+    rows, columns = grid.cells_of(np.array([2.0, 2.0, 2.0]), np.array([-1.0, 0.0, 1.0]))
+    assert ml[rows[1], columns[1]] == 0, 'the corridor is free'
+    for row in (rows[0], rows[2]):
+        assert (ml[row - 1 : row + 2, columns[0]] == 1).any(), 'its walls stand'
+    assert (tmp_path / 'corridor_maps' / 'ml_map.yaml').is_file()
+
+
+def test_importing_the_package_imports_no_kernel() -> None:
+    code = 'import sys, forward_grid_mapper; sys.exit("numba" in sys.modules)'
+    assert subprocess.run([sys.executable, '-c', code], check=False).returncode == 0
+    with pytest.raises(AttributeError, match='make_map'):
+        forward_grid_mapper.make_map  # noqa: B018
