@@ -40,7 +40,7 @@ def test_the_report_says_what_became_of_the_trajectory() -> None:
         'places_recognised': 1,
         'odometry': 'turns are measured 2.0 % too large',
     }
-    text = report_text({'input': {'trajectory': refined}})
+    text = ' '.join(report_text({'input': {'trajectory': refined}}).split())
     assert 'off by 5.43 m and 16.0°' in text
     assert '1 place recognised' in text
     assert 'Wheels' in text

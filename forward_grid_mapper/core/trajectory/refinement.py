@@ -65,9 +65,9 @@ MOST_STEPS = 3
 SIGMA = np.array([0.01, math.radians(0.5), math.radians(0.5), 0.02])
 """σ of the calibration found."""
 
-TRIED_ON, FEWEST_TRIED, TRIED_SPAN = 45, 10, 6.0
-"""Windows that a calibration is tried on, the readings that these have at least, and the metres of travel before and
-after them that their maps are made of."""
+TRIED_ON, FEWEST_TRIED, SPAN = 45, 10, 6.0
+"""Windows that a calibration is tried on, the readings that these have at least, and the metres of progress before and
+after a block that the map is made of on which odometry is compared."""
 
 JUDGED_ON, HELD_OUT = 60, 40
 """Blocks, and held-out windows, that trajectories are compared on at the most."""
@@ -75,11 +75,18 @@ JUDGED_ON, HELD_OUT = 60, 40
 LEAST_SIGMAS = 2.3
 """Standard errors by which readings must be foreseen better than with odometry: by chance it is so in one of 100."""
 
+LEAST_OVER_ODOMETRY, LEAST_SIGMAS_WITH_WALLS = 10.0, -1.0
+"""Nats by which the votes of walls must be likelier than with odometry's yaw to be a witness of their own, and the
+standard errors that are then enough: readings must not be foreseen worse. Little drift hardly shows in a few metres."""
+
 MOST_WORSE = 1.0
 """Standard errors by which matching may foresee what was held out worse."""
 
 OF_WAYS = np.array([1.0, 1.0, 0.0, 0.0])
 """The part of a calibration that is left where the yaw is known."""
+
+OVER_CHANCE = 1.7
+"""Times that votes must agree better than they would if ranges were random."""
 
 LEAST_CERTAINTY = 0.9
 """Probability that the heading did not get lost by a right angle."""
@@ -178,7 +185,8 @@ class Refiner:
         better = self._compare(scans, windows.node, straight)
         said = f'readings are foreseen {better.mean:+.3f} ± {better.error:.3f} nats a reading better than with odometry'
         named = dict(zip(CALIBRATION, calibration.tolist(), strict=True))
-        if better.sigmas < LEAST_SIGMAS:
+        least = LEAST_SIGMAS_WITH_WALLS if walls.over_odometry > LEAST_OVER_ODOMETRY else LEAST_SIGMAS
+        if better.sigmas < least:
             reason = f'{said}: not enough to tell that odometry is off'
             return Refinement(False, reason, readings, odometry, named, gain=better.mean)
         solution, loops = self._solve(odometry, windows, scans, walls, calibration)
@@ -203,7 +211,15 @@ class Refiner:
 
     def _heading(self, windows: Windows, scans: Scans) -> Heading | None:
         self._say('directions of walls')
-        return heading(windows, *wall_votes(windows, scans.held_out))
+        found = heading(windows, *wall_votes(windows, scans.held_out))
+        if found is None:
+            return None
+        # sensors have directions of their own, which vote with whatever ranges
+        readings, rng = windows.readings, np.random.default_rng(0)
+        drawn = np.where(readings.echo, rng.random(len(readings)) * readings.z_max, readings.z)
+        by_chance = replace(windows, readings=replace(readings, z=drawn))
+        chance = heading(by_chance, *wall_votes(by_chance, scans.held_out))
+        return found if chance is None or found.gain > OVER_CHANCE * chance.gain else None
 
     def _calibrate(self, odometry: Odometry, windows: Windows, scans: Scans, walls: Heading) -> Floats:
         """Return the calibration with which readings are foreseen best, shape (4,)."""
@@ -218,7 +234,7 @@ class Refiner:
             trial = found.copy()
             trial[which] = value
             nodes = calibrated(turned, trial).at(windows.node_stamp)
-            found_there = foreseen(scans, nodes, chosen, TRIED_SPAN)
+            found_there = foreseen(scans, nodes, chosen, SPAN)
             return float(np.nanmean(found_there)) if np.isfinite(found_there).any() else 0.0
 
         for name, values in (('scale', SCALES), ('heading', HEADINGS)):
@@ -262,9 +278,10 @@ class Refiner:
         """Return by how much one trajectory foresees readings better than another, all over the drive."""
         say = self._say('judgement')
         blocks = blocks_of(len(before), BLOCK, JUDGED_ON)
-        one = foreseen(scans, before, blocks)
+        # places of another time are left out: where they overlap by half they contradict, far apart they say nothing
+        one = foreseen(scans, before, blocks, SPAN)
         say(0.5)
-        return gain(one, foreseen(scans, after, blocks))
+        return gain(one, foreseen(scans, after, blocks, SPAN))
 
     def _choose(self, scans: Scans, straight: Floats, matched: Floats) -> Floats:
         """Return the nodes after matching, unless they foresee what was held out from it worse than those before."""

@@ -1,0 +1,182 @@
+"""How well drift is taken out of wheel odometry: simulated buildings and levels of drift, and recordings.
+
+    python benchmarks/trajectories.py                       # all simulated runs
+    python benchmarks/trajectories.py --robot front --level wheels --seeds 2
+    python benchmarks/trajectories.py --shared ../shared/data
+
+Each run prints the absolute trajectory error (rms after rigid alignment, metres) of odometry and of what `Refiner`
+makes of it, whether that was taken, and the time of one core a metre; each group ends with a summary.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import math
+import time
+from pathlib import Path
+
+import numpy as np
+
+from forward_grid_mapper.core.common.parameters import Parameters
+from forward_grid_mapper.core.common.readings import Readings
+from forward_grid_mapper.core.trajectory.poses import rms_after_alignment
+from forward_grid_mapper.core.trajectory.refinement import Refiner
+from forward_grid_mapper.core.trajectory.windows import Odometry
+from forward_grid_mapper.recordings.read_drive import read_drive
+from forward_grid_mapper.simulation.drift import LEVELS, with_drift
+from forward_grid_mapper.simulation.drive import Recording, drive
+from forward_grid_mapper.simulation.sonar import NoiseModel, front_array, sonar_ring
+from forward_grid_mapper.simulation.world import Floorplan, World, building_tour, building_world
+
+ROBOTS = {
+    'ring': (lambda: sonar_ring(16), 0.1, NoiseModel(0.02, 0.01, 0.0)),
+    'front': (front_array, 0.1, NoiseModel(0.03, 0.04, 0.05)),
+    'cheap': (front_array, 0.15, NoiseModel(0.04, 0.10, 0.3)),
+}
+"""Sonars, metres between sweeps, and noise."""
+
+SMOOTH = 0.35
+"""Part of the walls, in pieces of 3 m, that are smooth."""
+
+RECORDINGS = ('building_a', 'building_b', 'building_c', 'office_a', 'office_b')
+
+
+def in_pieces(world: World, rng: np.random.Generator) -> World:
+    """Return a world whose walls are of one material every 3 m."""
+    segments, smooth = [], []
+    for (x0, y0, x1, y1), was in zip(world.segments, world.smooth, strict=True):
+        count = max(1, round(math.hypot(x1 - x0, y1 - y0) / 3.0))
+        for k in range(count):
+            a, b = k / count, (k + 1) / count
+            segments.append((x0 + a * (x1 - x0), y0 + a * (y1 - y0), x0 + b * (x1 - x0), y0 + b * (y1 - y0)))
+            smooth.append(bool(was) or rng.random() < SMOOTH)
+    return dataclasses.replace(world, segments=np.array(segments), smooth=np.array(smooth))
+
+
+def corridors(seed: int, legs: int) -> tuple[World, np.ndarray]:
+    """Return a building with rooms along a corridor that goes around, and a way of so many of its sides."""
+    rng = np.random.default_rng([seed, 5])
+    width, height = (int(side * rng.uniform(0.8, 1.2)) for side in (420, 260))
+    deep, across = int(rng.integers(38, 55)), int(rng.integers(17, 24))
+    plan = Floorplan(f'corridors {seed}', width + 40, height + 40)
+    low, high = (20, 20), (20 + width, 20 + height)
+    plan.box(low, high)
+    outer = low[0] + deep, low[1] + deep, high[0] - deep, high[1] - deep
+    inner = outer[0] + across, outer[1] + across, outer[2] - across, outer[3] - across
+    sides = (('x', outer[1], outer[0], outer[2], low[1]), ('y', outer[2], outer[1], outer[3], high[0]))
+    sides += (('x', outer[3], outer[0], outer[2], high[1]), ('y', outer[0], outer[1], outer[3], low[0]))
+    for axis, wall, begin, end, back in sides:
+        at, doors = begin, []
+        while at < end - 30:
+            to = min(at + int(rng.integers(35, 75)), end)
+            to = end if end - to < 30 else to
+            if to - at > 24 and rng.random() < 0.8:
+                door = int(rng.integers(at + 6, to - 15))
+                doors.append((door, door + int(rng.integers(8, 12))))
+            if to < end:
+                plan.wall('y' if axis == 'x' else 'x', to, (min(wall, back), max(wall, back)))
+            at = to
+        plan.wall(axis, wall, (begin, end), tuple(doors))
+    plan.box(inner[:2], inner[2:])
+    half = across // 2
+    corners = [
+        (outer[0] + half, outer[1] + half),
+        (outer[2] - half, outer[1] + half),
+        (outer[2] - half, outer[3] - half),
+        (outer[0] + half, outer[3] - half),
+    ]
+    way = [np.array(corners[k % 4]) + 0.5 + (rng.uniform(-3, 3, 2) if k else 0.0) for k in range(legs + 1)]
+    return in_pieces(plan.world(corners[0]), rng), np.array(way) * 0.1
+
+
+def worlds(seed: int) -> dict[str, tuple[World, np.ndarray]]:
+    """Return worlds and ways through them; a seed changes floor plans and materials."""
+    rng = np.random.default_rng(seed)
+    tour = building_tour() + np.r_[np.zeros((1, 2)), rng.uniform(-0.05, 0.05, (len(building_tour()) - 1, 2))]
+    world, way = corridors(seed + 100, 3)
+    return {
+        'one pass': corridors(seed, 3),
+        'around': corridors(seed, 6),
+        'to and fro': (world, np.concatenate([way, way[-2::-1]])),
+        'rooms': (building_world(), tour),
+    }
+
+
+def odometry_of(recording: Recording) -> Odometry:
+    """Return the odometry of a recording."""
+    messages = recording.odometry
+    return Odometry.of(np.array([m.stamp for m in messages]), np.array([m.pose for m in messages], np.float64))
+
+
+def run(name: str, readings: Readings, odometry: Odometry, true: Odometry) -> dict[str, float | bool | str]:
+    """Refine one drive, print a row and return its figures."""
+    began = time.process_time()
+    outcome = Refiner(Parameters()).run(readings, odometry)
+    spent = 1e3 * (time.process_time() - began) / odometry.travel[-1]
+    before, after = (rms_after_alignment(path.at(true.stamp), true.pose) for path in (odometry, outcome.trajectory))
+    worse = after > before + max(0.02, 0.05 * before)
+    taken = 'taken' if outcome.accepted else f'left: {outcome.reason}'
+    print(
+        f'{name:<34} {before:7.2f} → {after:6.3f} m  {spent:4.0f} ms/m  {"WORSE  " if worse else ""}{taken}', flush=True
+    )
+    return {'before': before, 'after': after, 'worse': worse, 'taken': outcome.accepted, 'ms': spent}
+
+
+def simulated(robot: str, level: str, seeds: range, first: int) -> list[dict[str, float | bool | str]]:
+    """Run the simulated worlds of one robot and level."""
+    sonars, spacing, noise = ROBOTS[robot]
+    rows = []
+    for seed in range(first, first + len(seeds)):
+        for name, (world, way) in worlds(seed).items():
+            exact = drive(world, way, spacing, sonars(), noise, seed)
+            recording = with_drift(exact, LEVELS[level], seed) if level != 'none' else exact
+            title = f'{robot}, {level}, {name}, seed {seed}'
+            rows.append(run(title, recording.readings, odometry_of(recording), odometry_of(exact)))
+    return rows
+
+
+def recorded(folder: Path) -> list[dict[str, float | bool | str]]:
+    """Run the recordings that have corrected odometry beside the raw one."""
+    rows = []
+    for name in RECORDINGS:
+        if not (folder / name).exists():
+            continue
+        raw, right = (
+            read_drive(folder / name / 'bag', Parameters(), {}, None, topic) for topic in ('/odom', '/odom_corrected')
+        )
+        odometry, true = (Odometry.of(*each.associator.odometry) for each in (raw, right))
+        rows.append(run(name, raw.associator.readings, odometry, true))
+    return rows
+
+
+def summary(title: str, rows: list[dict[str, float | bool | str]]) -> None:
+    """Print what a group of runs comes to."""
+    before, after, spent = (np.array([row[key] for row in rows], float) for key in ('before', 'after', 'ms'))
+    taken, worse = (sum(bool(row[key]) for row in rows) for key in ('taken', 'worse'))
+    print(
+        f'{title:<34} {np.median(before):7.2f} → {np.median(after):6.3f} m in the median, {after.max():.2f} m at '
+        f'worst; {taken} of {len(rows)} taken, {worse} worse; {np.median(spent):.0f} ms/m\n'
+    )
+
+
+def main() -> None:
+    """Do what the command line asks for."""
+    parser = argparse.ArgumentParser(description=__doc__.split('\n\n')[0])
+    parser.add_argument('--robot', choices=[*ROBOTS], action='append')
+    parser.add_argument('--level', choices=['none', *LEVELS], action='append')
+    parser.add_argument('--seeds', type=int, default=5)
+    parser.add_argument('--first-seed', type=int, default=0, help='0 to 9 were tuned on')
+    parser.add_argument('--shared', type=Path, help='folder of recordings with corrected odometry, instead')
+    options = parser.parse_args()
+    if options.shared:
+        summary('recordings', recorded(options.shared))
+        return
+    for robot in options.robot or ROBOTS:
+        for level in options.level or ('none', *LEVELS):
+            rows = simulated(robot, level, range(options.seeds), options.first_seed)
+            summary(f'{robot}, {level}', rows)
+
+
+if __name__ == '__main__':
+    main()
