@@ -136,8 +136,9 @@ def _frame(axes: Axes, title: str, view: tuple[float, float, float, float], oute
 def _draw_overlay(axes: Axes, picture: Picture) -> None:
     dots, path = picture.unexplained_xy, picture.path_xy
     if len(dots):
-        # Many dots shrink, so that the map stays visible beneath them.
-        size = float(np.clip(9.0 * math.sqrt(300 / len(dots)), 2.0, 9.0))
+        # together they cover a hundredth of the panel at most, so that the map stays visible beneath them
+        extent, points = axes.get_window_extent(), 72.0 / axes.figure.dpi
+        size = float(np.clip(0.01 * extent.width * extent.height * points**2 / len(dots), 0.8, 9.0))
         axes.scatter(dots[:, 0], dots[:, 1], s=size, color=_DOT, linewidths=0, alpha=0.85, zorder=3)
     if not len(path):
         return
