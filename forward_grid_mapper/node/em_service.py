@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from ..core.common.parameters import Parameters
+from ..core.learning.consistency import consistency_warnings
 from ..core.mapping import Mapper
 from ..core.maps.map_set import MapSet
+from ..core.messages.message_types import Pose2
 from ..core.messages.pose_association import PoseAssociator
 from ..core.messages.reading_buffer import bounded
 from ..files.quality_warning import quality_warning
@@ -37,6 +39,8 @@ class EmService:
     sensors : SensorWatch
     online : OnlineWorker or None
         Gives the map to start from, and takes what was found.
+    extrinsics : callable
+        Returns the poses of the sensors that are fixed to the robot, by frame.
     """
 
     def __init__(
@@ -54,6 +58,7 @@ class EmService:
         self.wrong_input: list[str] = []
         self.sensors = SensorWatch()
         self.online: OnlineWorker | None = None
+        self.extrinsics: Callable[[], Mapping[str, Pose2]] = dict
         self._parameters, self._associator, self._publishers = parameters, associator, publishers
         self._inbox, self._logger = inbox, logger
         self._watched = 0.0
@@ -140,6 +145,22 @@ class EmService:
             self._logger.warning(f'EM: {warning}')
         self.last_run = summary(maps, sum(maps.statistics['seconds'].values()))
         self._logger.info(f'EM: {self.last_run}')
+        # whoever called EM has his answer before this
+        fixed, generation = dict(self.extrinsics()), self._publishers.generation
+        self.worker.worker.put(lambda: self._check_consistency(maps, fixed, generation))
+
+    def _check_consistency(self, maps: MapSet, fixed: Mapping[str, Pose2], generation: int) -> None:
+        """Look for poses and stamps that contradict the readings; in the worker's thread."""
+        found = consistency_warnings(maps.readings, fixed, maps.parameters)
+
+        def take() -> None:
+            if generation == self._publishers.generation and maps is self.maps:
+                self.wrong_input = [*self.wrong_input, *found]
+                for warning in found:
+                    self._logger.warning(f'EM: {warning}')
+
+        if found:
+            self._inbox.put(take)
 
     def _watch(self, run: Run) -> None:
         """Show the map found so far, and the progress, at most `publish_rate` times a second; in the run's thread."""

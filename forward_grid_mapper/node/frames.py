@@ -20,8 +20,11 @@ MOST_HELD = 10_000
 LOOKUPS = 100
 """Transforms that one odometry message asks for at the most, so that a transform that comes late holds up nobody."""
 
+STILL = 1e-3
+"""Metres, or radians, by which the pose of a sensor may change for it to be fixed to the robot."""
+
 MOST_MISSING = 1000
-"""Frames whose absence is remembered, so that names that strangers make up cost no memory."""
+"""Frames whose absence, or pose, is remembered, so that names that strangers make up cost no memory."""
 
 
 class Transforms:
@@ -89,10 +92,25 @@ class Extrinsics:
     def __init__(self, given: Mapping[str, Pose2], transforms: Transforms) -> None:
         self._given = {frame.lstrip('/'): pose for frame, pose in given.items()}
         self._transforms = transforms
+        self._used: dict[str, Pose2] = {}
+        self._moved: set[str] = set()
         self.unusable: set[str] = set()
+
+    @property
+    def fixed(self) -> dict[str, Pose2]:
+        """The poses of the sensors that were asked for and did not move on the robot, by frame."""
+        return {frame: pose for frame, pose in self._used.items() if frame not in self._moved}
 
     def __call__(self, base_frame: str, frame: str, stamp: int) -> Pose2 | Later | None:
         """Return the pose of a sensor at a stamp, `LATER` if TF may still know it, None if nothing will."""
+        pose = self._look_up(base_frame, frame, stamp)
+        if isinstance(pose, Pose2) and (frame in self._used or len(self._used) < MOST_MISSING):
+            first = self._used.setdefault(frame, pose)
+            if max(abs(a - b) for a, b in zip(first, pose, strict=True)) > STILL:
+                self._moved.add(frame)
+        return pose
+
+    def _look_up(self, base_frame: str, frame: str, stamp: int) -> Pose2 | Later | None:
         given = self._given.get(frame.lstrip('/'))
         if given is not None:
             return given

@@ -100,6 +100,8 @@ class MapperNode(Node):
         self.maps = MapPublishers(self, self.parameters.grid.resolution, self._frame, self._up_to_date)
         self.live = LiveMap(self.parameters, self._show_live, log.error, lambda: self.kernels.wait('live map'))
         self.em = EmService(lambda: self.parameters, self.associator, self.maps, self.inbox, self.kernels, log)
+        self._extrinsics = extrinsics
+        self.em.extrinsics = lambda: extrinsics.fixed
         self.online = self.em.online = self._online_worker() if node.online else None
         self.saver = Saver(self.em, self.live, self._account, log)
         self._aside = Worker('readings', log.error)
@@ -313,6 +315,7 @@ class MapperNode(Node):
             'odom_frame': associator.map_frame,
             'map_frame': associator.map_frame,
             'base_frame': associator.base_frame,
+            'extrinsics': self._extrinsics.fixed,
             'counts': {
                 'received': self.intake.received,
                 'accepted': len(associator.buffer),

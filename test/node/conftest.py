@@ -13,7 +13,16 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).parent))
 
-_domains = itertools.count(os.getpid() % 60)
+
+def _first_domain() -> int:
+    """A domain to begin with: another one in each run of the tests, and far from those of a worker beside this one."""
+    worker = os.environ.get('PYTEST_XDIST_WORKER', 'gw0').removeprefix('gw')
+    count = int(os.environ.get('PYTEST_XDIST_WORKER_COUNT', '1'))
+    run = os.getppid() if count > 1 else os.getpid()
+    return run % 60 + int(worker) * (100 // count)
+
+
+_domains = itertools.count(_first_domain())
 
 
 @pytest.fixture

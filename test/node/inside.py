@@ -57,7 +57,7 @@ class Inside:
         assert not self.node.failure
         return self
 
-    def until(self, condition: Callable[[], Any], seconds: float = 60.0) -> Any:
+    def until(self, condition: Callable[[], Any], seconds: float = 200.0) -> Any:
         """Turn the executor until something is so."""
         end = time.monotonic() + seconds
         while not (value := condition()):

@@ -218,3 +218,13 @@ def test_the_extrinsics_are_asked_for_anew_after_a_jump_where_odometry_is_the_ma
     assert extrinsics('base', 'sonar', 1 * NANOSECONDS) is LATER
     buffer.known['base', 'sonar'] = transform(0.2, 0.0)
     assert extrinsics('base', 'sonar', 1 * NANOSECONDS) == Pose2(0.2, 0.0, 0.0)
+
+
+def test_sensors_that_turn_on_the_robot_are_not_fixed(buffer: Buffer, transforms: Transforms) -> None:
+    extrinsics = Extrinsics({'given': Pose2(1.0, 2.0, 3.0)}, transforms)
+    buffer.known['base', 'fixed'] = transform(0.1, 0.0)
+    buffer.known['base', 'servo'] = lambda stamp: transform(0.1, 0.0, stamp / NANOSECONDS)
+    for seconds in (0.0, 0.1, 0.2):
+        for frame in ('given', 'fixed', 'servo', 'absent'):
+            extrinsics('base', frame, round(seconds * NANOSECONDS))
+    assert extrinsics.fixed == {'given': Pose2(1.0, 2.0, 3.0), 'fixed': Pose2(0.1, 0.0, 0.0)}

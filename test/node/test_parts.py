@@ -24,7 +24,7 @@ from forward_grid_mapper.core.maps.log_odds_map import LogOddsMap
 from forward_grid_mapper.core.messages import reading_buffer
 from forward_grid_mapper.core.messages.reading_buffer import ReadingBuffer
 from forward_grid_mapper.core.online_map import OnlineMap
-from forward_grid_mapper.node import em, main, map_publishers, saver
+from forward_grid_mapper.node import em, em_service, main, map_publishers, saver
 from forward_grid_mapper.node.intake import AT_ONCE
 
 OK, WARN = b'\x00', b'\x01'
@@ -35,6 +35,7 @@ LONG_WORK: tuple[tuple[Any, str], ...] = (
     *((Mapper, name) for name in ('run', 'so_far')),
     *((reading_buffer, name) for name in ('kept', 'bounded')),
     *((em, name) for name in ('sensor_health', 'input_warnings', 'map_grid')),
+    (em_service, 'consistency_warnings'),
     (map_publishers, 'grid_message'),
     (saver, 'write_results'),
 )
@@ -88,6 +89,39 @@ def test_the_executor_does_no_long_work(inside: Callable[..., Inside], watched: 
     watched.clear()
     robot.call(robot.node.reset)
     assert watched == []
+
+
+def test_poses_that_contradict_the_readings_are_told_of_after_the_answer(
+    inside: Callable[..., Inside], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[Any] = []
+    go_on = threading.Event()
+
+    def contradiction(readings: Readings, extrinsics: Any, parameters: Any) -> list[str]:
+        asked.append((len(readings), dict(extrinsics)))
+        assert go_on.wait(60.0)
+        return ['stamps are late']
+
+    monkeypatch.setattr(em_service, 'consistency_warnings', contradiction)
+    robot = inside().start()
+    node = robot.node
+    robot.drive(0, 60)
+    assert robot.call(node.em.run_em)[0]
+    robot.until(lambda: asked)
+    assert asked == [(len(node.associator.buffer), {'sonar': (0.1, 0.0, 0.4)})]
+    assert 'stamps are late' not in node.em.wrong_input
+    go_on.set()
+    robot.until(lambda: 'stamps are late' in node.em.wrong_input)
+    assert 'stamps are late' in str(robot.status('readings'))
+    # what is found of maps that were forgotten is forgotten
+    go_on.clear()
+    assert robot.call(node.em.run_em)[0]
+    robot.until(lambda: len(asked) == 2)
+    robot.call(node.reset)
+    go_on.set()
+    robot.until(lambda: not node.em.worker.worker.waiting)
+    robot.executor.spin_once(timeout_sec=0.01)
+    assert node.em.wrong_input == []
 
 
 def test_commands_do_not_wait_for_the_online_map(
