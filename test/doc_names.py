@@ -282,7 +282,8 @@ def exists(name: str, page: Path) -> bool:
         or is_member(name)
         or f'{name}.py' in sources()
         or is_spoken(name)
-        or (page.name in ('README.md', 'library.md') and re.split(r'[=(]', name)[0] in library_names())
+        or (page.name == 'library.md' and re.split(r'[=(]', name)[0] in library_names())
+        or name == 'make_maps'
     )
 
 

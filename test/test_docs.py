@@ -37,6 +37,12 @@ ALLOWED = {
     '-wal': 'the ending of that file',
     'synchronous=NORMAL': 'a setting of SQLite',
     'TMPDIR': 'an environment variable of POSIX',
+    'header.stamp': 'a field of messages',
+    'header.frame_id': 'a field of messages',
+    'child_frame_id': 'a field of odometry',
+    'base_link': 'a usual name of a frame',
+    'inf': 'a number that is not finite',
+    'sonar_left': 'a name of a sensor, as an example',
     '/map': 'the topic of the map in Nav2, where a launch argument sends one of ours',
     '/tf': 'the topic of transforms',
     '--delay 3': 'an option of ros2 bag play',
@@ -51,6 +57,12 @@ PAGE_OR_PROGRAM = r'\b(?:docs|benchmarks|config|scripts)/\w+\.(?:md|py|yaml|xml|
 """A page, program or file of parameters as comments and help texts name it."""
 
 of_each_page = pytest.mark.parametrize('page', PAGES, ids=[str(page.relative_to(ROOT)) for page in PAGES])
+
+
+def test_the_readme_leads_to_every_page() -> None:
+    text = (ROOT / 'README.md').read_text(encoding='utf-8')
+    assert [page.name for page in PAGES if page.parent.name == 'docs' and f'(docs/{page.name})' not in text] == []
+    assert len(text.splitlines()) < 100, 'the rest belongs to docs/'
 
 
 @of_each_page
@@ -88,8 +100,8 @@ def test_paths_in_sources_exist() -> None:
     assert wrong == []
 
 
-def test_the_readme_lists_all_packages_and_the_layers_of_the_core_in_their_order() -> None:
-    text = (ROOT / 'README.md').read_text(encoding='utf-8')
+def test_a_page_lists_all_packages_and_the_layers_of_the_core_in_their_order() -> None:
+    text = (ROOT / 'docs' / 'architecture.md').read_text(encoding='utf-8')
     assert ' ← '.join(CORE) in text
     listed = dict(re.findall(r'^    (\w+)/ +\S.*?(?:← (.*))?$', text, flags=re.MULTILINE))
     below = {name: set(filter(None, listed[name].split(', '))) for name in BELOW}
