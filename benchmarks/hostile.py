@@ -155,6 +155,9 @@ class Hostile:
         name = row.name if self.random.random() < 0.9 else self.random.choice(['sensors.a.pose', 'sensors.b', 'p_hitt'])
         return Parameter(name, value=value)
 
+    def clear(self) -> None:
+        """Forget transforms, as a buffer of tf2 does; none was kept."""
+
     def lookup_transform(self, target: str, source: str, time: Any) -> Any:
         """Answer as a `tf2_ros.Buffer` does."""
         from geometry_msgs.msg import TransformStamped
