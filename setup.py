@@ -73,7 +73,7 @@ setup(
             'ros-jazzy-std-srvs>=5,<6',
             'ros-jazzy-diagnostic-msgs>=5,<6',
         ],
-        'test': ['pytest>=7.2,<10', 'hypothesis>=6.80,<7', 'pillow>=9.2,<14'],
+        'test': ['pytest>=7.2,<10', 'pytest-xdist>=3.3,<4', 'hypothesis>=6.80,<7', 'pillow>=9.2,<14'],
         'lint': ['ruff>=0.17,<0.18', 'mypy>=1.15,<3', 'types-PyYAML>=6,<7'],
     },
     entry_points={'console_scripts': SCRIPTS},

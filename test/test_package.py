@@ -32,7 +32,7 @@ DEPENDENCIES = {
         *('python3-matplotlib', 'python3-numba', 'python3-numpy', 'python3-rosbags-pip', 'python3-scipy'),
         'python3-yaml',
     },
-    'test_depend': {'python3-hypothesis', 'python3-pil', 'python3-pytest'},
+    'test_depend': {'python3-hypothesis', 'python3-pil', 'python3-pytest', 'python3-pytest-xdist'},
 }
 """Names of ROS packages, and keys of rosdep for the rest."""
 

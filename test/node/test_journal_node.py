@@ -125,6 +125,8 @@ def test_node_and_offline_keep_the_same_readings(start: Any, robot: Robot, tmp_p
     assert not any('came after EM' in text for text in warnings)
     out = tmp_path / 'offline'
     assert process_bag([str(folder), '-o', str(out), '-q', '--set', 'max_readings=300']) == 0
+    # a journal does not say where the sensors sit, so poses cannot be compared with the readings; these make no room
+    warnings = [text for text in warnings if 'with this undone' not in text]
     assert warnings == json.loads((out / 'report.json').read_text())['warnings']
     ours, offline = read_npz(saved / 'maps.npz'), read_npz(out / 'maps.npz')
     assert ours.grid == offline.grid
