@@ -25,7 +25,8 @@ setup(
     name=NAME,
     version='0.1.0',
     description='Occupancy grid maps from sonar with forward sensor models, for ROS 2',
-    long_description=Path('README.md').read_text(encoding='utf-8'),
+    # colcon links this file into a folder that has no README
+    long_description=Path(__file__).resolve().with_name('README.md').read_text(encoding='utf-8'),
     long_description_content_type='text/markdown',
     keywords=['ROS 2', 'sonar', 'ultrasonic', 'mapping', 'occupancy grid', 'EM', 'Nav2'],
     classifiers=[

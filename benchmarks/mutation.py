@@ -36,6 +36,8 @@ MODULES = {
     'core/messages/robot_path': ('core/messages/test_robot_path',),
     'bags/choice': ('bags/test_topic_choice',),
     'bags/static_transforms': ('bags/test_static_transforms',),
+    'node/losses': ('node/test_losses',),
+    'node/background': ('node/test_background',),
 }
 """Modules, and the tests that must notice their changes; each takes seconds."""
 
