@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import random
+import time
 
-from forward_grid_mapper.node.losses import Losses
+import pytest
+
+from forward_grid_mapper.node.losses import LASTING, MOST_STREAMS, STEADY, STRANGE, Losses
 
 MILLISECOND = 1_000_000
 
@@ -82,3 +85,61 @@ def test_what_the_middleware_says_and_what_gaps_tell_count_once() -> None:
     assert losses.lost == 8
     losses.clear()
     assert losses.lost == 0
+    assert losses.recent + LASTING <= 0
+    losses.told(Told(0))
+    assert losses.recent + LASTING <= 0, 'nothing was lost'
+    losses.told(Told(2))
+    assert losses.lost == 2
+    assert time.monotonic() - LASTING < losses.recent <= time.monotonic()
+
+
+def at_steps(losses: Losses, *steps: float, frame: str = 'sonar') -> list[int]:
+    """Messages of one sensor, so many usual intervals apart; returns what is lost after each."""
+    stamp, found = 10**9, []
+    for step in (0.0, *steps):
+        stamp += round(step * 100 * MILLISECOND)
+        losses.taken({}, frame, stamp)
+        found.append(losses.lost)
+    return found[1:]
+
+
+def test_a_sensor_is_steady_after_some_intervals_of_about_the_same_length() -> None:
+    # the first tells the interval
+    assert at_steps(Losses(lambda: 1), *[1.0] * STEADY, 4.0)[-1] == 0
+    assert at_steps(Losses(lambda: 1), *[1.0] * (1 + STEADY), 4.0)[-1] == 3
+    assert at_steps(Losses(lambda: 1), 1.0, *[1.25, 0.8] * (STEADY // 2), 4.0)[-1] == 3
+
+
+@pytest.mark.parametrize(('step', 'missing'), [(1.6, 0), (1.75, 1), (2.4, 1), (2.6, 2), (50.0, 49)])
+def test_how_many_intervals_are_missing(step: float, missing: int) -> None:
+    assert at_steps(Losses(lambda: 1), *[1.0] * 20, step)[-1] == missing
+
+
+@pytest.mark.parametrize('odd', [0.5, 1.5])
+def test_an_odd_interval_makes_a_sensor_unsteady(odd: float) -> None:
+    # from now on the odd one is the usual interval, and the next ones are no gaps
+    found = at_steps(Losses(lambda: 1), *[1.0] * 20, odd, 3.0, *[1.0] * STEADY, 3.0)
+    assert found[-1] == 0
+
+
+def test_a_stamp_that_does_not_advance_changes_nothing() -> None:
+    assert at_steps(Losses(lambda: 1), *[1.0] * 20, 0.0, 3.0)[-1] == 2
+    assert at_steps(Losses(lambda: 1), *[1.0] * 20, -5.0, 1.0, 3.0)[-1] == 2
+
+
+def test_more_sensors_than_are_told_apart_are_left_out() -> None:
+    losses = Losses(lambda: 1)
+    for k in range(MOST_STREAMS + 1):
+        at_steps(losses, frame=f'sonar_{k}')
+    assert at_steps(losses, *[1.0] * 20, 5.0, frame=f'sonar_{MOST_STREAMS}')[-1] == 0
+    assert at_steps(losses, *[1.0] * 20, 5.0, frame=f'sonar_{MOST_STREAMS - 1}')[-1] == 4
+
+
+@pytest.mark.parametrize(('gap', 'lost'), [(STRANGE, STRANGE - 1), (STRANGE + 1, 0)])
+def test_a_large_gap_is_another_publisher_where_there_is_one(gap: int, lost: int) -> None:
+    losses = Losses(lambda: 2)
+    numbered(losses, 1000, 1000 + gap)
+    assert losses.lost == lost
+    alone = Losses(lambda: 1)
+    numbered(alone, 1000, 1000 + gap)
+    assert alone.lost == gap - 1
