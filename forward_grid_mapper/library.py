@@ -13,17 +13,23 @@ from numpy.typing import ArrayLike, NDArray
 
 from .core.common.errors import InputError
 from .core.common.parameters import Parameters
+from .core.learning.consistency import consistency_warnings
 from .core.learning.input_warnings import input_warnings
 from .core.mapping import Mapper, Watch
 from .core.maps.map_set import MapSet
 from .core.messages.message_types import NANOSECONDS, OdometryMessage, Pose2, RangeMessage
 from .core.messages.pose_association import PoseAssociator
 from .core.messages.quaternions import yaw_of
-from .core.messages.rep117 import REASONS
+from .core.messages.rep117 import ODOMETRY_REASONS, REASONS
 from .files.quality_warning import quality_warning
 from .files.results import write_results
 
 __all__ = ['Sonar', 'SonarMaps', 'make_maps', 'poses_from_tum']
+
+TURN = 2.0 * math.pi
+
+MANY = 0.2
+"""Part of the ranges whose rejection for one reason is worth a warning."""
 
 _TUM_COLUMNS = 8
 
@@ -52,7 +58,14 @@ class Sonar:
     min_range: float = 0.0
 
     def __post_init__(self) -> None:
-        if not all(map(math.isfinite, (self.x, self.y, self.yaw, self.max_range, self.min_range))):
+        try:
+            finite = all(map(math.isfinite, (self.x, self.y, self.yaw, self.max_range, self.min_range)))
+            self.field_of_view / 1.0
+        except TypeError as error:
+            raise InputError(f'{self}: a number is wanted: {error}') from None
+        if abs(self.yaw) > TURN:
+            raise InputError(f'yaw = {self.yaw:g} rad is more than a turn; did you mean radians({self.yaw:g})?')
+        if not finite:
             raise InputError(f'{self}: pose and limits must be finite')
         if not 0.0 < self.field_of_view < math.pi:
             degrees = f'; did you mean radians({self.field_of_view:g})?' if 0 < self.field_of_view < 180 else ''
@@ -77,6 +90,8 @@ class SonarMaps:
         What is wrong with the input although it raises no error, and what to do about it.
     path : float64, shape (P, 2)
         Where the robot drove, metres.
+    source : dict
+        What the report says of the input.
     """
 
     maps: MapSet
@@ -84,6 +99,7 @@ class SonarMaps:
     rejected: dict[str, int]
     warnings: tuple[str, ...]
     path: NDArray[np.float64]
+    source: dict[str, Any]
 
     def save(self, folder: Path | str, title: str = 'Sonar maps') -> dict[str, Any]:
         """Write maps for map_server, archive, picture and report into a new folder; return the report.
@@ -93,13 +109,14 @@ class SonarMaps:
         OutputError
             If the folder exists, or cannot be written.
         """
-        counts = {'received': self.received, 'accepted': len(self.maps.readings), 'rejected': self.rejected}
-        return write_results(folder, self.maps, {'counts': counts}, self.path, title)
+        return write_results(folder, self.maps, self.source, self.path, title)
 
 
 def _column(name: str, values: ArrayLike, length: int | None = None) -> NDArray[np.float64]:
     """Return numbers as float64, shape (length,)."""
     try:
+        if np.iscomplexobj(values):
+            raise InputError(f'{name} must be real numbers')
         column = np.asarray(values, np.float64)
     except (TypeError, ValueError) as error:
         raise InputError(f'{name} must be numbers: {error}') from None
@@ -175,6 +192,12 @@ def make_maps(
     ParameterError
         For an unknown name or a value out of range.
     """
+    if not isinstance(sensors, Mapping) or not all(isinstance(sensor, Sonar) for sensor in sensors.values()):
+        raise InputError('sensors must be a mapping from the name of each sensor to its Sonar')
+    if not isinstance(parameters or {}, Mapping) or not all(isinstance(name, str) for name in parameters or {}):
+        raise InputError('parameters must be a mapping from names to values, such as {"resolution": 0.05}')
+    if not isinstance(sensor_of, (str, Sequence, np.ndarray)):
+        raise InputError('sensor_of must be the name of a sensor, or one name for each range')
     chosen = Parameters.from_flat(parameters or {})
     odometry = _poses(_stamps('pose_stamps', pose_stamps), poses)
     stamps = _stamps('range_stamps', range_stamps)
@@ -198,15 +221,36 @@ def make_maps(
     associator.finish()
     if not len(associator.buffer):
         reasons = '; '.join(f'{n} {reason} ({REASONS[reason]})' for reason, n in associator.rejected.most_common())
+        reasons += ''.join(f'; {text}' for text in _told_of_poses(associator))
         spans = f'poses span {odometry[0].stamp / 1e9:.3f} … {odometry[-1].stamp / 1e9:.3f} s'
         raise InputError(
             f'none of {len(values)} ranges could be used: {reasons}; {spans}, ranges '
             f'{stamps.min() / 1e9:.3f} … {stamps.max() / 1e9:.3f} s'
         )
     maps = Mapper(chosen).run(associator.readings, watch)
-    found = [*associator.limits.warnings(), *input_warnings(maps.readings), *filter(None, [quality_warning(maps)])]
+    before = [*_told_of_poses(associator), *associator.limits.warnings()]
+    for reason, count in associator.rejected.items():
+        if count > MANY * len(values):
+            before.append(f'{count} of {len(values)} ranges were rejected as {reason}: {REASONS[reason]}')
+    found = [
+        *before,
+        *input_warnings(maps.readings),
+        *consistency_warnings(maps.readings, mounted, chosen),
+        *filter(None, [quality_warning(maps)]),
+    ]
     path = np.array(associator.path, np.float64).reshape(-1, 2)
-    return SonarMaps(maps, associator.received, dict(associator.rejected), tuple(found), path)
+    rejected = dict(associator.rejected)
+    counts = {'received': len(values), 'accepted': len(associator.buffer), 'rejected': rejected}
+    source = {'counts': counts, 'warnings': before, 'extrinsics': mounted}
+    return SonarMaps(maps, len(values), rejected, tuple(found), path, source)
+
+
+def _told_of_poses(associator: PoseAssociator) -> list[str]:
+    """Return what is to be said of poses that were not used."""
+    return [
+        f'{count} of {associator.odometry_received} poses were rejected: {ODOMETRY_REASONS[reason]}'
+        for reason, count in associator.odometry_rejected.items()
+    ]
 
 
 def poses_from_tum(path: Path | str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

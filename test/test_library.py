@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import forward_grid_mapper
-from forward_grid_mapper import Sonar, SonarMaps, make_maps, poses_from_tum
+from forward_grid_mapper import Sonar, SonarMaps, library, make_maps, poses_from_tum
 from forward_grid_mapper.core.common.errors import InputError, ParameterError
 from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.mapping import Mapper
@@ -97,9 +97,45 @@ def test_what_is_wrong_without_an_error_is_a_warning() -> None:
     assert any('mm' in warning or 'millimetre' in warning for warning in make_maps(**arrays).warnings)
 
 
+def test_the_report_warns_of_what_the_result_warns_of(tmp_path: Path) -> None:
+    arrays = given()
+    poses = np.array(arrays['poses'])
+    poses[len(poses) // 2 :, 0] = 1e8
+    found = make_maps(**{**arrays, 'poses': poses})
+    assert any('poses were rejected' in warning for warning in found.warnings)
+    assert any('ranges were rejected as' in warning for warning in found.warnings)
+    assert tuple(found.save(tmp_path / 'maps')['warnings']) == found.warnings
+    with pytest.raises(InputError, match='poses were rejected'):
+        make_maps(**{**arrays, 'poses': poses * [0, 0, 0] + [1e8, 0, 0]})
+
+
+def test_poses_of_sensors_are_compared_with_the_readings(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[Any] = []
+
+    def turned(readings: Any, extrinsics: Any, parameters: Any) -> list[str]:
+        asked.append(extrinsics)
+        return ['sensors are turned']
+
+    monkeypatch.setattr(library, 'consistency_warnings', turned)
+    arrays = given()
+    assert 'sensors are turned' in make_maps(**arrays).warnings
+    assert asked == [{name: (s.x, s.y, s.yaw) for name, s in arrays['sensors'].items()}]
+
+
+def test_numpy_scalars_are_numbers() -> None:
+    chosen = {'resolution': np.float64(0.2), 'max_iterations': np.int64(50), 'p_hit': np.float32(0.5)}
+    assert make_maps(**given(), parameters=chosen).maps.grid.resolution == 0.2
+
+
 @pytest.mark.parametrize(
     ('change', 'said'),
     [
+        ({'sensors': [Sonar(0.0, 0.0, 0.0, 0.5, 3.0)]}, 'sensors must be a mapping'),
+        ({'sensors': {'f': (0, 0, 0, 0.5, 3)}}, 'sensors must be a mapping'),
+        ({'sensor_of': 5}, 'sensor_of must be'),
+        ({'parameters': 'resolution=0.1'}, 'parameters must be a mapping'),
+        ({'parameters': {1: 2}}, 'parameters must be a mapping'),
+        ({'ranges': np.array([1j])}, 'ranges must be real numbers'),
         ({'poses': np.zeros((3, 2))}, 'poses has the shape (3, 2), not'),
         ({'ranges': [1.0]}, 'ranges has the shape (1,), not'),
         ({'ranges': 'far'}, 'ranges must be numbers'),
@@ -120,6 +156,10 @@ def test_units_are_checked() -> None:
         make_maps(**{**arrays, 'range_stamps': np.array(arrays['range_stamps']) * 1e9 + 1.7e18})
     with pytest.raises(InputError, match=re.escape('did you mean radians(30)?')):
         Sonar(0.0, 0.0, 0.0, 30.0, 3.0)
+    with pytest.raises(InputError, match=re.escape('did you mean radians(90)?')):
+        Sonar(0.0, 0.0, 90.0, 0.5, 3.0)
+    with pytest.raises(InputError, match='a number is wanted'):
+        Sonar('a', 0.0, 0.0, 0.5, 3.0)
     with pytest.raises(InputError, match='leave no range'):
         Sonar(0.0, 0.0, 0.0, 0.5, 3.0, 4.0)
     with pytest.raises(InputError, match='must be finite'):

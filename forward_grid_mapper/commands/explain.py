@@ -23,6 +23,12 @@ COMMAND = 'explain'
 STATES = {1: 'occupied', 0: 'free', -1: 'not observed'}
 SHOWN = 5
 
+FARTHEST = 1e9
+"""Metres; no map reaches so far, and numbers of cells stay whole."""
+
+LEAST_TYPICAL = 0.05
+"""Nats that one reading must say for it to be asked how many more of its kind it takes."""
+
 
 def parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
@@ -45,9 +51,9 @@ def explain(options: argparse.Namespace) -> int:
     """Do what the command line asks for."""
     folder = Path(options.maps)
     maps = read_npz(folder / 'maps.npz')
-    readings, normals = read_readings(folder / 'readings.npz', maps.grid, maps.parameters)
+    readings, normals = read_readings(folder / 'readings.npz', maps)
     left, right, bottom, top = maps.grid.extent
-    if not (left <= options.x < right and bottom <= options.y < top):
+    if not _on_map(maps, options.x, options.y):
         raise InputError(
             f'({options.x:g}, {options.y:g}) is not on the map, which spans x = {left:.2f} … {right:.2f} m and '
             f'y = {bottom:.2f} … {top:.2f} m'
@@ -55,6 +61,14 @@ def explain(options: argparse.Namespace) -> int:
     found = cell_evidence(readings, maps.grid, maps.ml, maps.parameters, normals, (options.x, options.y))
     print('\n'.join(explanation(maps, readings, found, max(options.readings, 0))))
     return 0
+
+
+def _on_map(maps: MapArchive, x: float, y: float) -> bool:
+    """Return whether a place is in a cell of the map; that is asked of the cells, since edges are rounded."""
+    if not math.isfinite(x) or not math.isfinite(y) or max(abs(x), abs(y)) > FARTHEST:
+        return False
+    (row,), (column,) = maps.grid.cells_of(np.array([x]), np.array([y]))
+    return bool(0 <= row < maps.grid.height and 0 <= column < maps.grid.width)
 
 
 def explanation(maps: MapArchive, readings: Readings, found: CellEvidence, shown: int = SHOWN) -> Iterator[str]:
@@ -132,10 +146,11 @@ def _what_decides(maps: MapArchive, found: CellEvidence, state: int) -> str:
     against = found.nats[(found.nats < 0) if state == 1 else (found.nats > 0)]
     typical = float(np.abs(against).max(initial=0.0))
     other = STATES[1 - state]
-    if typical > 0:
+    if typical >= LEAST_TYPICAL:
         more = math.ceil(abs(total) / typical)
-        return f'to be {other} it takes {abs(total):.1f} nats more: {more} more readings like the strongest against it'
-    return f'to be {other} it takes {abs(total):.1f} nats; so far no reading says so'
+        kind = f'the one that speaks most for {other}'
+        return f'to be {other} it takes {abs(total):.1f} nats more: {more} more readings like {kind}'
+    return f'to be {other} it takes {abs(total):.1f} nats; so far no reading says so to speak of'
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -10,11 +10,10 @@ from typing import NamedTuple
 import numpy as np
 
 from ..core.common.errors import InputError
-from ..core.common.grid import Grid
-from ..core.common.parameters import Parameters
 from ..core.common.readings import Readings
 from ..core.maps.map_set import MapSet
 from ..core.sensor.surface_normals import SurfaceNormals, known_normals, no_normals
+from .map_archive import MapArchive
 from .output_folder import output_errors
 
 COLUMNS = tuple(field.name for field in fields(Readings) if field.name != 'sensor_names')
@@ -47,13 +46,14 @@ def write_readings(path: Path | str, maps: MapSet) -> None:
         **{name: getattr(maps.readings, name) for name in COLUMNS},
         sensor_names=np.array(maps.readings.sensor_names or ('',)),
         normals=normals.reshape(2, *maps.grid.shape),
+        log_likelihood=np.float64(maps.log_likelihood),
     )
     with output_errors(path):
         path.write_bytes(packed.getvalue())
 
 
-def read_readings(path: Path | str, grid: Grid, parameters: Parameters) -> ReadingArchive:
-    """Read what `write_readings` wrote beside the maps of a grid.
+def read_readings(path: Path | str, maps: MapArchive) -> ReadingArchive:
+    """Read what `write_readings` wrote beside these maps.
 
     Raises
     ------
@@ -66,14 +66,20 @@ def read_readings(path: Path | str, grid: Grid, parameters: Parameters) -> Readi
             names = tuple(str(name) for name in data['sensor_names'])
             readings = Readings.from_columns(names, **{name: data[name] for name in COLUMNS})
             x, y = data['normals']
+            same = float(data['log_likelihood']) == maps.log_likelihood
+            sound = all(np.isfinite(data[name]).all() for name in COLUMNS)
     except FileNotFoundError as error:
-        raise InputError(f'{path} does not exist: the maps were made by an earlier version; make them anew') from error
+        raise InputError(f'{path} does not exist; make the maps anew') from error
     except Exception as error:  # zipfile, zlib and numpy have many kinds for damaged bytes
         raise InputError(f'{path} is not an archive of readings, or is damaged: {error}') from error
-    if x.shape != grid.shape or not (
-        0 <= readings.sensor.min(initial=0) <= readings.sensor.max(initial=0) < len(names)
+    if not sound:
+        raise InputError(f'{path} is damaged: it has numbers that are not finite')
+    if (
+        not same
+        or x.shape != maps.grid.shape
+        or not (0 <= readings.sensor.min(initial=0) <= readings.sensor.max(initial=0) < len(names))
     ):
         raise InputError(f'{path} is not of the maps beside it')
     known = ((x != 0) | (y != 0)).astype(np.uint8)
-    found = known_normals(known, x, y, parameters.model.max_incidence_angle) if known.any() else no_normals()
+    found = known_normals(known, x, y, maps.parameters.model.max_incidence_angle) if known.any() else no_normals()
     return ReadingArchive(readings, found)

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import queue
 import time
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from typing import Any
 
+from ..core.common.errors import Cancelled
 from ..core.common.parameters import Parameters
+from ..core.common.readings import Readings
 from ..core.learning.consistency import consistency_warnings
 from ..core.mapping import Mapper
 from ..core.maps.map_set import MapSet
@@ -21,6 +25,15 @@ from .kernels import Kernels
 from .map_publishers import MapPublishers
 from .online import OnlineWorker
 from .sensor_status import SensorWatch
+
+
+def _waited_for(taken: queue.SimpleQueue[tuple[int, Any]], run: Run) -> tuple[int, Any]:
+    """Return what the executor takes for a run, unless this is cancelled."""
+    while True:
+        if run.cancelled:
+            raise Cancelled('cancelled before it began')
+        with suppress(queue.Empty):
+            return taken.get(timeout=0.1)
 
 
 class EmService:
@@ -60,7 +73,7 @@ class EmService:
         self.online: OnlineWorker | None = None
         self.extrinsics: Callable[[], Mapping[str, Pose2]] = dict
         self._parameters, self._associator, self._publishers = parameters, associator, publishers
-        self._inbox, self._logger = inbox, logger
+        self._inbox, self._kernels, self._logger = inbox, kernels, logger
         self._watched = 0.0
         self._generation = 0
         self.worker = EmWorker(self._watch, logger.error, inbox.put, lambda stop: kernels.wait('EM', stop))
@@ -111,7 +124,15 @@ class EmService:
 
     def _start(self, done: Callable[[Outcome], object]) -> None:
         generation, buffer, bound = self._publishers.generation, self._associator.buffer, self._associator.buffer.bound
-        count, held = len(buffer), buffer.snapshot()
+        # what comes while kernels are compiled is mapped as well
+        early = None if self._kernels.has('EM') else queue.SimpleQueue[tuple[int, Any]]()
+        taken = [(len(buffer), buffer.snapshot())]
+
+        def readings() -> Readings:
+            if early is not None:
+                self._inbox.put(lambda: early.put((len(buffer), buffer.snapshot())))
+                taken[0] = _waited_for(early, run)
+            return bounded(taken[0][1], bound)
 
         def found(maps: MapSet) -> None:
             self._publishers.publish('ml_map', generation, maps.grid, maps.ml)
@@ -121,11 +142,11 @@ class EmService:
             if generation != self._publishers.generation:
                 # whoever waits is told the same
                 outcome.maps, outcome.message = None, 'EM was cancelled by reset'
-            self._finish(outcome, count)
+            self._finish(outcome, taken[0][0])
 
         parameters = self._parameters()
         start = self.online.so_far() if self.online else None
-        run = Run(Mapper(parameters), parameters, lambda: bounded(held, bound), found, start)
+        run = Run(Mapper(parameters), parameters, readings, found, start)
         self._generation = generation
         self.worker.start(run, finish)
         run.waiting.append(done)

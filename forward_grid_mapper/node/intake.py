@@ -160,6 +160,8 @@ class Intake:
             self._take(made, sent, self.paused)
         elif len(self._held) - self._ranges_held < MOST_WAITING:
             self._hold(made, sent)
+        else:
+            self._odometry_losses.add(1)
         self._wake()
 
     def begin(self) -> None:

@@ -52,15 +52,16 @@ class Losses:
         number = info.get('publication_sequence_number')
         missing = self._by_stamp(frame, stamp) if number is None else self._by_number(number)
         if missing:
-            self._add(missing)
+            self.add(missing)
 
     def told(self, info: Any) -> None:
         """Note what the middleware says of losses; what it says and what gaps tell may be the same messages."""
         self._told += info.total_count_change
         if self._told > self.lost:
-            self._add(self._told - self.lost)
+            self.add(self._told - self.lost)
 
-    def _add(self, missing: int) -> None:
+    def add(self, missing: int) -> None:
+        """Note messages that nobody will take any more."""
         self.lost += missing
         self.recent = time.monotonic()
 

@@ -88,6 +88,9 @@ class MapperNode(Node):
             If the journal or the map frame cannot be had.
         """
         node, log = self.parameters.node, self.get_logger()
+        odometry = self.resolve_topic_name(node.odom_topic)
+        if odometry in map(self.resolve_topic_name, node.range_topics):
+            raise MapperError(f'{odometry} cannot be a topic of Range and of odometry: set range_topics or odom_topic')
         transforms = Transforms.of(self)
         extrinsics = Extrinsics(self._given_extrinsics, transforms)
         self._map_frame = MapFrame(node.map_frame, transforms, self.parameters.association.pose_timeout)

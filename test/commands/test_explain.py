@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from pathlib import Path
 
@@ -10,6 +11,8 @@ import pytest
 from drive_samples import code_of, mapped, tape, write_tape
 
 from forward_grid_mapper.commands import explain
+from forward_grid_mapper.core.common.grid import Grid
+from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.maps.cell_evidence import cell_evidence
 from forward_grid_mapper.files import drawing
 from forward_grid_mapper.files.map_archive import MapArchive, read_npz
@@ -41,7 +44,7 @@ def test_a_cell_is_explained(maps: Path, state: int, word: str, capsys: pytest.C
     assert code_of(explain.main, maps, x, y) == 0
     said = capsys.readouterr().out
     assert said.splitlines()[0].endswith(f': {word}')
-    readings, normals = read_readings(maps / 'readings.npz', archive.grid, archive.parameters)
+    readings, normals = read_readings(maps / 'readings.npz', archive)
     found = cell_evidence(readings, archive.grid, archive.ml, archive.parameters, normals, (x, y))
     total = re.search(r'([+-][\d.]+) nats from (\d+) readings', said)
     assert total and (float(total[1]), int(total[2])) == (pytest.approx(found.data, abs=0.051), len(found.readings))
@@ -52,7 +55,7 @@ def test_a_cell_is_explained(maps: Path, state: int, word: str, capsys: pytest.C
 
 def test_readings_are_kept_as_they_were(maps: Path) -> None:
     archive = read_npz(maps / 'maps.npz')
-    readings, normals = read_readings(maps / 'readings.npz', archive.grid, archive.parameters)
+    readings, normals = read_readings(maps / 'readings.npz', archive)
     assert len(readings) > 0
     assert set(readings.sensor_names) == {frame for frame, _ in tape().extrinsics}
     assert normals.known.any()
@@ -91,8 +94,22 @@ def test_folders_without_maps_or_readings_are_named(
     for content, reason in ((b'PK\3\4nothing', 'is damaged'), (None, 'is not of the maps beside it')):
         if content is None:
             with np.load(maps / 'readings.npz', allow_pickle=False) as data:
-                np.savez(tmp_path / 'readings.npz', **{**data, 'normals': data['normals'][:, 1:]})
+                np.savez(tmp_path / 'readings.npz', **{**data, 'log_likelihood': data['log_likelihood'] + 1e-6})
         else:
             (tmp_path / 'readings.npz').write_bytes(content)
         assert code_of(explain.main, tmp_path, 0, 0) == 1
         assert reason in capsys.readouterr().err
+
+
+@pytest.mark.parametrize('resolution', [0.05, 0.1, 0.2])
+def test_the_edges_of_a_map_are_those_of_its_cells(resolution: float) -> None:
+    nothing = np.zeros((3, 27))
+    for column in range(-40, 40):
+        grid = Grid(resolution, column, 0, 27, 3)
+        archive = MapArchive(grid, nothing, nothing, nothing, 0.0, 0.0, Parameters())
+        for edge in grid.extent[:2]:
+            for x in (edge, round(edge, 6), np.nextafter(edge, -9), np.nextafter(edge, 9)):
+                _, (at,) = grid.cells_of(np.array([x]), np.array([0.0]))
+                assert explain._on_map(archive, float(x), 0.0) == (0 <= at < grid.width), x
+    assert not explain._on_map(archive, math.inf, 0.0)
+    assert not explain._on_map(archive, 0.0, 1e300)

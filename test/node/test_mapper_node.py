@@ -246,6 +246,13 @@ def test_a_bad_value_at_start_is_an_error(start: Any) -> None:
     assert 'Traceback' not in node.output
 
 
+def test_one_topic_for_ranges_and_odometry_is_an_error(start: Any) -> None:
+    node = start('-p', 'odom_topic:=/sonar', ready=False)
+    assert node.process.wait(60) == 1
+    assert '/sonar cannot be a topic of Range and of odometry' in node.output
+    assert 'Traceback' not in node.output
+
+
 def test_misspelt_parameters_are_named(start: Any) -> None:
     node = start('-p', 'p_hitt:=0.5')
     assert 'did you mean p_hit' in node.output

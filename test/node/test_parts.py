@@ -124,6 +124,25 @@ def test_poses_that_contradict_the_readings_are_told_of_after_the_answer(
     assert node.em.wrong_input == []
 
 
+def test_em_maps_what_comes_while_its_kernels_are_compiled(
+    inside: Callable[..., Inside], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    robot = inside().start()
+    node = robot.node
+    compiled = threading.Event()
+    monkeypatch.setattr(node.kernels, 'has', lambda name: False)
+    monkeypatch.setattr(node.em.worker, '_prepare', lambda stop: compiled.wait(60.0))
+    robot.drive(0, 20)
+    answers: list[Any] = []
+    node.em.run_em(SimpleNamespace(send=lambda *answer: answers.append(answer)))
+    robot.drive(20, 30)
+    compiled.set()
+    robot.until(lambda: answers)
+    assert answers[0][0]
+    assert answers[0][1].startswith('50 readings')
+    assert node.em.explained == 50
+
+
 def test_commands_do_not_wait_for_the_online_map(
     inside: Callable[..., Inside], monkeypatch: pytest.MonkeyPatch
 ) -> None:

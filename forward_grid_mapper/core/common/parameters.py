@@ -14,6 +14,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, get_origin, get_type_hints
 
+import numpy as np
+
 from .errors import ParameterError
 
 LOG = logging.getLogger('forward_grid_mapper')
@@ -340,6 +342,8 @@ class Parameter:
             str: 'text',
             tuple: 'a list of text',
         }[self.type]
+        if isinstance(value, np.generic):
+            value = value.item()
         if self.type is tuple and isinstance(value, list) and all(isinstance(v, str) and v for v in value):
             value = tuple(value)
         if self.type is float and isinstance(value, int) and not isinstance(value, bool):
