@@ -103,7 +103,9 @@ def _open_folder(folder: Path) -> tuple[list[Source], str | None]:
                 f'{folder} has no metadata.yaml but several bag files; name one of them ({bags}) '
                 f'or run `ros2 bag reindex {quoted(folder)}`.'
             )
-        raise BagError(f'{folder} is not a bag: it has neither metadata.yaml nor a .mcap, .db3 or .bag file.')
+        inside = sorted(path.parent for path in folder.glob('*/metadata.yaml'))
+        hint = f' There is one in it: {inside[0]}' if inside else ''
+        raise BagError(f'{folder} is not a bag: it has neither metadata.yaml nor a .mcap, .db3 or .bag file.{hint}')
     listed = _without_repetition(folder / name for name in metadata.files)
     sources, problems = _open_each([p for p in listed if p.exists()] or present, metadata.compression)
     problems += [f'{p.name} is missing' for p in listed if not p.exists()]

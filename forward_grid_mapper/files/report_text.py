@@ -69,7 +69,7 @@ def _trajectory(data: dict[str, Any]) -> Iterator[str]:
         f'root mean square; {places} {"place" if places == 1 else "places"} recognised; {found["reason"]}',
     )
     if words := found.get('odometry'):
-        yield from _line('Wheels', words)
+        yield from _line('Wheels', f'{words} (what fits this drive; measure before you set it)')
 
 
 def _counts(data: dict[str, Any]) -> Iterator[str]:

@@ -66,6 +66,13 @@ def refused_drive(capsys: pytest.CaptureFixture[str], folder: Path, drive: Tape,
 # ---- bags
 
 
+def test_a_folder_that_holds_a_bag_is_told_apart_from_one(
+    tmp_path: Path, plain: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    said = refusal(capsys, tmp_path, plain, '-o', tmp_path / 'maps')
+    assert 'is not a bag' in said and f'There is one in it: {plain / "bag"}' in said
+
+
 def test_no_such_bag(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     said = refusal(capsys, tmp_path, tmp_path / 'absent', '-o', tmp_path / 'maps')
     assert str(tmp_path / 'absent') in said and 'does not exist' in said and 'Give a bag' in said

@@ -136,7 +136,7 @@ class Refinement:
 
 
 class Refiner:
-    """Runs from a drive to its trajectory; can be cancelled from another thread."""
+    """Runs from a drive to its trajectory; can be cancelled from another thread, once and for all."""
 
     def __init__(self, parameters: Parameters) -> None:
         """Prepare runs with these parameters; the sensor model and the search are those of the maps."""
