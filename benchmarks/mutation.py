@@ -37,7 +37,6 @@ MODULES = {
     'bags/choice': ('bags/test_topic_choice',),
     'bags/static_transforms': ('bags/test_static_transforms',),
     'node/losses': ('node/test_losses',),
-    'node/background': ('node/test_background',),
 }
 """Modules, and the tests that must notice their changes; each takes seconds."""
 
