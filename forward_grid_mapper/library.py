@@ -13,15 +13,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from .core.common.errors import InputError
 from .core.common.parameters import Parameters
-from .core.learning.consistency import consistency_warnings
-from .core.learning.input_warnings import input_warnings
 from .core.mapping import Mapper, Watch
 from .core.maps.map_set import MapSet
 from .core.messages.message_types import NANOSECONDS, OdometryMessage, Pose2, RangeMessage
 from .core.messages.pose_association import PoseAssociator
 from .core.messages.quaternions import yaw_of
 from .core.messages.rep117 import ODOMETRY_REASONS, REASONS
-from .files.quality_warning import quality_warning
+from .files.quality_warning import data_warnings
 from .files.results import write_results
 
 __all__ = ['Sonar', 'SonarMaps', 'make_maps', 'poses_from_tum']
@@ -92,6 +90,8 @@ class SonarMaps:
         Where the robot drove, metres.
     source : dict
         What the report says of the input.
+    judged : tuple of str
+        Those of the warnings that the maps gave rise to.
     """
 
     maps: MapSet
@@ -100,6 +100,7 @@ class SonarMaps:
     warnings: tuple[str, ...]
     path: NDArray[np.float64]
     source: dict[str, Any]
+    judged: tuple[str, ...]
 
     def save(self, folder: Path | str, title: str = 'Sonar maps') -> dict[str, Any]:
         """Write maps for map_server, archive, picture and report into a new folder; return the report.
@@ -109,7 +110,7 @@ class SonarMaps:
         OutputError
             If the folder exists, or cannot be written.
         """
-        return write_results(folder, self.maps, self.source, self.path, title)
+        return write_results(folder, self.maps, self.source, self.path, title, judged=self.judged)
 
 
 def _column(name: str, values: ArrayLike, length: int | None = None) -> NDArray[np.float64]:
@@ -232,17 +233,12 @@ def make_maps(
     for reason, count in associator.rejected.items():
         if count > MANY * len(values):
             before.append(f'{count} of {len(values)} ranges were rejected as {reason}: {REASONS[reason]}')
-    found = [
-        *before,
-        *input_warnings(maps.readings),
-        *consistency_warnings(maps.readings, mounted, chosen),
-        *filter(None, [quality_warning(maps)]),
-    ]
+    judged = tuple(data_warnings(maps, mounted))
     path = np.array(associator.path, np.float64).reshape(-1, 2)
     rejected = dict(associator.rejected)
     counts = {'received': len(values), 'accepted': len(associator.buffer), 'rejected': rejected}
     source = {'counts': counts, 'warnings': before, 'extrinsics': mounted}
-    return SonarMaps(maps, len(values), rejected, tuple(found), path, source)
+    return SonarMaps(maps, len(values), rejected, (*before, *judged), path, source, judged)
 
 
 def _told_of_poses(associator: PoseAssociator) -> list[str]:

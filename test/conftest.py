@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import signal
 import sys
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +13,10 @@ import numpy as np
 import pytest
 
 from forward_grid_mapper.core.common.grid import Grid
-from forward_grid_mapper.core.common.parameters import ModelParameters, SearchParameters
+from forward_grid_mapper.core.common.parameters import ModelParameters, Parameters, SearchParameters
 from forward_grid_mapper.core.common.readings import Readings
+from forward_grid_mapper.core.messages.message_types import OdometryMessage, Pose2, RangeMessage
+from forward_grid_mapper.core.messages.pose_association import PoseAssociator
 from forward_grid_mapper.core.search.search import Search
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -87,3 +90,17 @@ def pytest_configure() -> None:
     """
     if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def associated(
+    extrinsics: Mapping[str, Pose2], odometry: Iterable[OdometryMessage], ranges: Iterable[RangeMessage]
+) -> PoseAssociator:
+    """What a recording of these messages gives, in the order of their stamps."""
+    made = PoseAssociator(lambda base, frame, stamp: extrinsics.get(frame), Parameters(), patient=True)
+    for message in sorted([*odometry, *ranges], key=lambda m: m.stamp):
+        if isinstance(message, RangeMessage):
+            made.add_range(message)
+        else:
+            made.add_odometry(message)
+    made.finish()
+    return made

@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 
 import forward_grid_mapper
+from conftest import associated
 from forward_grid_mapper import Sonar, SonarMaps, library, make_maps, poses_from_tum
 from forward_grid_mapper.core.common.errors import InputError, ParameterError
 from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.mapping import Mapper
-from forward_grid_mapper.core.messages.pose_association import PoseAssociator
 from forward_grid_mapper.simulation.drive import door_drive
 from forward_grid_mapper.simulation.sonar import NOISY, front_array
 
@@ -45,13 +45,7 @@ def given() -> dict[str, Any]:
 def expected() -> Any:
     """The maps of the same drive as messages."""
     drive = door_drive(1, NOISY, 0, front_array())
-    poses = dict(drive.extrinsics)
-    associator = PoseAssociator(lambda base, frame, stamp: poses.get(frame), Parameters(), patient=True)
-    for odometry in drive.odometry:
-        associator.add_odometry(odometry)
-    for message in drive.ranges:
-        associator.add_range(message)
-    associator.finish()
+    associator = associated(dict(drive.extrinsics), drive.odometry, drive.ranges)
     return Mapper(Parameters()).run(associator.readings)
 
 
@@ -109,16 +103,18 @@ def test_the_report_warns_of_what_the_result_warns_of(tmp_path: Path) -> None:
         make_maps(**{**arrays, 'poses': poses * [0, 0, 0] + [1e8, 0, 0]})
 
 
-def test_poses_of_sensors_are_compared_with_the_readings(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_poses_of_sensors_are_compared_with_the_readings_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[Any] = []
 
-    def turned(readings: Any, extrinsics: Any, parameters: Any) -> list[str]:
+    def turned(maps: Any, extrinsics: Any) -> list[str]:
         asked.append(extrinsics)
         return ['sensors are turned']
 
-    monkeypatch.setattr(library, 'consistency_warnings', turned)
+    monkeypatch.setattr(library, 'data_warnings', turned)
     arrays = given()
-    assert 'sensors are turned' in make_maps(**arrays).warnings
+    found = make_maps(**arrays)
+    assert 'sensors are turned' in found.warnings
+    assert 'sensors are turned' in found.save(tmp_path / 'maps')['warnings']
     assert asked == [{name: (s.x, s.y, s.yaw) for name, s in arrays['sensors'].items()}]
 
 

@@ -70,6 +70,9 @@ def read_npz(path: Path | str) -> MapArchive:
         If the file is missing, damaged or something else.
     """
     path = Path(path)
+    if path.exists() and not path.is_file():
+        # a pipe would be waited for
+        raise InputError(f'{path} is no file')
     try:
         with path.open('rb') as file, np.load(file, allow_pickle=False) as data:
             ml = data['ml_map']

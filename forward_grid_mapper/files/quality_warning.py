@@ -1,16 +1,37 @@
-"""What users are warned of: readings that do not fit the map, and readings that it was not made from."""
+"""What users are warned of: input that is wrong without an error, and readings that do not fit the map."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 
+from ..core.learning.consistency import consistency_warnings
+from ..core.learning.input_warnings import input_warnings
 from ..core.maps.map_set import MapSet
+from ..core.messages.message_types import Pose2
 
 TOO_MANY = 0.5
 """Fraction of unexplained readings above which a warning is due."""
 
 ENOUGH = 20
 """Readings below which nothing can be said."""
+
+
+def data_warnings(maps: MapSet, extrinsics: Mapping[str, Pose2]) -> list[str]:
+    """Return all that is wrong with the readings of a map, each with its remedy.
+
+    Parameters
+    ----------
+    maps : MapSet
+    extrinsics : mapping
+        Poses of the sensors that are fixed to the robot, by `frame_id`.
+    """
+    return [
+        *input_warnings(maps.readings),
+        *consistency_warnings(maps.readings, extrinsics, maps.parameters),
+        *filter(None, [quality_warning(maps)]),
+    ]
 
 
 def quality_warning(maps: MapSet) -> str:

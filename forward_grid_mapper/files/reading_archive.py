@@ -61,6 +61,9 @@ def read_readings(path: Path | str, maps: MapArchive) -> ReadingArchive:
         If the file is missing, damaged, something else or of other maps.
     """
     path = Path(path)
+    if path.exists() and not path.is_file():
+        # a pipe would be waited for
+        raise InputError(f'{path} is no file')
     try:
         with path.open('rb') as file, np.load(file, allow_pickle=False) as data:
             names = tuple(str(name) for name in data['sensor_names'])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,13 +11,11 @@ from numpy.typing import NDArray
 
 from ..core.common.errors import OutputError
 from ..core.common.grid import Grid
-from ..core.learning.consistency import consistency_warnings
-from ..core.learning.input_warnings import input_warnings
 from ..core.maps.map_set import MapSet
 from .map_archive import write_npz
 from .map_files import write_raw, write_trinary
 from .output_folder import output_errors, output_folder
-from .quality_warning import quality_warning
+from .quality_warning import data_warnings
 from .reading_archive import write_readings
 from .report import report_data, write_report
 
@@ -31,6 +29,7 @@ def write_results(
     reference: tuple[Grid, NDArray[np.int8]] | None = None,
     extras: Mapping[str, str] | None = None,
     odometry_xy: NDArray[np.float64] | None = None,
+    judged: Sequence[str] | None = None,
 ) -> dict[str, Any]:
     """Write maps, archive, picture and report into a new folder; nothing is left if any of them fails.
 
@@ -51,6 +50,8 @@ def write_results(
         More text files, by name.
     odometry_xy : float64, shape (Q, 2), optional
         The path that odometry gives, metres, where the robot was elsewhere.
+    judged : sequence of str, optional
+        What `data_warnings` says of the maps, if that is known.
 
     Returns
     -------
@@ -70,9 +71,7 @@ def write_results(
         write_readings(folder / 'readings.npz', maps)
         warnings = [
             *(source.get('warnings') or []),
-            *input_warnings(maps.readings),
-            *consistency_warnings(maps.readings, source.get('extrinsics') or {}, maps.parameters),
-            *filter(None, [quality_warning(maps)]),
+            *(data_warnings(maps, source.get('extrinsics') or {}) if judged is None else judged),
         ]
         try:
             from .picture import NOWHERE, write_picture

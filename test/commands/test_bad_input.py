@@ -179,6 +179,15 @@ def test_no_frame_has_a_pose_and_some_readings_are_rejected_for_another_reason(
     assert 'no /tf_static' in said and f'--sensor {FRAMES[0]}=x,y,yaw' in said
 
 
+def test_names_that_would_write_on_the_terminal_are_rejected_and_shown_as_text(tmp_path: Path) -> None:
+    drive = tape()
+    bad = drive.ranges[0]._replace(frame_id='a\n\x1b[31mX')
+    mapped(write_tape(tmp_path / 'bag', drive._replace(ranges=[bad, *drive.ranges[1:]])), tmp_path / 'maps')
+    text = (tmp_path / 'maps' / 'report.txt').read_text()
+    assert 'unprintable_frame_id (a\\n\\x1b[31mX 1)' in text
+    assert '\x1b' not in text
+
+
 def test_frames_that_do_not_join_the_robot(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     said = refused_drive(capsys, tmp_path, tape().with_odometry(child_frame_id='base_footprint'))
     assert 'base_footprint' in said and 'base_link' in said and '--sensor' in said

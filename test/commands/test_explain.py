@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 import re
 from pathlib import Path
 
@@ -113,3 +114,12 @@ def test_the_edges_of_a_map_are_those_of_its_cells(resolution: float) -> None:
                 assert explain._on_map(archive, float(x), 0.0) == (0 <= at < grid.width), x
     assert not explain._on_map(archive, math.inf, 0.0)
     assert not explain._on_map(archive, 0.0, 1e300)
+
+
+@pytest.mark.parametrize('name', ['maps.npz', 'readings.npz'])
+def test_a_pipe_is_not_waited_for(maps: Path, tmp_path: Path, name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / 'maps.npz').write_bytes((maps / 'maps.npz').read_bytes())
+    (tmp_path / name).unlink(missing_ok=True)
+    os.mkfifo(tmp_path / name)
+    assert code_of(explain.main, tmp_path, 0, 0) == 1
+    assert f'{name} is no file' in capsys.readouterr().err

@@ -211,6 +211,9 @@ class PoseAssociator:
         if max(len(message.frame_id), len(message.child_frame_id)) > LONGEST_NAME:
             self.odometry_rejected['long_frame_id'] += 1
             return
+        if not (message.frame_id + message.child_frame_id).isprintable():
+            self.odometry_rejected['unprintable_frame_id'] += 1
+            return
         if not self.map_frame and not self.base_frame:
             self.map_frame, self.base_frame = message.frame_id, message.child_frame_id
         if (message.frame_id, message.child_frame_id) != (self.map_frame, self.base_frame):
@@ -269,7 +272,8 @@ class PoseAssociator:
         self.rejected[reason] += count
         known = self.rejected_by_frame
         new = len(known) < MOST_FRAMES and len(frame_id) <= LONGEST_NAME
-        frame = frame_id if frame_id in known or new else OTHERS
+        name = frame_id if frame_id.isprintable() else frame_id.encode('unicode_escape').decode()
+        frame = name if name in known or new else OTHERS
         self.rejected_by_frame.setdefault(frame, Counter())[reason] += count
 
     def _reject_unknown(self, measured: Measurement) -> None:

@@ -16,6 +16,7 @@ REASONS = {
     'bad_field_of_view': 'the field of view is not between 0 and 180 degrees; parameter field_of_view overrides it',
     'empty_frame_id': 'the header has no frame_id, so the sensor is unknown',
     'long_frame_id': 'the frame_id has more than 255 characters',
+    'unprintable_frame_id': 'the frame_id has characters that cannot be printed',
     'unknown_extrinsics': 'nothing says where this frame is on the robot: give --sensor, a YAML or a transform',
     'before_odometry': 'the stamp is before the first odometry, or the message came minutes late',
     'after_odometry': 'the recording ended before odometry reached the stamp',
@@ -36,6 +37,7 @@ REASONS = {
 ODOMETRY_REASONS = {
     'bad_pose': 'the pose is not finite, absurdly far away or on end, or its quaternion is not normalised',
     'long_frame_id': 'the frame_id or child_frame_id has more than 255 characters',
+    'unprintable_frame_id': 'the frame_id or child_frame_id has characters that cannot be printed',
     'other_frame': 'the frame_id or child_frame_id is not that of the first odometry message; reset takes the new',
 }
 """Why an odometry message is rejected, in words."""
@@ -75,6 +77,8 @@ def measure(message: RangeMessage, parameters: AssociationParameters) -> Measure
         return 'empty_frame_id'
     if len(message.frame_id) > LONGEST_NAME:
         return 'long_frame_id'
+    if not message.frame_id.isprintable():
+        return 'unprintable_frame_id'
     angle = parameters.field_of_view or message.field_of_view
     if not 0.0 < angle < math.pi:
         return 'bad_field_of_view'

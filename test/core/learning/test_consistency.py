@@ -15,12 +15,12 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
+from conftest import associated
 from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.common.readings import Readings
 from forward_grid_mapper.core.learning.consistency import consistency_warnings
 from forward_grid_mapper.core.mapping import Mapper
 from forward_grid_mapper.core.messages.message_types import NANOSECONDS, OdometryMessage, Pose2, RangeMessage
-from forward_grid_mapper.core.messages.pose_association import PoseAssociator
 from forward_grid_mapper.files.quality_warning import quality_warning
 from forward_grid_mapper.simulation.drive import Recording, building_drive, corridor_drive, door_drive, drive
 from forward_grid_mapper.simulation.sonar import NOISE_FREE, NOISY, front_array, sonar_ring
@@ -65,15 +65,7 @@ def office() -> Messages:
 
 
 def told(messages: Messages) -> list[str]:
-    associator = PoseAssociator(lambda base, frame, stamp: messages.extrinsics.get(frame), Parameters(), patient=True)
-    merged: list[OdometryMessage | RangeMessage] = [*messages.odometry, *messages.ranges]
-    for message in sorted(merged, key=lambda m: m.stamp):
-        if isinstance(message, RangeMessage):
-            associator.add_range(message)
-        else:
-            associator.add_odometry(message)
-    associator.finish()
-    return consistency_warnings(associator.readings, messages.extrinsics)
+    return consistency_warnings(associated(*messages).readings, messages.extrinsics)
 
 
 def turned(degrees: float) -> Callable[[Pose2], Pose2]:

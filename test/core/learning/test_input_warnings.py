@@ -12,10 +12,10 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
+from conftest import associated
 from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.learning.input_warnings import input_warnings
 from forward_grid_mapper.core.messages.message_types import OdometryMessage, Pose2, RangeMessage
-from forward_grid_mapper.core.messages.pose_association import PoseAssociator
 from forward_grid_mapper.simulation.drive import building_drive, corridor_drive, door_drive
 from forward_grid_mapper.simulation.sonar import NOISE_FREE, NOISY, SonarArray, front_array, sonar_ring
 
@@ -57,14 +57,7 @@ def circling() -> Messages:
 
 def told(messages: Messages) -> list[str]:
     """What is said of a drive, node and offline alike."""
-    associator = PoseAssociator(lambda base, frame, stamp: messages.extrinsics.get(frame), Parameters(), patient=True)
-    merged: list[OdometryMessage | RangeMessage] = [*messages.odometry, *messages.ranges]
-    for message in sorted(merged, key=lambda m: m.stamp):
-        if isinstance(message, RangeMessage):
-            associator.add_range(message)
-        else:
-            associator.add_odometry(message)
-    associator.finish()
+    associator = associated(*messages)
     return [*associator.limits.warnings(), *input_warnings(associator.readings)]
 
 

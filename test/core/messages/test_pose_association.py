@@ -73,6 +73,7 @@ def accounted(p: PoseAssociator) -> bool:
         ({'min_range': -0.1}, 'bad_limits'),
         ({'frame_id': ''}, 'empty_frame_id'),
         ({'frame_id': 'x' * 300}, 'long_frame_id'),
+        ({'frame_id': 'a\n\x1b[31mX'}, 'unprintable_frame_id'),
     ],
 )
 def test_rejections_of_rep_117(changes: dict[str, object], reason: str) -> None:
