@@ -78,17 +78,17 @@ def compose(
     ]
     if reference is not None:
         named.append(('Reference', reference[0], _probability(reference[1])))
-    known = (maps.ml != UNKNOWN) | np.isfinite(maps.live)
-    view = _view(maps.grid, known, np.concatenate([path_xy, odometry_xy]))
+    view = view_of(maps, np.concatenate([path_xy, odometry_xy]))
     panels = [Panel(name, *_crop(grid, values, view)) for name, grid, values in named]
-    return Picture(title, _figures(maps), panels, view, 1, path_xy, _unexplained_ends(maps), odometry_xy)
+    return Picture(title, figures_of(maps), panels, view, 1, path_xy, _unexplained_ends(maps), odometry_xy)
 
 
 def _probability(cells: NDArray[np.int8]) -> NDArray[np.float32]:
     return np.where(cells == UNKNOWN, np.nan, cells).astype(np.float32)
 
 
-def _figures(maps: MapSet) -> str:
+def figures_of(maps: MapSet) -> str:
+    """Return the line of figures below the title."""
     readings = len(maps.readings)
     parts = [f'{readings:,} readings', f'{100 * maps.grid.resolution:g} cm cells']
     if np.isfinite(maps.log_likelihood):
@@ -99,8 +99,9 @@ def _figures(maps: MapSet) -> str:
     return '   ·   '.join(parts)
 
 
-def _view(grid: Grid, known: NDArray[np.bool_], path_xy: NDArray[np.float64]) -> Box:
-    """Return the box around the known cells and the path, with a margin."""
+def view_of(maps: MapSet, path_xy: NDArray[np.float64]) -> Box:
+    """Return the box around the known cells and the path, with a margin: left, right, bottom, top in metres."""
+    grid, known = maps.grid, (maps.ml != UNKNOWN) | np.isfinite(maps.live)
     columns, rows = np.flatnonzero(known.any(axis=0)), np.flatnonzero(known.any(axis=1))
     left, right, bottom, top = grid.extent
     if len(rows):
