@@ -1,4 +1,4 @@
-"""Pictures of what `quality.py` maps: the truth, the standard map, the paper's plain ML map, and the default's."""
+"""Pictures of what `quality.py` maps: the truth, the standard map, the maximum likelihood map of the paper and ours."""
 
 from __future__ import annotations
 

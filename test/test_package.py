@@ -198,7 +198,7 @@ def test_rviz_shows_the_three_maps() -> None:
         assert display['Topic']['Durability Policy'] == 'Transient Local'
         assert display['Topic']['Reliability Policy'] == 'Reliable'
     assert {display['Name']: display['Alpha'] for display in maps if display['Enabled'] and display['Alpha'] == 1} == {
-        'ML map': 1
+        'Maximum likelihood map': 1
     }
     assert displays['Odometry path']['Topic']['Value'] == '/odom'
     assert displays['TF']['Enabled']

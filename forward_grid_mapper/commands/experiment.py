@@ -93,7 +93,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def forward(cases: Iterable[Case], parameters: Parameters, title: str) -> Outcome:
-    """Score the ML map of every case."""
+    """Score the maximum likelihood map of every case."""
     scores, tiles = [], []
     for case in cases:
         maps = Mapper(parameters).run(case.recording.readings)

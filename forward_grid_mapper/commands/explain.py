@@ -76,7 +76,8 @@ def explanation(maps: MapArchive, readings: Readings, found: CellEvidence, shown
     cell, state = (found.row, found.column), int(maps.ml[found.row, found.column])
     x, y = (values[k] for values, k in zip(maps.grid.centers(), reversed(cell), strict=True))
     yield f'cell at x = {x:.2f} m, y = {y:.2f} m (row {found.row}, column {found.column}): {STATES[state]}'
-    yield f'  obstacle: {_percent(maps.uncertainty[cell])} (uncertainty map), {_percent(maps.live[cell])} (live map)'
+    uncertainty, standard = _percent(maps.uncertainty[cell]), _percent(maps.live[cell])
+    yield f'  obstacle: {uncertainty} (uncertainty map), {standard} (standard map)'
     count = len(found.readings)
     yield f'  {_nats(found.data)} nats from {count} readings, {_nats(found.prior)} from the prior of walls'
     groups = (

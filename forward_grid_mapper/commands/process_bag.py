@@ -33,7 +33,7 @@ def parser() -> argparse.ArgumentParser:
     made = BagParser(
         COMMAND,
         description='Map a recorded drive: reads sonar Range and Odometry from a ROS 1 or ROS 2 bag and writes the '
-        'live log-odds map, the maximum likelihood map and the uncertainty map.',
+        'standard map, the maximum likelihood map and the uncertainty map.',
     )
     made.add_bag('ROS 2 bag folder, single .mcap or .db3 file, ROS 1 .bag, or a journal of the node')
     made.add_argument('-o', '--output', metavar='DIR', help='new folder for the results (default: BAG_maps)')

@@ -20,8 +20,9 @@ from matplotlib.patches import Patch
 from matplotlib.path import Path as Outline
 from matplotlib.ticker import MaxNLocator
 from matplotlib.transforms import Affine2D
+from numpy.typing import NDArray
 
-from .panels import Picture, Tile
+from .panels import Box, Picture, Tile, coarse
 
 # Free is white and unknown a cool tint, so that they differ to every eye; in between runs a warm scale, so that an
 # uncertain cell looks like neither. Path, dots and the path by odometry are blue, vermilion and purple of
@@ -40,6 +41,10 @@ _EDGE, _HEAD, _FOOT, _LABELS, _CAPTION, _GAP = 0.3, 0.8, 0.8, 0.55, 0.42, 0.3
 # Below this width the legend would run into the scale of probabilities.
 _MIN_WIDTH = 11.3
 _WIDE = 2.6
+# Pixels of a cell, at least: below that walls of one cell are hardly seen.
+_CELL = 2.5
+# Longest scale bar, as a part of the panel's width.
+_BAR = 0.2
 
 
 def draw(path: Path, picture: Picture) -> None:
@@ -58,16 +63,8 @@ def draw(path: Path, picture: Picture) -> None:
         axes = figure.add_axes((x / page_width, y / page_height, width / page_width, height / page_height))
         axes.set_facecolor(_UNKNOWN)
         if panel.values.size:
-            axes.imshow(
-                panel.values,
-                cmap=_PROBABILITY,
-                vmin=0.0,
-                vmax=1.0,
-                extent=panel.extent,
-                origin='lower',
-                interpolation='nearest',
-                aspect='auto',
-            )
+            _draw_map(axes, panel.values, panel.extent, (right - left) / (width * _DPI))
+        _draw_scale(axes, picture.view)
         if k == picture.overlay:
             _draw_overlay(axes, picture)
         _frame(axes, panel.title, picture.view, (column == 0, row == rows - 1))
@@ -91,14 +88,50 @@ def draw_table(path: Path, title: str, rows: Sequence[Sequence[Tile]], view: tup
             axes = figure.add_axes((x / page[0], y / page[1], width / page[0], height / page[1]))
             axes.set_facecolor(_UNKNOWN)
             shown = np.where(np.asarray(tile.values) < 0, np.nan, tile.values)
-            axes.imshow(
-                shown, cmap=_PROBABILITY, vmin=0, vmax=1, extent=tile.grid.extent, origin='lower', interpolation='none'
-            )
+            _draw_map(axes, shown, tile.grid.extent, (view[1] - view[0]) / (width * _DPI))
             axes.set(xlim=view[:2], ylim=view[2:], xticks=[], yticks=[])
+            _draw_scale(axes, view)
             axes.set_title(tile.title, loc='left', fontsize=9.5, color=_INK, pad=4)
             for spine in axes.spines.values():
                 spine.set(color=_FRAME, linewidth=0.7)
     figure.savefig(path)
+
+
+def _draw_map(axes: Axes, values: NDArray[Any], extent: Box, pixel: float) -> None:
+    """Draw a map in cells of at least `_CELL` pixels; `pixel` is the length that a pixel stands for, metres."""
+    left, right, bottom, top = extent
+    cell = (right - left) / values.shape[1]
+    step = max(1, math.ceil(_CELL * pixel / cell - 1e-9))
+    if step > 1:
+        values = coarse(values, step)
+        right, top = left + values.shape[1] * step * cell, bottom + values.shape[0] * step * cell
+    box = (left, right, bottom, top)
+    axes.imshow(
+        values, cmap=_PROBABILITY, vmin=0, vmax=1, extent=box, origin='lower', interpolation='nearest', aspect='auto'
+    )
+
+
+def _draw_scale(axes: Axes, view: Box) -> None:
+    """Draw a bar of a round length into the lower left corner."""
+    width, height = view[1] - view[0], view[3] - view[2]
+    longest = max(_BAR * width, 1e-3)
+    power = 10.0 ** math.floor(math.log10(longest))
+    length = next(n * power for n in (5, 2, 1) if n * power <= longest)
+    x, y = view[0] + 0.02 * width, view[2] + min(0.05 * height, 0.02 * width)
+    halo = [patheffects.withStroke(linewidth=4.5, foreground='white', alpha=0.9)]
+    axes.plot([x, x + length], [y, y], color=_INK, linewidth=2.0, solid_capstyle='butt', path_effects=halo, zorder=6)
+    text = f'{length:g} m' if length >= 1 else f'{100 * length:g} cm'
+    axes.annotate(
+        text,
+        (x + length, y),
+        (4, 0),
+        textcoords='offset points',
+        va='center',
+        fontsize=8,
+        color=_INK,
+        path_effects=[patheffects.withStroke(linewidth=2.5, foreground='white', alpha=0.9)],
+        zorder=6,
+    )
 
 
 def _layout(panels: int, aspect: float) -> tuple[int, int, float, float]:

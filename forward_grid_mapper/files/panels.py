@@ -21,6 +21,17 @@ class Tile(NamedTuple):
     values: NDArray[Any]
 
 
+def coarse(values: NDArray[Any], step: int) -> NDArray[np.float32]:
+    """Return a map in blocks of `step` cells, each with the largest of its values; NaN where all of them are.
+
+    Walls one cell thick stay, and do not fall between the pixels of a picture. Rows and columns are filled up with NaN.
+    """
+    pad = [(0, -n % step) for n in values.shape]
+    part = np.pad(np.asarray(values, np.float32), pad, constant_values=np.nan)
+    part = np.fmax.reduce(part.reshape(part.shape[0] // step, step, -1), axis=1)
+    return np.asarray(np.fmax.reduce(part.reshape(part.shape[0], -1, step), axis=2))
+
+
 class Panel(NamedTuple):
     """One map of the picture: `values` are probabilities with NaN where unknown, `extent` its box in metres."""
 

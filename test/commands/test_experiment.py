@@ -98,7 +98,7 @@ def test_demo(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Ca
     }
     out = capsys.readouterr().out
     assert (folder / 'scores.txt').read_text().strip() in out
-    assert re.search(r'^ML map +0\.\d{3}', out, re.MULTILINE)
+    assert re.search(r'^maximum likelihood map +0\.\d{3}', out, re.MULTILINE)
     assert code_of(demo.main, '--seen', 1, '--offline') == 0
     assert (tmp_path / 'demo_output_2' / 'maps' / 'maps.png').is_file()
 
@@ -108,7 +108,7 @@ def test_demo_through_the_node(tmp_path: Path, capsys: pytest.CaptureFixture[str
     assert code_of(demo.main, '--seen', 1, '--rate', 20, '-o', tmp_path / 'out') == 0
     out = capsys.readouterr().out
     assert 'EM in the node' in out
-    assert re.search(r'^ML map +0\.\d{3}', out, re.MULTILINE)
+    assert re.search(r'^maximum likelihood map +0\.\d{3}', out, re.MULTILINE)
     assert (tmp_path / 'out' / 'demo.png').is_file()
     assert (tmp_path / 'out' / 'maps' / 'report.txt').is_file()
 
