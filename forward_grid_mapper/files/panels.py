@@ -8,17 +8,29 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.common.grid import Grid
+from ..core.common.readings import Readings
 
 Box = tuple[float, float, float, float]
 """Left, right, bottom, top in metres."""
 
 
 class Tile(NamedTuple):
-    """One map of the table: `values` are probabilities, or cells 0 and 1, with NaN or -1 where unknown."""
+    """One map of the table: `values` are probabilities, or cells 0 and 1, with NaN or -1 where unknown.
+
+    The cones of `readings` are drawn over it.
+    """
 
     title: str
     grid: Grid
     values: NDArray[Any]
+    readings: Readings | None = None
+
+
+class Curve(NamedTuple):
+    """A density in 1/m over ranges in metres, both float64 of shape (N,)."""
+
+    x: NDArray[np.float64]
+    y: NDArray[np.float64]
 
 
 def coarse(values: NDArray[Any], step: int) -> NDArray[np.float32]:
