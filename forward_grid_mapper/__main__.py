@@ -1,3 +1,4 @@
+# PYTHON_ARGCOMPLETE_OK
 """The entry of every command: `python3 -m forward_grid_mapper COMMAND …`, and one script each once it is installed.
 
 Signals get their handlers before the commands' modules are imported, which takes a second.
@@ -12,7 +13,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from . import __version__
-from .commands import signals
+from .commands import completion, signals
 
 COMMANDS = {
     'mapper': ('node.main', 'the ROS 2 node: map while driving'),
@@ -105,6 +106,7 @@ def demo() -> int:
 
 def main() -> int:
     """Run the command named by the first argument."""
+    completion.complete(COMMANDS, __package__)
     given = sys.argv[1] if len(sys.argv) > 1 else ''
     if given in COMMANDS:
         return run(given, sys.argv[2:])

@@ -32,6 +32,7 @@ def parser() -> argparse.ArgumentParser:
         COMMAND,
         description="The main job for real: simulates the paper's drive past an open door into a bag, starts the node, "
         'replays the bag to it over DDS, runs EM, saves the maps, and scores them against the truth.',
+        epilog='example: demo --world corridor -o seen',
     )
     made.add_argument('-o', '--output', metavar='DIR', help='new folder (default: demo_output)')
     made.add_argument('--world', choices=('door', 'corridor'), default='door', help='default: door')

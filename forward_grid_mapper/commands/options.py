@@ -16,6 +16,13 @@ from ..files.parameter_file import load_parameters, parse_setting
 from ..files.parameter_text import dump_parameters
 
 
+def add_json_option(parser: argparse.ArgumentParser) -> None:
+    """Add `--json`."""
+    parser.add_argument(
+        '--json', action='store_true', help='print the result as JSON, and nothing else on standard output'
+    )
+
+
 class BagParser(argparse.ArgumentParser):
     """A parser of commands that read a bag, which may also stand behind an option that takes several words.
 
