@@ -73,7 +73,7 @@ def write_page(
         What `report_data` returned.
     title : str
     path_xy : float64, shape (P, 2)
-        Where the robot was, in order, metres; may be empty.
+        Where the robot was, in order, metres; may be empty. Rows of NaN part several drives.
     odometry_xy : float64, shape (Q, 2)
         The path that odometry gives, metres, where the robot was elsewhere.
     reference : (Grid, int8 array), optional
@@ -139,12 +139,13 @@ def page_data(
         arrays['reference'] = np.where(reference[1] == UNKNOWN, 255, reference[1]).astype(np.uint8)
     if 0 < len(maps.readings) <= MOST_READINGS:
         arrays |= _readings(maps)
+    everywhere = np.concatenate([path_xy.reshape(-1, 2), odometry_xy])
     model = maps.parameters.model
     stamps = maps.readings.stamp
     return {
         'grid': _grid(maps.grid),
         'reference': None if reference is None else _grid(reference[0]),
-        'view': view_of(maps, np.concatenate([path_xy.reshape(-1, 2), odometry_xy])),
+        'view': view_of(maps, everywhere[np.isfinite(everywhere).all(axis=1)]),
         'model': {
             'p_hit': causes_of(maps.readings.select(slice(0)), np.zeros(0), model, maps.grid.resolution).p_hit,
             'mixture_weight': 1.0 - model.p_rand - model.p_lost,
@@ -185,9 +186,11 @@ def _shares(probability: NDArray[np.float32]) -> NDArray[np.uint16]:
 
 
 def _thinned(xy: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Return a path of at most `MOST_POINTS` points, the last one among them."""
-    xy = xy[np.isfinite(xy).all(axis=1)]
-    which = np.unique(np.linspace(0, len(xy) - 1, min(len(xy), MOST_POINTS)).astype(np.int64))
+    """Return a path of some `MOST_POINTS` points, the last one among them; rows of NaN, which part drives, stay."""
+    which = np.linspace(0, len(xy) - 1, min(len(xy), MOST_POINTS)).astype(np.int64)
+    parted = np.flatnonzero(~np.isfinite(xy).all(axis=1))
+    ends = np.concatenate([parted - 1, parted, parted + 1])
+    which = np.union1d(which, ends[(ends >= 0) & (ends < len(xy))])
     return xy[which].astype(np.float32)
 
 

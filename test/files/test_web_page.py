@@ -250,6 +250,24 @@ def test_a_page_with_few_readings_opens(tmp_path: Path, readings: int) -> None:
     ]
 
 
+def test_several_drives_stay_apart(tmp_path: Path) -> None:
+    xy = np.full((30_001, 2), 0.5)
+    xy[10_001] = np.nan
+    xy[:10_001] = -0.5
+    maps = made_maps()
+    write_page(tmp_path / 'report.html', maps, report_data(maps, {}), 'two', xy)
+    kept = array(numbers(tmp_path / 'report.html'), 'path').reshape(-1, 2)
+    (gap,) = np.flatnonzero(np.isnan(kept[:, 0]))
+    assert (kept[:gap] == -0.5).all() and (kept[gap + 1 :] == 0.5).all()
+    script = """
+        const lines = [], g = {stroke() {}, beginPath() {}, setLineDash() {}, moveTo: () => lines.push(0),
+          lineTo: () => lines[lines.length - 1]++};
+        report.chart.line(g, report.page.arrays.path, 'black', 1);
+        return lines;
+    """
+    assert found_in(tmp_path / 'report.html', tmp_path, script) == [gap - 1, len(kept) - gap - 2]
+
+
 def test_a_long_path_is_thinned(tmp_path: Path) -> None:
     xy = np.stack([np.linspace(0, 9, 50_000), np.zeros(50_000)], 1)
     maps = made_maps()

@@ -189,7 +189,12 @@ class Chart {
     g.lineJoin = 'round';
     g.setLineDash(dash);
     g.beginPath();
-    for (let k = 0; k < xy.length; k += 2) g.lineTo(...this.pixels(xy[k], xy[k + 1]));
+    let pen = false;
+    for (let k = 0; k < xy.length; k += 2) {
+      const drawn = Number.isFinite(xy[k] + xy[k + 1]);
+      if (drawn) g[pen ? 'lineTo' : 'moveTo'](...this.pixels(xy[k], xy[k + 1]));
+      pen = drawn;
+    }
     g.stroke();
     g.setLineDash([]);
   }
