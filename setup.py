@@ -82,6 +82,7 @@ setup(
             'argcomplete>=3.1,<4',
         ],
         'completion': ['argcomplete>=3.1,<4'],
+        'site': ['mkdocs>=1.6,<2', 'mkdocs-material>=9.5,<10', 'nbclient>=0.10,<1', 'ipykernel>=6.29,<8'],
         'lint': ['ruff>=0.17,<0.18', 'mypy>=1.15,<3', 'types-PyYAML>=6,<7'],
     },
     entry_points={'console_scripts': SCRIPTS},
