@@ -50,9 +50,10 @@ class Health:
         last_run: str,
         grid: Grid,
         extra: dict[str, Any],
+        map_frame: str = '',
     ) -> list[DiagnosticStatus]:
-        """Return the statuses of input and of EM."""
-        level, message = self._judge(associator, intake)
+        """Return the statuses of input and of EM; `map_frame` says what is wrong with its transform."""
+        level, message = self._judge(associator, intake, map_frame)
         bound = associator.parameters.max_readings
         held = min(associator.buffer.held, bound or associator.buffer.held)
         values = {
@@ -80,7 +81,7 @@ class Health:
             status(f'{name}: EM', DiagnosticStatus.OK, em['state'], name, em),
         ]
 
-    def _judge(self, associator: PoseAssociator, intake: Intake) -> tuple[bytes, str]:
+    def _judge(self, associator: PoseAssociator, intake: Intake, map_frame: str) -> tuple[bytes, str]:
         received, rejected = intake.received, sum(associator.rejected.values())
         new, new_rejected = received - self._received, rejected - self._rejected
         self._received, self._rejected = received, rejected
@@ -93,6 +94,8 @@ class Health:
         if silent_odometry > SILENCE and refused_now > 0:
             reason = max(associator.odometry_rejected, key=lambda key: associator.odometry_rejected[key])
             return DiagnosticStatus.WARN, f'odometry is rejected as {reason}: {ODOMETRY_REASONS[reason]}'
+        if map_frame:
+            return DiagnosticStatus.WARN, map_frame
         if silent_odometry > SILENCE:
             return DiagnosticStatus.WARN, f'no odometry for {silent_odometry:.0f} s'
         if silent_ranges > SILENCE:

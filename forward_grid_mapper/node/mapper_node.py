@@ -118,7 +118,7 @@ class MapperNode(Node):
             health,
             self.intake,
             self.associator,
-            (extrinsics, self._map_frame),
+            (extrinsics, self._map_frame, transforms),
             self.live,
             self.em,
             self.journal,
