@@ -59,6 +59,8 @@ class MapPublishers:
         self._out = {name: node.create_publisher(OccupancyGrid, f'~/{name}', LATCHED) for name in MAPS}
         self._lock = threading.Lock()
         self._pending: dict[str, tuple[Grid, NDArray[Any]]] = {}
+        self._nothing = Grid(resolution, 0, 0, 1, 1), np.full((1, 1), -1, np.int8)
+        self._ml_map = self._nothing
         nothing = Grid(resolution, 0, 0, 0, 0)
         self.latest = {name: self._message(nothing, np.zeros(nothing.shape, np.int8)) for name in MAPS}
         for name in MAPS:
@@ -82,17 +84,24 @@ class MapPublishers:
                 return
             waits = name in self._pending
             self._pending[name] = grid, values
+            if name == 'ml_map':
+                self._ml_map = grid, values
         if not waits:
             self.worker.put(partial(self._publish, name))
 
+    @property
+    def ml_map(self) -> tuple[Grid, NDArray[np.int8]]:
+        """Grid and cells of the ML map that was given last; a single cell not observed if none was."""
+        with self._lock:
+            return self._ml_map
+
     def clear(self) -> None:
         """Have empty maps published, after which none of those that were there before comes."""
-        nothing = Grid(self._resolution, 0, 0, 1, 1)
         with self._lock:
             self.generation += 1
             generation = self.generation
         for name in MAPS:
-            self.publish(name, generation, nothing, np.full(nothing.shape, -1, np.int8))
+            self.publish(name, generation, *self._nothing)
 
     def _publish(self, name: str) -> None:
         with self._lock:

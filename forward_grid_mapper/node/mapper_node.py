@@ -127,6 +127,7 @@ class MapperNode(Node):
         )
         for name, handler in (
             ('~/run_em', self.em.run_em),
+            ('~/cancel_em', self.em.cancel),
             ('~/save_maps', self.saver.save_maps),
             ('~/reset', self.reset),
         ):
