@@ -17,6 +17,7 @@ from ..core.common.grid import Grid
 from .background import Worker
 from .deferred import DeferredService, Reply
 from .grid_message import grid_message
+from .map_updates import MapUpdates
 
 MAPS = ('live_map', 'ml_map', 'uncertainty_map')
 LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -57,6 +58,7 @@ class MapPublishers:
         self.generation = 0
         self._node, self._resolution, self._frame, self._before = node, resolution, frame, before
         self._out = {name: node.create_publisher(OccupancyGrid, f'~/{name}', LATCHED) for name in MAPS}
+        self._updates = MapUpdates.of(node, self._out['live_map'])
         self._lock = threading.Lock()
         self._pending: dict[str, tuple[Grid, NDArray[Any]]] = {}
         self._nothing = Grid(resolution, 0, 0, 1, 1), np.full((1, 1), -1, np.int8)
@@ -95,6 +97,11 @@ class MapPublishers:
         with self._lock:
             return self._ml_map
 
+    def refresh(self) -> None:
+        """Have the whole live map published where somebody needs it, after only parts of it were."""
+        if self._updates and self._updates.stale:
+            self.worker.put(self._updates.refresh)
+
     def clear(self) -> None:
         """Have empty maps published, after which none of those that were there before comes."""
         with self._lock:
@@ -108,7 +115,10 @@ class MapPublishers:
             grid, values = self._pending.pop(name)
         message = self._message(grid, values)
         self.latest[name] = message
-        self._out[name].publish(message)
+        if name == 'live_map' and self._updates:
+            self._updates.publish(message)
+        else:
+            self._out[name].publish(message)
 
     def _message(self, grid: Grid, values: NDArray[Any]) -> OccupancyGrid:
         # tf2 refuses the leading slash that ROS 1 had

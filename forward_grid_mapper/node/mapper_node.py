@@ -251,6 +251,7 @@ class MapperNode(Node):
         if self.mapping:
             self._feed()
             self.live.publish()
+            self.maps.refresh()
 
     def _show_live(self, snapshot: LiveSnapshot) -> None:
         self.maps.publish('live_map', snapshot.generation, snapshot.grid, snapshot.probability)
