@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections import deque
 from collections.abc import Mapping
 from typing import Any
 
-from ..core.messages.extrinsics import LATE, LATER, Later
+from ..core.messages.extrinsics import LATE, LATER, Later, mount_of
 from ..core.messages.message_types import NANOSECONDS, OdometryMessage, Pose2, planar_pose
 from ..core.messages.pose_association import JUMP
+from ..core.messages.quaternions import rotation_of
 
 TF, TF_STATIC = '/tf', '/tf_static'
 
@@ -117,8 +119,8 @@ class Extrinsics:
         """The poses of the sensors that were asked for and did not move on the robot, by frame."""
         return {frame: pose for frame, pose in self._used.items() if frame not in self._moved}
 
-    def __call__(self, base_frame: str, frame: str, stamp: int) -> Pose2 | Later | None:
-        """Return the pose of a sensor at a stamp, `LATER` if TF may still know it, None if nothing will."""
+    def __call__(self, base_frame: str, frame: str, stamp: int) -> Pose2 | Later | str | None:
+        """Return the pose of a sensor at a stamp, as `ExtrinsicsLookup` has it."""
         pose = self._look_up(base_frame, frame, stamp)
         if isinstance(pose, Pose2) and (frame in self._used or len(self._used) < MOST_MISSING):
             first = self._used.setdefault(frame, pose)
@@ -126,7 +128,7 @@ class Extrinsics:
                 self._moved.add(frame)
         return pose
 
-    def _look_up(self, base_frame: str, frame: str, stamp: int) -> Pose2 | Later | None:
+    def _look_up(self, base_frame: str, frame: str, stamp: int) -> Pose2 | Later | str | None:
         given = self._given.get(frame.lstrip('/'))
         if given is not None:
             return given
@@ -135,10 +137,12 @@ class Extrinsics:
         transform = self._transforms.lookup(base_frame, frame, stamp)
         if isinstance(transform, Later):
             return transform
-        pose = planar_pose(transform.translation, transform.rotation)
-        if pose is None:
+        t, q = transform.translation, transform.rotation
+        rotation = rotation_of(float(q.x), float(q.y), float(q.z), float(q.w))
+        if rotation is None or not (math.isfinite(t.x) and math.isfinite(t.y)):
             self.unusable.add(frame)
-        return pose
+            return None
+        return mount_of(float(t.x), float(t.y), [row[0] for row in rotation])
 
 
 class MapFrame:

@@ -7,7 +7,9 @@ from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 
+from ..core.messages.extrinsics import STEEP
 from ..core.messages.pose_association import MOST_FRAMES, PoseAssociator
+from ..core.messages.rep117 import REASONS
 from . import diagnostics
 from .background import Worker
 from .em_service import EmService
@@ -108,7 +110,7 @@ class Reporter:
                 break
             self._reported.add(frame)
             why = (
-                'its transform is not normalised, or its axis leaves the plane by more than 60°'
+                'its transform is not normalised, or not finite'
                 if frame in self._extrinsics.unusable
                 else 'neither is known'
             )
@@ -117,3 +119,7 @@ class Reporter:
                 f'transform from {self._associator.base_frame or "the base frame"}; {why}; its readings are rejected'
             )
         self._lost = unknown & self._reported
+        for frame, counts in list(self._associator.rejected_by_frame.items()):
+            if STEEP in counts and frame not in self._reported and len(self._reported) < MOST_FRAMES:
+                self._reported.add(frame)
+                self._node.get_logger().warning(f'readings of {frame} are rejected: {REASONS[STEEP]}')

@@ -10,7 +10,7 @@ import pytest
 
 pytest.importorskip('rclpy', reason='stamps are asked for with rclpy')
 
-from forward_grid_mapper.core.messages.extrinsics import LATE, LATER
+from forward_grid_mapper.core.messages.extrinsics import LATE, LATER, STEEP
 from forward_grid_mapper.core.messages.message_types import NANOSECONDS, OdometryMessage, Pose2, RangeMessage
 from forward_grid_mapper.core.messages.pose_association import PoseAssociator
 from forward_grid_mapper.node import frames
@@ -92,8 +92,8 @@ def test_poses_are_projected_and_steep_sensors_refused(buffer: Buffer, transform
     buffer.known['base', 'down'] = transform(0.0, 0.0, pitch=1.5)
     extrinsics = Extrinsics({}, transforms)
     assert extrinsics('base', 'ahead', 0) == pytest.approx((1.0, 2.0, 2.5))
-    assert extrinsics('base', 'down', 0) is None
-    assert extrinsics.unusable == {'down'}
+    assert extrinsics('base', 'down', 0) == STEEP
+    assert extrinsics.unusable == set()
 
 
 def test_a_frame_that_is_not_there_is_asked_for_only_now_and_then(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Callable, Iterator
 from types import ModuleType, SimpleNamespace
@@ -176,3 +177,17 @@ def test_simulated_time_that_nobody_publishes_is_said(inside: Callable[..., Insi
         return '/clock' not in robot.status('readings')['message']
 
     robot.until(gone)
+
+
+def test_inclined_and_steep_sensors(inside: Callable[..., Inside]) -> None:
+    robot = begun(inside)
+    pose = Transform()
+    buffer: Any = robot.node._extrinsics._transforms._buffer
+    for pitch in (math.radians(30.0), math.radians(80.0)):
+        pose.rotation.y, pose.rotation.w = math.sin(pitch / 2), math.cos(pitch / 2)
+        buffer.set_transform_static(pose, '')
+        from_tower(robot, len(robot.node.associator.buffer), 3)
+    assert robot.node.associator.readings.z.tolist() == pytest.approx([2.0 * math.cos(math.radians(30.0))] * 3)
+    readings = robot.status('readings')
+    assert readings['rejected: steep_sensor'] == '3'
+    assert readings['frames without a pose'] == ''

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from ..common.parameters import Parameters
 from ..common.readings import Readings
-from .extrinsics import ExtrinsicsLookup, Later
+from .extrinsics import ExtrinsicsLookup, Later, Mount, project
 from .limit_watch import LimitWatch
 from .map_extent import MapExtent, possible
 from .message_types import NANOSECONDS, OdometryMessage, Pose2, RangeMessage
@@ -376,8 +376,12 @@ class PoseAssociator:
             self._reject_unplaced(measured, 'unknown_extrinsics')
             return
         self.unknown_frames.discard(measured.frame_id)
+        if isinstance(extrinsic, str):
+            self._reject(measured.frame_id, extrinsic)
+            return
         sensor = pose.compose(extrinsic)
-        reason = self._extent.admit(sensor, measured, self._all)
+        reason = project(measured, extrinsic.elevation) if isinstance(extrinsic, Mount) else ''
+        reason = reason or self._extent.admit(sensor, measured, self._all)
         if reason:
             self._reject(measured.frame_id, reason)
             return

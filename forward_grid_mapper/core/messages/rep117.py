@@ -19,6 +19,7 @@ REASONS = {
     'unprintable_frame_id': 'the frame_id has characters that cannot be printed',
     'unknown_extrinsics': 'nothing says where this frame is on the robot: give --sensor, a YAML or a transform',
     'late_transform': 'TF knows this frame, but its transform of the stamp did not come within pose_timeout',
+    'steep_sensor': 'the sensor looks up or down, by more than 60° or straight so with a part of its cone',
     'before_odometry': 'the stamp is before the first odometry, or the message came minutes late',
     'after_odometry': 'the recording ended before odometry reached the stamp',
     'no_odometry': 'odometry, or its transform to map_frame, did not reach the stamp within pose_timeout',
