@@ -69,7 +69,7 @@ class Health:
             'odometry lost in the middleware (estimated)': intake.odometry_lost,
             **{f'odometry rejected: {reason}': count for reason, count in sorted(associator.odometry_rejected.items())},
             'clock jumps back': associator.time_jumps,
-            'frames without a pose': _listed(associator.unknown_frames),
+            'frames without a pose': listed(associator.unknown_frames),
             'map frame': associator.map_frame,
             'map size': f'{grid.width} x {grid.height} cells of {grid.resolution} m',
             **extra,
@@ -101,7 +101,7 @@ class Health:
         if silent_ranges > SILENCE:
             return DiagnosticStatus.WARN, f'no Range for {silent_ranges:.0f} s'
         if associator.unknown_frames and new_rejected:
-            return DiagnosticStatus.WARN, f'no pose on the robot for {_listed(associator.unknown_frames)}'
+            return DiagnosticStatus.WARN, f'no pose on the robot for {listed(associator.unknown_frames)}'
         if new and new_rejected > 0.2 * new:
             return DiagnosticStatus.WARN, (
                 f'{new_rejected} of {new} readings were rejected in the last second{self._main_reason(associator)}'
@@ -137,7 +137,8 @@ def add_faults(made: DiagnosticStatus, faults: list[str]) -> None:
         made.message = '; '.join(faults if well else [made.message, *faults])
 
 
-def _listed(frames: Collection[str]) -> str:
+def listed(frames: Collection[str]) -> str:
+    """Return names in words, `SHOWN` of them at the most."""
     more = f' and {len(frames) - SHOWN} more' if len(frames) > SHOWN else ''
     return ', '.join(sorted(frames)[:SHOWN]) + more
 

@@ -17,6 +17,7 @@ from ..core.common.parameters import Parameters
 from ..core.messages.message_types import OdometryMessage, RangeMessage, odometry_message, range_message
 from ..core.messages.pose_association import MOST_WAITING, PoseAssociator
 from .frames import MapFrame
+from .heard import Heard
 from .losses import LASTING, Losses
 
 QUEUE = 2000
@@ -36,6 +37,8 @@ class Intake:
         Whether lost messages are a fault, or to be expected.
     range_losses : list of Losses
         Of each Range topic.
+    heard : Heard
+        When each sensor sent last.
     """
 
     def __init__(
@@ -61,6 +64,7 @@ class Intake:
         self._node, self._associator, self._map_frame, self._on_taken = node, associator, map_frame, on_taken
         self.paused = self._ready = False
         self.reliable = own.range_reliability == 'reliable'
+        self.heard = Heard()
         self._held: deque[tuple[RangeMessage | OdometryMessage, int, bool]] = deque()
         self._ranges_held = self._refused = self._told_of = 0
         self._last_refused: RangeMessage | None = None
@@ -142,6 +146,7 @@ class Intake:
         """Take a Range."""
         made, sent = range_message(message), info['source_timestamp']
         losses.taken(info, made.frame_id, made.stamp)
+        self.heard.note(made.frame_id)
         self._on_taken(sent)
         if self._ready and not self._held and not self._associator.behind:
             self._take(made, sent, self.paused)
@@ -195,6 +200,7 @@ class Intake:
         for losses in (*self.range_losses, self._odometry_losses):
             losses.clear()
         self._told_of = 0
+        self.heard.clear()
 
     @property
     def busy(self) -> bool:

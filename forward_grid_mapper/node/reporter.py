@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
@@ -47,6 +47,7 @@ class Reporter:
         )
         self._reported: set[str] = set()
         self._lost: set[str] = set()
+        self._quiet: set[str] = set()
         self._no_map_frame = False
         self._out = node.create_publisher(DiagnosticArray, '/diagnostics', 10)
 
@@ -70,7 +71,8 @@ class Reporter:
         faults = [*self._intake.faults(), *self._surroundings.faults()]
         diagnostics.add_faults(statuses[0], [*faults, *self._associator.limits.warnings(), *self._em.wrong_input])
         statuses += self._journal.statuses(name)
-        statuses.append(self._em.sensors.status(name, self._associator.buffer.counts()))
+        counts = self._associator.buffer.counts()
+        statuses.append(self._em.sensors.status(name, counts, self._silent(counts)))
         statuses.append(self._background(name))
         self._out.publish(diagnostics.array(statuses, self._node.get_clock().now().to_msg()))
 
@@ -87,6 +89,18 @@ class Reporter:
         message = '; '.join(failed) or (f'compiling kernels: {stage}' if stage else 'all is well')
         level = DiagnosticStatus.WARN if failed else DiagnosticStatus.OK
         return diagnostics.status(f'{name}: background', level, message, name, values)
+
+    def _silent(self, counts: Mapping[str, Any]) -> dict[str, float]:
+        """Return the sensors that stopped sending and for how long; the log is told of them and of their return."""
+        found = {frame: seconds for frame, seconds in self._intake.heard.silent().items() if frame in counts}
+        log = self._node.get_logger()
+        if new := found.keys() - self._quiet:
+            log.warning(f'sensors that send nothing any more, while others do: {diagnostics.listed(new)}')
+        # a reset forgets who was silent, too
+        if back := [frame for frame in self._quiet - found.keys() if frame in self._intake.heard]:
+            log.info(f'sensors that send again: {diagnostics.listed(back)}')
+        self._quiet = set(found)
+        return found
 
     def _map_frame_fault(self) -> str:
         """Return what is wrong with the transform to the map frame; the log is told when it begins and when it ends."""
