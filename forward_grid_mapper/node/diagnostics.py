@@ -89,6 +89,8 @@ class Health:
         silent_odometry = self._silence('odometry', associator.odometry_received - refused)
         refused_now, self._refused = refused - self._refused, refused
         silent_ranges = self._silence('range', received)
+        if not intake.listening:
+            return DiagnosticStatus.OK, 'inactive: nothing is received'
         if intake.paused:
             return DiagnosticStatus.OK, 'paused'
         if silent_odometry > SILENCE and refused_now > 0:

@@ -98,7 +98,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         executor = SingleThreadedExecutor()
         executor.add_node(node)
         node.when_failed = lambda: executor.create_task(_raise_stop)
-        node.start()
+        if node.parameters.node.autostart:
+            node.start()
+        else:
+            node.wait_for_manager()
         stopper.call(lambda: executor.create_task(_raise_stop))
         _spin(executor, node)
     except _Stop:
@@ -115,7 +118,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if node is not None and node.failure:
         print(f'mapper: error: {node.failure}', file=sys.stderr)
         code = 1
-    if node is not None and node.kernels.stage:
+    if node is not None and node.kernels is not None and node.kernels.working:
         # the compiler must not be at work when its libraries are unloaded
         sys.stdout.flush()
         sys.stderr.flush()

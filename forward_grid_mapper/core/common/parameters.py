@@ -293,6 +293,11 @@ class NodeParameters:
         'none.',
         read_only=True,
     )
+    autostart: bool = _param(
+        True,
+        'Start at once; if not, a lifecycle manager configures and activates the node.',
+        read_only=True,
+    )
     save_directory: str = _param('~/forward_grid_mapper', 'Folder in which save_maps makes a new folder at each call.')
 
 
