@@ -21,6 +21,8 @@ ALLOWED = {
     'mode: raw': 'a line of map_server files',
     'use_sim_time:=true': 'a parameter of every ROS node',
     'set_parameters': 'a service of every ROS node',
+    '~/change_state': 'a service of every lifecycle node',
+    '~/get_state': 'a service of every lifecycle node',
     'manager.yaml': 'a file of the user',
     'node_names': "a parameter of Nav2's lifecycle manager",
     '~/live_map_updates': "the live map's topic and an ending",

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from typing import Any
 
 from ..core.common.errors import MapperError
+from .complaints import of_ros
 
 try:
     from rclpy.lifecycle import LifecycleNode as Base
@@ -116,12 +117,12 @@ class ManagedNode(Base):
             work()
             return TransitionCallbackReturn.SUCCESS
         except Exception as error:
-            expected = isinstance(error, (MapperError, ValueError))
             if undo:
                 self._undo()
             self._refusal = error
             if not self._starting:
-                self.get_logger().error(str(error) if expected else traceback.format_exc())
+                expected = isinstance(error, (MapperError, ValueError)) or type(error).__name__ == 'RCLError'
+                self.get_logger().error(of_ros(error) if expected else traceback.format_exc())
             return TransitionCallbackReturn.FAILURE
 
     def _undo(self) -> None:

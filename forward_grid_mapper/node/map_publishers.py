@@ -13,6 +13,7 @@ from nav_msgs.srv import GetMap
 from numpy.typing import NDArray
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
+from ..core.common.errors import MapperError
 from ..core.common.grid import Grid
 from .background import Worker
 from .deferred import DeferredService, Reply
@@ -53,11 +54,19 @@ class MapPublishers:
         before : callable
             Given the name of a map that is asked for, what to call when it is up to date, and what to call with the
             reason if it cannot be.
+
+        Raises
+        ------
+        MapperError
+            If two maps were given the same topic.
         """
         self.worker = Worker('maps', node.get_logger().error)
         self.generation = 0
         self._node, self._resolution, self._frame, self._before = node, resolution, frame, before
         self._out = {name: node.create_publisher(OccupancyGrid, f'~/{name}', LATCHED) for name in MAPS}
+        topics = [self._out[name].topic_name for name in MAPS]
+        if twice := sorted(topic for topic in set(topics) if topics.count(topic) > 1):
+            raise MapperError(f'{twice[0]} can have one map only: give the others another topic, or leave them theirs')
         self._updates = MapUpdates.of(node, self._out['live_map'])
         self._lock = threading.Lock()
         self._pending: dict[str, tuple[Grid, NDArray[Any]]] = {}

@@ -20,6 +20,7 @@ from ..core.messages.pose_association import PoseAssociator
 from ..core.messages.reading_buffer import bounded
 from . import ros_parameters
 from .background import Inbox, Worker
+from .complaints import of_ros
 from .deferred import DeferredService, Reply
 from .diagnostics import Health
 from .em_service import EmService
@@ -93,8 +94,10 @@ class MapperNode(ManagedNode):
         """
         self._begin_anew()
         node, log = self.parameters.node, self.get_logger()
-        odometry = self.resolve_topic_name(node.odom_topic)
-        if odometry in map(self.resolve_topic_name, node.range_topics):
+        odometry = self._resolved('odom_topic', node.odom_topic)
+        if not node.range_topics:
+            raise MapperError('range_topics is empty; give it the name of a topic of sensor_msgs/Range, or several')
+        if odometry in [self._resolved('range_topics', topic) for topic in node.range_topics]:
             raise MapperError(f'{odometry} cannot be a topic of Range and of odometry: set range_topics or odom_topic')
         transforms = Transforms.of(self)
         extrinsics = Extrinsics(self._given_extrinsics, transforms)
@@ -145,6 +148,13 @@ class MapperNode(ManagedNode):
         self.associator.buffer.before_thinning.append(self._feed)
         kernels.begin(lambda: inbox.put(lambda: self._has('kernels')))
         self._aside.put(partial(self._restore, self.journal, inbox), lambda why: inbox.put(lambda: self._fail(why)))
+
+    def _resolved(self, parameter: str, topic: str) -> str:
+        """Return the full name of a topic that a parameter gives."""
+        try:
+            return str(self.resolve_topic_name(topic))
+        except Exception as error:  # a class of rclpy's C extension
+            raise MapperError(f'{parameter}: {topic!r} is no name of a topic: {of_ros(error)}') from None
 
     def activate(self) -> None:
         """Take messages from here on; they are mapped as soon as it can be."""

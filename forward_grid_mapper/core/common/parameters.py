@@ -345,7 +345,7 @@ class Parameter:
             int: 'a whole number',
             bool: 'true or false',
             str: 'text',
-            tuple: 'a list of text',
+            tuple: 'a list of text, none of it empty',
         }[self.type]
         if isinstance(value, np.generic):
             value = value.item()
