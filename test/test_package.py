@@ -27,8 +27,8 @@ NAME = 'forward_grid_mapper'
 DEPENDENCIES = {
     'exec_depend': {
         *('diagnostic_msgs', 'geometry_msgs', 'launch', 'launch_ros', 'nav_msgs', 'rclpy'),
-        *('rosgraph_msgs', 'sensor_msgs', 'std_srvs', 'tf2_msgs', 'tf2_ros_py'),
-        *('builtin_interfaces', 'rcl_interfaces', 'rviz2'),
+        *('map_msgs', 'rosgraph_msgs', 'sensor_msgs', 'std_srvs', 'tf2_msgs', 'tf2_ros_py'),
+        *('builtin_interfaces', 'lifecycle_msgs', 'rcl_interfaces', 'rviz2'),
         *('python3-matplotlib', 'python3-numba', 'python3-numpy', 'python3-rosbags-pip', 'python3-scipy'),
         'python3-yaml',
     },

@@ -57,7 +57,9 @@ class BagParser(argparse.ArgumentParser):
             self.error(f'no bag is given, or it does not exist{hint}')
         if getattr(options, 'range_topics', None) is not None:
             # a comma cannot be part of a topic's name
-            options.range_topics = [t for word in options.range_topics for t in word.split(',') if t]
+            options.range_topics = [t for word in options.range_topics for t in word.split(',') if t.strip()]
+            if not options.range_topics:
+                self.error('argument --range-topics: the name of a topic is expected, not an empty one')
         return options
 
 

@@ -16,7 +16,7 @@ from drive_samples import FILES, tape, write_tape
 from numba.core import event
 
 from forward_grid_mapper import __version__
-from forward_grid_mapper.__main__ import COMMANDS
+from forward_grid_mapper.__main__ import COMMANDS, _to_a_pipe
 from forward_grid_mapper.commands import console, process_bag
 from forward_grid_mapper.commands.console import Ticker
 from forward_grid_mapper.core.search.search import Progress
@@ -52,6 +52,36 @@ def test_usage() -> None:
     assert "no command 'procces_bag'; did you mean process_bag?" in refused.stderr
     assert refused.stderr.endswith(helped.stdout)
     assert shell('--version').stdout == f'{__version__}\n'
+
+
+@pytest.mark.parametrize('unbuffered', ['', '1'])
+@pytest.mark.parametrize('arguments', [('--help',), ('--version',), ('mapper', '--help'), ('process_bag', '--help')])
+def test_whoever_reads_the_output_may_go_before_its_end(arguments: tuple[str, ...], unbuffered: str) -> None:
+    """As `head` does."""
+    reader, writer = os.pipe()
+    os.close(reader)
+    command = [*MODULE, *arguments]
+    with os.fdopen(writer, 'w') as output:
+        done = subprocess.run(
+            command,
+            stdout=output,
+            stderr=subprocess.PIPE,
+            text=True,
+            check=False,
+            env={**os.environ, 'PYTHONUNBUFFERED': unbuffered},
+        )
+    assert done.stderr == ''
+    # argparse takes it for nothing at all where nothing is buffered
+    assert done.returncode in (0, 1)
+
+
+def test_a_pipe_that_broke_elsewhere_is_no_reader_who_went() -> None:
+    def fail() -> int:
+        raise BrokenPipeError('somewhere else')
+
+    with pytest.raises(BrokenPipeError, match='somewhere else'):
+        _to_a_pipe(fail)
+    assert _to_a_pipe(lambda: 3) == 3
 
 
 @pytest.mark.parametrize('command', ['process_bag', 'learn', 'replay_bag', 'simulate', 'demo'])

@@ -294,6 +294,11 @@ class NodeParameters:
         'none.',
         read_only=True,
     )
+    autostart: bool = _param(
+        True,
+        'Start at once; if not, a lifecycle manager configures and activates the node.',
+        read_only=True,
+    )
     save_directory: str = _param('~/forward_grid_mapper', 'Folder in which save_maps makes a new folder at each call.')
 
 
@@ -341,7 +346,7 @@ class Parameter:
             int: 'a whole number',
             bool: 'true or false',
             str: 'text',
-            tuple: 'a list of text',
+            tuple: 'a list of text, none of it empty',
         }[self.type]
         if isinstance(value, np.generic):
             value = value.item()
