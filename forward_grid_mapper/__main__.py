@@ -1,3 +1,4 @@
+# PYTHON_ARGCOMPLETE_OK
 """The entry of every command: `python3 -m forward_grid_mapper COMMAND …`, and one script each once it is installed.
 
 Signals get their handlers before the commands' modules are imported, which takes a second.
@@ -13,7 +14,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from . import __version__
-from .commands import signals
+from .commands import completion, signals
 
 COMMANDS = {
     'mapper': ('node.main', 'the ROS 2 node: map while driving'),
@@ -127,6 +128,7 @@ def main() -> int:
 
 
 def _main() -> int:
+    completion.complete(COMMANDS, __package__)
     given = sys.argv[1] if len(sys.argv) > 1 else ''
     if given in COMMANDS:
         return run(given, sys.argv[2:])

@@ -23,7 +23,9 @@ USAGE = """usage: mapper [--ros-args ...]
 
 Maps sonar Range and Odometry: publishes a live map, and on ~/run_em the maximum likelihood and uncertainty maps.
 Parameters: --ros-args -p NAME:=VALUE, or --params-file FILE (config/mapper.yaml lists all). Remap the topics sonar
-and odom with -r sonar:=/my/sonar -r odom:=/my/odom."""
+and odom with -r sonar:=/my/sonar -r odom:=/my/odom.
+
+example: mapper --ros-args --params-file my_robot.yaml -r sonar:=/ultrasonic"""
 
 
 LOG_EVERY = 10.0

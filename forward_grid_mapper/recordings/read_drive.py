@@ -112,7 +112,7 @@ def read_drive(
     if journal is not None:
         return read_journal(journal, parameters, extrinsics, range_topics, odom_topic)
     with Bag(path) as bag:
-        topics = bag.choose_topics(range_topics, odom_topic)
+        topics = bag.choose_topics(range_topics, odom_topic, any_poses=True)
         lookup = Extrinsics(extrinsics, bag.static_transforms())
         associator = PoseAssociator(lookup, parameters, patient=True)
         live = LogOddsMapOfAll(associator, parameters)

@@ -264,6 +264,19 @@ def test_says_that_it_compiles_only_while_it_does(monkeypatch: pytest.MonkeyPatc
         assert 'uncertainty (compil' not in stream.getvalue()
 
 
+def test_quiet_says_once_that_it_compiles(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(console, 'PATIENCE', 0.0)
+    stream = io.StringIO()
+    with Ticker(quiet=True, stream=stream) as ticker:
+        ticker.say('one')
+        with compiling_begun():
+            wait_until_shown(stream, 'compiling kernels, which takes half a minute once\n')
+            ticker.say('two')
+        with compiling_begun():
+            ticker.say('three')
+    assert stream.getvalue().count('\n') == 1
+
+
 def compiling_begun() -> AbstractContextManager[None]:
     """The event that numba triggers around a compilation, and not for what it finds in its cache."""
     return event.trigger_event('numba:compile')

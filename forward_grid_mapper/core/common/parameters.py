@@ -235,7 +235,7 @@ class SearchParameters:
 
 @dataclass(frozen=True)
 class LiveMapParameters:
-    """The standard log-odds map ((3), (4), (14)-(16) of the paper), updated reading by reading."""
+    """The standard map: log odds ((3), (4), (14)-(16) of the paper), updated reading by reading."""
 
     live_p_occupied: float = _param(
         0.8,
@@ -281,7 +281,8 @@ class NodeParameters:
     )
     online: bool = _param(
         False,
-        'Keep the ML map and the uncertainty map up to date with every reading, and start EM from there.',
+        'Keep the maximum likelihood map and the uncertainty map up to date with every reading, and start EM from '
+        'there.',
         read_only=True,
     )
     publish_rate: float = _param(
