@@ -128,7 +128,11 @@ def start(context):
         # the configuration names topics from the root, which a namespace moves
         remappings=[
             *TRANSFORMS,
-            *((f'/{PACKAGE}/{name}', 'map' if name == given['map'] else f'{PACKAGE}/{name}') for name in MAPS),
+            *(
+                (f'/{PACKAGE}/{name}{ending}', ('map' if name == given['map'] else f'{PACKAGE}/{name}') + ending)
+                for name in MAPS
+                for ending in ('', '_updates')
+            ),
             ('/odom', LaunchConfiguration('odom')),
         ],
         arguments=['-d', LaunchConfiguration('rviz_config')],

@@ -45,7 +45,7 @@ class Run:
 
     `stage` and `progress` say where it stands; `ended` is set when its thread has done all that it does for it. `found`
     is called with the maps as soon as they are there, in the thread. `shown` says whether the map so far was published,
-    `why` which service cancelled the run.
+    `asked` whether somebody asked for its end alone.
     """
 
     mapper: Mapper
@@ -59,7 +59,7 @@ class Run:
     progress: Progress | None = None
     cancelled: bool = False
     shown: bool = False
-    why: str = ''
+    asked: bool = False
     ended: threading.Event = field(default_factory=threading.Event)
     waiting: list[Callable[[Outcome], object]] = field(default_factory=list)
 

@@ -112,7 +112,7 @@ class EmService:
             else:
                 reply.send(True, f'{outcome.message} (after {run.seconds:.1f} s); readings and earlier maps are kept')
 
-        run.why = run.why or 'cancel_em'
+        run.asked = True
         run.waiting.append(ended)
         self.worker.cancel()
 
@@ -130,8 +130,6 @@ class EmService:
 
     def reset(self) -> None:
         """Forget the maps, and cancel the run that goes on."""
-        if self.current is not None:
-            self.current.why = 'reset'
         self.worker.cancel()
         self._generation = self._publishers.generation
         self.maps, self.wrong_input, self.last_run = None, [], 'none since the reset'
@@ -161,8 +159,8 @@ class EmService:
             # whoever waits is told the same
             if generation != self._publishers.generation:
                 outcome.maps, outcome.message = None, 'EM was cancelled by reset'
-            elif outcome.maps is None and run.cancelled and run.why:
-                outcome.message = f'EM was cancelled by {run.why}'
+            elif outcome.maps is None and run.asked:
+                outcome.message = 'EM was cancelled by cancel_em'
             self._finish(outcome, taken[0][0])
             if outcome.maps is None and run.shown:
                 self._publishers.publish('ml_map', generation, *before)
