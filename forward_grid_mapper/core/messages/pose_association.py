@@ -20,6 +20,7 @@ from ..common.readings import Readings
 from .limit_watch import LimitWatch
 from .map_extent import MapExtent, possible
 from .message_types import NANOSECONDS, OdometryMessage, Pose2, RangeMessage
+from .odometry_record import MOST_POSES
 from .pose_history import PoseHistory
 from .reading_buffer import ReadingBuffer
 from .rep117 import LONGEST_NAME, Measurement, measure
@@ -34,7 +35,6 @@ LATER = Later()
 
 ExtrinsicsLookup = Callable[[str, str, int], 'Pose2 | Later | None']
 """(base frame, sensor frame, stamp in ns) → pose of the sensor in the base frame, `LATER`, or None if unknown."""
-
 
 JUMP = NANOSECONDS
 """Odometry older than the newest by more than this means that the clock jumped back, not that messages overtook."""
@@ -121,8 +121,7 @@ class PoseAssociator:
         self.map_frame = self.base_frame = ''
         self.time_jumps = 0
         self._waiting: list[Measurement] = []
-        self._path = RobotPath()
-        self._history = PoseHistory()
+        self._path, self._history = RobotPath(), PoseHistory(0 if patient else MOST_POSES)
         self._newest_range: int | None = None
         self._held: deque[tuple[Measurement, Pose2]] = deque()
         self._retrying = 0
@@ -154,8 +153,9 @@ class PoseAssociator:
 
     @property
     def odometry(self) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """The poses of odometry that are held: stamps in ns, shape (M,), and x, y, yaw, shape (M, 3)."""
-        return self._history.held()
+        """The poses of the drive as odometry gave them: stamps in ns, shape (M,), and x, y, yaw, shape (M, 3)."""
+        stamps = self.buffer.snapshot().stamp
+        return self._history.record.snapshot(int(stamps.min()) if len(stamps) else None)
 
     def add_range(self, message: RangeMessage, sent: int = 0) -> None:
         """Take one Range message; `sent` is when it was published, nanoseconds of the system's clock, 0 if unknown."""
@@ -188,6 +188,7 @@ class PoseAssociator:
         if self._other_frame:
             self.map_frame = self.base_frame = ''
             self._history.clear()
+        self._history.record.begin_anew()
         self.buffer.clear()
         self.limits.clear()
         self.rejected.clear()
@@ -196,8 +197,7 @@ class PoseAssociator:
         self.unknown_frames.clear()
         self._waiting.clear()
         self._held.clear()
-        self._retrying = 0
-        self.behind = False
+        self._retrying, self.behind = 0, False
         self._path.clear()
         self.received = self.odometry_received = self.time_jumps = 0
         self._extent.clear()

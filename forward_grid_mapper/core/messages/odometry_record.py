@@ -1,0 +1,124 @@
+"""All poses of a drive as odometry gave them, for whoever places its readings anew.
+
+`pose_history` places readings as they come, and forgets; this remembers. Columns of 32 bytes a pose.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .message_types import NANOSECONDS, Pose2
+
+Floats = NDArray[np.float64]
+
+MOST_POSES = 300_000
+"""Poses that are kept at the most, 10 MB: of more, those go that their neighbours tell. At 50 Hz it is 100 minutes of
+driving without a rest."""
+
+TOLERANCE = 1e-4
+"""Metres, and radians, by which the neighbours may miss a pose that goes; more where too few would."""
+
+OVERLAP = 60 * NANOSECONDS
+"""Nanoseconds of the drive before that stay when another one begins: readings are late by less."""
+
+LARGEST_SHARE = 0.75
+"""Part of the poses that may stay when some go, so that they seldom have to."""
+
+
+class OdometryRecord:
+    """Stamps and poses in order of time, one for each stamp; snapshots never change.
+
+    Parameters
+    ----------
+    most : int
+        Poses that are kept at the most; 0 is no bound.
+    """
+
+    def __init__(self, most: int = MOST_POSES) -> None:
+        self._most = most
+        self.clear()
+
+    def __len__(self) -> int:
+        return self._size
+
+    def clear(self) -> None:
+        """Forget every pose."""
+        self._size, self._anew = 0, False
+        self._stamp = np.empty(1024, np.int64)
+        self._pose = np.empty((1024, 3))
+
+    def add(self, stamp: int, pose: Pose2) -> None:
+        """Add a pose, in any order of stamps; it replaces one of the same stamp."""
+        size = self._size
+        if size and stamp <= self._stamp[size - 1]:
+            self._insert(stamp, pose)
+            return
+        if size == len(self._stamp):
+            self._stamp, self._pose = _longer(self._stamp, size + 1024), _longer(self._pose, size + 1024)
+        self._stamp[size] = stamp
+        self._pose[size] = pose
+        self._size = size + 1
+        if self._most and self._size > self._most:
+            self._thin()
+
+    def begin_anew(self) -> None:
+        """Begin a drive where another one ended: the next reading may be of any time, the drive begins with it."""
+        self._anew = True
+        newest = int(self._stamp[self._size - 1]) if self._size else 0
+        begin = int(np.searchsorted(self._stamp[: self._size], newest - OVERLAP))
+        # what stays is not much, and the rest is to be freed
+        self._stamp, self._pose = self._stamp[begin : self._size].copy(), self._pose[begin : self._size].copy()
+        self._size = len(self._stamp)
+
+    def snapshot(self, first: int | None = None) -> tuple[NDArray[np.int64], Floats]:
+        """Return stamps in ns, shape (M,), and x, y, yaw, shape (M, 3), which nobody must change.
+
+        Parameters
+        ----------
+        first : int, optional
+            Stamp of the drive's first reading, ns: after `begin_anew`, poses begin with the last one before it.
+        """
+        stamp, pose = self._stamp[: self._size], self._pose[: self._size]
+        if not self._anew or first is None:
+            return stamp, pose
+        begin = max(int(np.searchsorted(stamp, first, side='right')) - 1, 0)
+        return stamp[begin:], pose[begin:]
+
+    def _insert(self, stamp: int, pose: Pose2) -> None:
+        # copies, since the columns are those of snapshots
+        old_stamp, old_pose = self._stamp[: self._size], self._pose[: self._size]
+        at = int(np.searchsorted(old_stamp, stamp))
+        after = at + int(old_stamp[at] == stamp)
+        self._stamp = np.concatenate([old_stamp[:at], [stamp], old_stamp[after:]])
+        self._pose = np.concatenate([old_pose[:at], [pose], old_pose[after:]])
+        self._size = len(self._stamp)
+
+    def _thin(self) -> None:
+        """Let poses go that lie between their neighbours, never two in a row, until enough have gone."""
+        tolerance = TOLERANCE
+        while self._size > LARGEST_SHARE * self._most:
+            stay = _telling(self._stamp[: self._size], self._pose[: self._size], tolerance)
+            self._stamp, self._pose = self._stamp[: self._size][stay], self._pose[: self._size][stay]
+            self._size = len(self._stamp)
+            tolerance *= 4.0
+
+
+def _telling(stamp: NDArray[np.int64], pose: Floats, tolerance: float) -> NDArray[np.bool_]:
+    """Return the poses that stay, shape (M,): every other one, and those that lie off the line between these."""
+    stay = np.ones(len(stamp), np.bool_)
+    before, middle, after = slice(0, -2, 2), slice(1, -1, 2), slice(2, None, 2)
+    part = ((stamp[middle] - stamp[before]) / (stamp[after] - stamp[before]))[:, None]
+    whole, half = pose[after] - pose[before], pose[middle] - pose[before]
+    for turn in (whole[:, 2], half[:, 2]):
+        turn[:] = np.remainder(turn + np.pi, 2 * np.pi) - np.pi
+    stay[middle] = np.abs(half - part * whole).max(1) > tolerance
+    return stay
+
+
+def _longer(column: NDArray[Any], rows: int) -> NDArray[Any]:
+    longer = np.empty((max(rows, 2 * len(column)), *column.shape[1:]), column.dtype)
+    longer[: len(column)] = column
+    return longer
