@@ -46,7 +46,7 @@ def test_memory_is_bounded_and_the_way_stays() -> None:
     assert len(stamp) > 0.3 * most
     assert (np.diff(stamp) > 0).all()
     again = np.stack([np.interp(np.arange(50_000) * NANOSECONDS // 50, stamp, pose[:, axis]) for axis in (0, 1)], 1)
-    assert np.hypot(*(again - true).T).max() < 0.02
+    assert np.hypot(*(again - true).T).max() < 0.05, 'half a cell, over 500 m'
     # columns of the size before the bound are not kept along
     assert record._stamp.nbytes + record._pose.nbytes <= 2 * 32 * (most + 1024)
 
