@@ -20,6 +20,7 @@ PARAMETERS = {
     'range_reliability': ('Quality of service of the Range subscriptions', RELIABILITY),
     'odom_reliability': ('Quality of service of the odometry subscription', RELIABILITY),
     'map_frame': ("Frame of the maps, if another than odometry's, such as map with a localiser", None),
+    'refine_poses': ('Whether run_em takes the drift out of odometry, in frame map', SWITCH),
     'online': ('Whether the ML map and the uncertainty map follow every reading', SWITCH),
     'journal': ('Folder of the journal, which gives accepted readings back after a restart', None),
 }

@@ -12,11 +12,11 @@ from ..core.common.errors import Cancelled
 from ..core.common.parameters import Parameters
 from ..core.common.readings import Readings
 from ..core.learning.consistency import consistency_warnings
-from ..core.mapping import Mapper
 from ..core.maps.map_set import MapSet
 from ..core.messages.message_types import Pose2
 from ..core.messages.pose_association import PoseAssociator
 from ..core.messages.reading_buffer import bounded
+from ..core.trajectory.windows import Odometry
 from ..files.quality_warning import quality_warning
 from .background import Inbox
 from .deferred import Reply
@@ -24,10 +24,15 @@ from .em import EmWorker, Outcome, Run, summary
 from .kernels import Kernels
 from .map_publishers import MapPublishers
 from .online import OnlineWorker
+from .refining import Drive, RefiningMapper
 from .sensor_status import SensorWatch
+from .trajectory import Trajectory
+
+Taken = tuple[int, Readings, Any]
+"""Number of readings accepted, those that are held, and stamps and poses of odometry."""
 
 
-def _waited_for(taken: queue.SimpleQueue[tuple[int, Any]], run: Run) -> tuple[int, Any]:
+def _waited_for(taken: queue.SimpleQueue[Taken], run: Run) -> Taken:
     """Return what the executor takes for a run, unless this is cancelled."""
     while True:
         if run.cancelled:
@@ -60,6 +65,7 @@ class EmService:
         self,
         parameters: Callable[[], Parameters],
         associator: PoseAssociator,
+        trajectory: Trajectory,
         publishers: MapPublishers,
         inbox: Inbox,
         kernels: Kernels,
@@ -73,6 +79,7 @@ class EmService:
         self.online: OnlineWorker | None = None
         self.extrinsics: Callable[[], Mapping[str, Pose2]] = dict
         self._parameters, self._associator, self._publishers = parameters, associator, publishers
+        self._trajectory = trajectory
         self._inbox, self._kernels, self._logger = inbox, kernels, logger
         self._watched = 0.0
         self._generation = 0
@@ -91,7 +98,8 @@ class EmService:
             if outcome.maps is None:
                 reply.send(False, outcome.message)
             else:
-                reply.send(True, summary(outcome.maps, time.monotonic() - begin))
+                said = filter(None, [summary(outcome.maps, time.monotonic() - begin), outcome.trajectory])
+                reply.send(True, '; '.join(said))
 
         run = self.current
         if run is not None:
@@ -123,20 +131,20 @@ class EmService:
         self.worker.close(seconds)
 
     def _start(self, done: Callable[[Outcome], object]) -> None:
-        generation, buffer, bound = self._publishers.generation, self._associator.buffer, self._associator.buffer.bound
+        generation, bound = self._publishers.generation, self._associator.buffer.bound
         # what comes while kernels are compiled is mapped as well
-        early = None if self._kernels.has('EM') else queue.SimpleQueue[tuple[int, Any]]()
-        taken = [(len(buffer), buffer.snapshot())]
+        early = None if self._kernels.has('EM') else queue.SimpleQueue[Taken]()
+        taken = [self._take()]
 
         def readings() -> Readings:
             if early is not None:
-                self._inbox.put(lambda: early.put((len(buffer), buffer.snapshot())))
+                self._inbox.put(lambda: early.put(self._take()))
                 taken[0] = _waited_for(early, run)
             return bounded(taken[0][1], bound)
 
         def found(maps: MapSet) -> None:
-            self._publishers.publish('ml_map', generation, maps.grid, maps.ml)
-            self._publishers.publish('uncertainty_map', generation, maps.grid, maps.uncertainty)
+            # the transform to the map changes together with the maps
+            self._inbox.put(lambda: self._show(maps, mapper, taken[0][0], generation))
 
         def finish(outcome: Outcome) -> None:
             if generation != self._publishers.generation:
@@ -145,11 +153,23 @@ class EmService:
             self._finish(outcome, taken[0][0])
 
         parameters = self._parameters()
-        start = self.online.so_far() if self.online else None
-        run = Run(Mapper(parameters), parameters, readings, found, start)
+        mapper = self._trajectory.mapper(parameters, lambda: Drive(Odometry.of(*taken[0][2]), taken[0][1]))
+        start = self.online.so_far() if self.online and self._trajectory.correction is None else None
+        run = Run(mapper, parameters, readings, found, start)
         self._generation = generation
         self.worker.start(run, finish)
         run.waiting.append(done)
+
+    def _take(self) -> Taken:
+        buffer = self._associator.buffer
+        return len(buffer), buffer.snapshot(), self._associator.odometry
+
+    def _show(self, maps: MapSet, mapper: Any, count: int, generation: int) -> None:
+        """Publish the maps of a run, and go on with its trajectory."""
+        if generation == self._publishers.generation:
+            self._trajectory.adopt(mapper.found if isinstance(mapper, RefiningMapper) else None, count)
+            self._publishers.publish('ml_map', generation, maps.grid, maps.ml)
+            self._publishers.publish('uncertainty_map', generation, maps.grid, maps.uncertainty)
 
     def _finish(self, outcome: Outcome, count: int) -> None:
         maps = outcome.maps
@@ -164,7 +184,9 @@ class EmService:
             self.online.adopt(maps)
         for warning in filter(None, [*outcome.warnings, quality_warning(maps)]):
             self._logger.warning(f'EM: {warning}')
-        self.last_run = summary(maps, sum(maps.statistics['seconds'].values()))
+        outcome.trajectory = self._trajectory.outcome()
+        said = filter(None, [summary(maps, sum(maps.statistics['seconds'].values())), outcome.trajectory])
+        self.last_run = '; '.join(said)
         self._logger.info(f'EM: {self.last_run}')
         # whoever called EM has his answer before this
         fixed, generation = dict(self.extrinsics()), self._publishers.generation

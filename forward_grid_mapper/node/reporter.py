@@ -17,6 +17,7 @@ from .journal_keeper import JournalKeeper
 from .kernels import Kernels
 from .live import LiveMap
 from .surroundings import Surroundings
+from .trajectory import Trajectory
 
 
 class Reporter:
@@ -32,13 +33,14 @@ class Reporter:
         live: LiveMap,
         em: EmService,
         journal: JournalKeeper,
+        trajectory: Trajectory,
         kernels: Kernels,
         workers: Iterable[Worker],
     ) -> None:
         """Prepare; `workers` are all that work in the background."""
         self._node, self._health, self._intake, self._associator = node, health, intake, associator
         self._extrinsics, self._map_frame = frames
-        self._live, self._em, self._journal = live, em, journal
+        self._live, self._em, self._journal, self._trajectory = live, em, journal, trajectory
         self._kernels, self._workers = kernels, list(workers)
         self._surroundings = Surroundings(node, intake.subscriptions)
         self._reported: set[str] = set()
@@ -56,7 +58,7 @@ class Reporter:
         )
         faults = [*self._intake.faults(), *self._surroundings.faults()]
         diagnostics.add_faults(statuses[0], [*faults, *self._associator.limits.warnings(), *self._em.wrong_input])
-        statuses += self._journal.statuses(name)
+        statuses += [*self._journal.statuses(name), *self._trajectory.statuses(name)]
         statuses.append(self._em.sensors.status(name, self._associator.buffer.counts()))
         statuses.append(self._background(name))
         self._out.publish(diagnostics.array(statuses, self._node.get_clock().now().to_msg()))

@@ -44,6 +44,13 @@ class OdometryRecord:
     def __len__(self) -> int:
         return self._size
 
+    @property
+    def newest(self) -> tuple[int, Pose2] | None:
+        """The last stamp, ns, and its pose; None while there is none."""
+        if not self._size:
+            return None
+        return int(self._stamp[self._size - 1]), Pose2(*self._pose[self._size - 1].tolist())
+
     def clear(self) -> None:
         """Forget every pose."""
         self._size, self._anew = 0, False

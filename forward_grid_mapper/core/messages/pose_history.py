@@ -6,6 +6,7 @@ import math
 from bisect import bisect_left
 
 from .message_types import NANOSECONDS, Pose2
+from .odometry_record import MOST_POSES as MOST_RECORDED
 from .odometry_record import OdometryRecord
 
 HISTORY = 600 * NANOSECONDS
@@ -44,9 +45,9 @@ class PoseHistory:
         Of all of them, those that were forgotten too.
     """
 
-    def __init__(self, most_recorded: int = 0) -> None:
-        """Begin without poses; `most_recorded` is the bound on the record, 0 is none."""
-        self.record = OdometryRecord(most_recorded)
+    def __init__(self, patient: bool = False) -> None:
+        """Begin without poses; the record has no bound where there is no hurry and the drive has an end (`patient`)."""
+        self.record = OdometryRecord(0 if patient else MOST_RECORDED)
         self._stamps: list[int] = []
         self._poses: list[Pose2] = []
 
