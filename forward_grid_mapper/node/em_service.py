@@ -83,7 +83,7 @@ class EmService:
         self._inbox, self._kernels, self._logger = inbox, kernels, logger
         self._watched = 0.0
         self._generation = 0
-        self.worker = EmWorker(self._watch, logger.error, inbox.put, lambda stop: kernels.wait('EM', stop))
+        self.worker = EmWorker(self._watch, logger.error, inbox.put, self._wait_for_kernels)
 
     @property
     def current(self) -> Run | None:
@@ -170,6 +170,11 @@ class EmService:
             self._trajectory.adopt(mapper.found if isinstance(mapper, RefiningMapper) else None, count)
             self._publishers.publish('ml_map', generation, maps.grid, maps.ml)
             self._publishers.publish('uncertainty_map', generation, maps.grid, maps.uncertainty)
+
+    def _wait_for_kernels(self, stop: Callable[[], bool]) -> None:
+        self._kernels.wait('EM', stop)
+        if self._parameters().node.refine_poses:
+            self._kernels.wait('trajectory', stop)
 
     def _finish(self, outcome: Outcome, count: int) -> None:
         maps = outcome.maps

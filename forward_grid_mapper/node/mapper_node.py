@@ -103,7 +103,7 @@ class MapperNode(Node):
         self.associator = PoseAssociator(extrinsics, self.parameters, at_once=AT_ONCE)
         self.journal = JournalKeeper(self, node.journal, self.associator)
         self.inbox = Inbox(self)
-        self.kernels = Kernels(log.info, log.error, node.online)
+        self.kernels = Kernels(log.info, log.error, node.online, node.refine_poses)
         self.trajectory = trajectory = Trajectory(self, self.associator, self._steady)
         self.maps = MapPublishers(self, self.parameters.grid.resolution, lambda: trajectory.frame, self._up_to_date)
         self.trajectory.publishing, self.trajectory.changed = self.maps.worker, self._map_anew

@@ -93,7 +93,8 @@ class RefiningMapper:
 
         `start` is used only where odometry stays.
         """
-        drive, seconds, refinement, correction = self._drive(), {}, None, None
+        drive, refinement, correction = self._drive(), None, None
+        seconds: dict[str, float] = {}
         if self._to_refine:
             begun = time.perf_counter()
             refinement = self._refine(readings, drive.odometry, watch)

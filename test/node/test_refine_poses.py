@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import threading
 from collections.abc import Callable
 from pathlib import Path
@@ -68,9 +69,8 @@ def test_the_maps_of_a_bent_drive_are_those_of_the_offline_tool(
     robot.listen()
     robot.meet()
     robot.play(in_turn(recording), 1000.0)
-    robot.until(lambda: int(robot.diagnostics['readings']['readings accepted']) == len(recording.ranges))
-    # or else the drives are not the same
-    assert int(robot.diagnostics['readings']['odometry received']) == len(recording.odometry)
+    for key, sent in (('readings accepted', recording.ranges), ('odometry received', recording.odometry)):
+        robot.until(lambda key=key, sent=sent: int(robot.diagnostics['readings'][key]) == len(sent), what=key)
     status = robot.until(lambda: robot.diagnostics.get('trajectory'))
     assert 'until run_em is called' in status['message']
     answer = robot.call('run_em', seconds=300.0)
@@ -83,9 +83,10 @@ def test_the_maps_of_a_bent_drive_are_those_of_the_offline_tool(
     same_maps(saved, tmp_path / 'maps')
     for name in ('trajectory.tum', 'odometry.tum'):
         assert (saved / name).read_bytes() == (tmp_path / 'maps' / name).read_bytes()
-    words = [(folder / 'report.txt').read_text() for folder in (saved, tmp_path / 'maps')]
-    lines = [[line for line in text.splitlines() if 'rajectory' in line or 'wheels' in line] for text in words]
-    assert lines[0] == lines[1] != []
+    reports = [json.loads((folder / 'report.json').read_text()) for folder in (saved, tmp_path / 'maps')]
+    assert reports[0]['input']['trajectory'] == reports[1]['input']['trajectory']
+    assert reports[0]['input']['trajectory']['refined']
+    assert (reports[0]['input']['odom_frame'], reports[0]['input']['map_frame']) == ('odom', 'map')
     assert {name: robot.maps[name][-1].header.frame_id for name in robot.maps} == dict.fromkeys(robot.maps, 'map')
     # whoever comes late gets the path, and without TF the pose
     paths: list[PathMessage] = []
