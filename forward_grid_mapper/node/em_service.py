@@ -16,6 +16,7 @@ from ..core.maps.map_set import MapSet
 from ..core.messages.message_types import Pose2
 from ..core.messages.pose_association import PoseAssociator
 from ..core.messages.reading_buffer import bounded
+from ..core.trajectory.recovering import recovered
 from ..core.trajectory.windows import Odometry
 from ..files.quality_warning import quality_warning
 from .background import Inbox
@@ -59,6 +60,8 @@ class EmService:
         Gives the map to start from, and takes what was found.
     extrinsics : callable
         Returns the poses of the sensors that are fixed to the robot, by frame.
+    mounts : callable
+        The same, with those of sensors that were not heard of yet.
     """
 
     def __init__(
@@ -78,6 +81,7 @@ class EmService:
         self.sensors = SensorWatch()
         self.online: OnlineWorker | None = None
         self.extrinsics: Callable[[], Mapping[str, Pose2]] = dict
+        self.mounts: Callable[[], Mapping[str, Pose2]] = dict
         self._parameters, self._associator, self._publishers = parameters, associator, publishers
         self._trajectory = trajectory
         self._inbox, self._kernels, self._logger = inbox, kernels, logger
@@ -153,7 +157,14 @@ class EmService:
             self._finish(outcome, taken[0][0])
 
         parameters = self._parameters()
-        mapper = self._trajectory.mapper(parameters, lambda: Drive(Odometry.of(*taken[0][2]), taken[0][1]))
+        mounts = dict(self.mounts())
+
+        def drive() -> Drive:
+            _, held, odometry = taken[0]
+            # after a restart the journal's readings are all there is of the odometry before
+            return Drive(recovered(Odometry.of(*odometry), held, mounts), held)
+
+        mapper = self._trajectory.mapper(parameters, drive)
         start = self.online.so_far() if self.online and self._trajectory.correction is None else None
         run = Run(mapper, parameters, readings, found, start)
         self._generation = generation

@@ -113,7 +113,7 @@ class MapperNode(Node):
             lambda: self.parameters, self.associator, self.trajectory, self.maps, self.inbox, self.kernels, log
         )
         self._extrinsics = extrinsics
-        self.em.extrinsics = lambda: extrinsics.fixed
+        self.em.extrinsics, self.em.mounts = lambda: extrinsics.fixed, lambda: extrinsics.known
         self.online = self.em.online = self._online_worker() if node.online else None
         self.saver = Saver(self.em, self.live, self._account, lambda: self.trajectory.found, log)
         self._aside = Worker('readings', log.error)

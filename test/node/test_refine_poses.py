@@ -309,6 +309,35 @@ def test_the_online_map_goes_along(inside: Callable[..., Inside], quick: Any) ->
     assert not node.online.worker.trouble
 
 
+def test_after_a_restart_the_journal_tells_the_odometry(
+    inside: Callable[..., Inside], quick: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    options = {'refine_poses': True, 'journal': str(tmp_path / 'journal')}
+    robot = inside(**options).start()
+    robot.drive(0, 150)
+    before = odometry_of(robot)
+    robot.close()
+    seen: list[Odometry] = []
+    run = quick.run
+
+    def look(self: Any, readings: Any, odometry: Odometry, watch: Any) -> Any:
+        seen.append(odometry)
+        return run(self, readings, odometry, watch)
+
+    monkeypatch.setattr(quick, 'run', look)
+    robot = inside(**options).start()
+    assert len(robot.node.associator.buffer) == 150
+    assert robot.call(robot.node.em.run_em)[0]
+    robot.drive(150, 50)
+    assert robot.call(robot.node.em.run_em)[0]
+    for odometry, count in zip(seen, (150, 200), strict=True):
+        assert len(odometry.stamp) == count
+        assert np.array_equal(odometry.stamp[:150], before.stamp)
+        assert odometry.pose[:150] == pytest.approx(before.pose, abs=1e-9)
+    assert robot.node.trajectory.correction is not None
+    assert_live(robot, seen[-1])
+
+
 def test_odometry_in_frame_map_is_left_alone_in_words(inside: Callable[..., Inside], quick: Any) -> None:
     robot = inside(refine_poses=True, map_frame='odom').start()
     robot.drive(0, 60)
