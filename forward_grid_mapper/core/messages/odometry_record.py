@@ -24,6 +24,9 @@ TOLERANCE = 1e-4
 OVERLAP = 60 * NANOSECONDS
 """Nanoseconds of the drive before that stay when another one begins: readings are late by less."""
 
+MOST_LATE = 1024
+"""Poses that came late and wait to be sorted in: it costs the same for many."""
+
 LARGEST_SHARE = 0.75
 """Part of the poses that may stay when some go, so that they seldom have to."""
 
@@ -42,7 +45,7 @@ class OdometryRecord:
         self.clear()
 
     def __len__(self) -> int:
-        return self._size
+        return self._size + len(self._late)
 
     @property
     def newest(self) -> tuple[int, Pose2] | None:
@@ -54,6 +57,7 @@ class OdometryRecord:
     def clear(self) -> None:
         """Forget every pose."""
         self._size, self._anew = 0, False
+        self._late: dict[int, Pose2] = {}
         self._stamp = np.empty(1024, np.int64)
         self._pose = np.empty((1024, 3))
 
@@ -61,7 +65,9 @@ class OdometryRecord:
         """Add a pose, in any order of stamps; it replaces one of the same stamp."""
         size = self._size
         if size and stamp <= self._stamp[size - 1]:
-            self._insert(stamp, pose)
+            self._late[stamp] = pose
+            if len(self._late) >= MOST_LATE:
+                self._sort_in()
             return
         if size == len(self._stamp):
             self._stamp, self._pose = _longer(self._stamp, size + 1024), _longer(self._pose, size + 1024)
@@ -73,6 +79,7 @@ class OdometryRecord:
 
     def begin_anew(self) -> None:
         """Begin a drive where another one ended: the next reading may be of any time, the drive begins with it."""
+        self._sort_in()
         self._anew = True
         newest = int(self._stamp[self._size - 1]) if self._size else 0
         begin = int(np.searchsorted(self._stamp[: self._size], newest - OVERLAP))
@@ -88,20 +95,27 @@ class OdometryRecord:
         first : int, optional
             Stamp of the drive's first reading, ns: after `begin_anew`, poses begin with the last one before it.
         """
+        self._sort_in()
         stamp, pose = self._stamp[: self._size], self._pose[: self._size]
         if not self._anew or first is None:
             return stamp, pose
         begin = max(int(np.searchsorted(stamp, first, side='right')) - 1, 0)
         return stamp[begin:], pose[begin:]
 
-    def _insert(self, stamp: int, pose: Pose2) -> None:
-        # copies, since the columns are those of snapshots
-        old_stamp, old_pose = self._stamp[: self._size], self._pose[: self._size]
-        at = int(np.searchsorted(old_stamp, stamp))
-        after = at + int(old_stamp[at] == stamp)
-        self._stamp = np.concatenate([old_stamp[:at], [stamp], old_stamp[after:]])
-        self._pose = np.concatenate([old_pose[:at], [pose], old_pose[after:]])
+    def _sort_in(self) -> None:
+        """Sort in what came late; into copies, since the columns are those of snapshots."""
+        if not self._late:
+            return
+        stamp = np.concatenate([self._stamp[: self._size], np.array(list(self._late), np.int64)])
+        pose = np.concatenate([self._pose[: self._size], np.array(list(self._late.values()))])
+        self._late.clear()
+        order = np.argsort(stamp, kind='stable')
+        # of one stamp the one that came last
+        last = np.append(np.diff(stamp[order]) > 0, True)
+        self._stamp, self._pose = stamp[order[last]], pose[order[last]]
         self._size = len(self._stamp)
+        if self._most and self._size > self._most:
+            self._thin()
 
     def _thin(self) -> None:
         """Let poses go that lie between their neighbours, never two in a row, until enough have gone."""

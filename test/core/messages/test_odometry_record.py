@@ -29,7 +29,8 @@ def test_any_order_gives_what_a_dictionary_holds() -> None:
         stamp, pose = record.snapshot()
         assert stamp.tolist() == sorted(known)
         assert pose.tolist() == [list(known[s]) for s in sorted(known)]
-        assert len(record) == len(known)
+        assert len(record) == len(known), 'those that came late are in their places'
+        assert record.newest == (max(known), known[max(known)])
         for now_stamp, now_pose, then_stamp, then_pose in snapshots:
             assert np.array_equal(now_stamp, then_stamp)
             assert np.array_equal(now_pose, then_pose)
