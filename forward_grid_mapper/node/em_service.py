@@ -25,9 +25,12 @@ from .em import EmWorker, Outcome, Run, summary
 from .kernels import Kernels
 from .map_publishers import MapPublishers
 from .online import OnlineWorker
-from .refining import Drive, RefiningMapper
+from .refining import Drive, Found, RefiningMapper
 from .sensor_status import SensorWatch
 from .trajectory import Trajectory
+
+TELLING = 10.0
+"""Seconds between two lines in the log while a trajectory is looked for."""
 
 Taken = tuple[int, Readings, Any]
 """Number of readings accepted, those that are held, and stamps and poses of odometry."""
@@ -49,6 +52,8 @@ class EmService:
     ----------
     maps : MapSet or None
         Of the latest run since the last reset.
+    found : Found or None
+        What became of their trajectory; None where none was looked for.
     explained : int
         Readings that had been accepted when it began.
     last_run : str
@@ -75,6 +80,7 @@ class EmService:
         logger: Any,
     ) -> None:
         self.maps: MapSet | None = None
+        self.found: Found | None = None
         self.explained = 0
         self.last_run = 'none yet'
         self.wrong_input: list[str] = []
@@ -85,7 +91,7 @@ class EmService:
         self._parameters, self._associator, self._publishers = parameters, associator, publishers
         self._trajectory = trajectory
         self._inbox, self._kernels, self._logger = inbox, kernels, logger
-        self._watched = 0.0
+        self._watched = self._told = 0.0
         self._generation = 0
         self.worker = EmWorker(self._watch, logger.error, inbox.put, self._wait_for_kernels)
 
@@ -127,7 +133,7 @@ class EmService:
         """Forget the maps, and cancel the run that goes on."""
         self.worker.cancel()
         self._generation = self._publishers.generation
-        self.maps, self.wrong_input, self.last_run = None, [], 'none since the reset'
+        self.maps, self.found, self.wrong_input, self.last_run = None, None, [], 'none since the reset'
         self.sensors.clear()
 
     def close(self, seconds: float) -> None:
@@ -193,7 +199,7 @@ class EmService:
             self.last_run = outcome.message
             self._logger.warning(f'EM: {outcome.message}')
             return
-        self.maps, self.explained = maps, count
+        self.maps, self.found, self.explained = maps, self._trajectory.found, count
         self.wrong_input = outcome.warnings
         self.sensors.take(outcome.health)
         if self.online:
@@ -225,7 +231,12 @@ class EmService:
         """Show the map found so far, and the progress, at most `publish_rate` times a second; in the run's thread."""
         now = time.monotonic()
         rate = self._parameters().node.publish_rate
-        if run.progress is None or now - max(self._watched, run.begin) < 1.0 / rate:
+        if run.progress is None:
+            if now - max(self._told, run.begin) > TELLING:
+                self._told = now
+                self._logger.info(f'EM: {run}')
+            return
+        if now - max(self._watched, run.begin) < 1.0 / rate:
             return
         self._watched = now
         generation = self._generation

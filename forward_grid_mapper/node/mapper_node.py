@@ -115,7 +115,7 @@ class MapperNode(Node):
         self._extrinsics = extrinsics
         self.em.extrinsics, self.em.mounts = lambda: extrinsics.fixed, lambda: extrinsics.known
         self.online = self.em.online = self._online_worker() if node.online else None
-        self.saver = Saver(self.em, self.live, self._account, lambda: self.trajectory.found, log)
+        self.saver = Saver(self.em, self.live, self._account, log)
         self._aside = Worker('readings', log.error)
         self.workers = [self._aside, self.live.worker, self.maps.worker, self.em.worker.worker]
         self.workers += [self.saver.worker, self.kernels.worker]

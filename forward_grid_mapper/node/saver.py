@@ -42,18 +42,10 @@ class Account(NamedTuple):
 class Saver:
     """Writes maps in a thread of its own, so that each call finds a folder name that is free."""
 
-    def __init__(
-        self,
-        em: EmService,
-        live: LiveMap,
-        account: Callable[[], Account],
-        trajectory: Callable[[], Found | None],
-        logger: Any,
-    ) -> None:
-        """Prepare; `account`, and `trajectory`, which returns that of the latest maps, are called by the executor."""
+    def __init__(self, em: EmService, live: LiveMap, account: Callable[[], Account], logger: Any) -> None:
+        """Prepare; `account` is called by the executor."""
         self.worker = Worker('save_maps', logger.error)
         self._em, self._live, self._account, self._logger = em, live, account, logger
-        self._trajectory = trajectory
 
     def save_maps(self, reply: Reply) -> None:
         """Answer the service; where EM has not run, run it first."""
@@ -65,7 +57,7 @@ class Saver:
             reply.send(False, f'there is no map to save: {outcome.message}')
             return
         account, explained, generation = self._account(), self._em.explained, self._live.generation
-        found = self._trajectory()
+        found = self._em.found
 
         def work() -> None:
             try:

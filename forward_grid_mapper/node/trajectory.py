@@ -107,7 +107,8 @@ class Trajectory:
         """Take what was found for the maps of the first `count` readings; None if they are as odometry has it."""
         before, live = self.frame, found.live if found else None
         self.correction = found.correction if found else None
-        self.found = found if found and found.refinement else None
+        # the live map belongs to the one who shows it
+        self.found = found._replace(live=None) if found and found.refinement else None
         self._switch(self.found is not None)
         self._show_path()
         if live is not None or self.frame != before:
