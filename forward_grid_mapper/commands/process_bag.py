@@ -5,8 +5,9 @@ from __future__ import annotations
 import argparse
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from ..core.common.errors import ParameterError
 from ..core.common.parameters import Parameters
@@ -17,13 +18,14 @@ from ..core.trajectory.windows import Odometry
 from ..files.map_files import occupancy_values
 from ..files.output_folder import free_name, output_folder, readable
 from ..files.parameter_file import parse_sensor
-from ..files.report_text import report_text
+from ..files.report import json_text, report_text
 from ..files.results import write_results
 from ..files.trajectory_text import trajectory_data, tum_text
 from ..recordings.drive import Drive
 from ..recordings.read_drive import read_drive
 from .console import Ticker, run
-from .options import BagParser, add_bag_options, add_mapping_options, chosen_parameters
+from .desktop import show
+from .options import BagParser, add_bag_options, add_json_option, add_mapping_options, chosen_parameters
 
 COMMAND = 'process_bag'
 
@@ -33,7 +35,8 @@ def parser() -> argparse.ArgumentParser:
     made = BagParser(
         COMMAND,
         description='Map a recorded drive: reads sonar Range and Odometry from a ROS 1 or ROS 2 bag and writes the '
-        'live log-odds map, the maximum likelihood map and the uncertainty map.',
+        'standard map, the maximum likelihood map and the uncertainty map.',
+        epilog='example: process_bag MY_BAG --sensor sonar_left=0.1,0.15,90deg -o maps --show',
     )
     made.add_bag('ROS 2 bag folder, single .mcap or .db3 file, ROS 1 .bag, or a journal of the node')
     made.add_argument('-o', '--output', metavar='DIR', help='new folder for the results (default: BAG_maps)')
@@ -53,6 +56,8 @@ def parser() -> argparse.ArgumentParser:
     )
     made.add_argument('--bag', dest='write_bag', action='store_true', help='also write the maps as a bag (mcap)')
     made.add_argument('-q', '--quiet', action='store_true', help='print nothing but errors and the folder')
+    add_json_option(made)
+    made.add_argument('--show', action='store_true', help="open the report with the desktop's browser")
     add_mapping_options(made)
     return made
 
@@ -104,13 +109,23 @@ def process(options: argparse.Namespace) -> int:
         report = write_results(folder, maps, drive.source, path, title, extras=extras, odometry_xy=before)
         if options.write_bag:
             _write_bag(folder / 'maps.mcap_bag', maps, drive)
+    tell(options, report, output)
+    if options.show:
+        show(output / 'report.html')
+    return 0
+
+
+def tell(options: argparse.Namespace, report: Mapping[str, Any], output: Path) -> None:
+    """Print what came out, as the options want it."""
+    if options.json:
+        print(json_text({'folder': readable(output), **report}), end='')
+        return
     if not options.quiet:
-        print(report_text(report), end='')
+        print(report_text(dict(report)), end='')
     else:
         for warning in report['warnings']:
             print(f'{COMMAND}: warning: {warning}', file=sys.stderr)
     print(f'maps are in {output}')
-    return 0
 
 
 def refine(drive: Drive, parameters: Parameters, ticker: Ticker) -> Refinement:
