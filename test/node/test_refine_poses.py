@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 import threading
 from collections.abc import Callable
 from pathlib import Path
@@ -20,6 +21,7 @@ from geometry_msgs.msg import PoseWithCovarianceStamped
 from inside import Inside
 from nav_msgs.msg import Path as PathMessage
 from robot import LATCHED
+from sensor_msgs.msg import MultiDOFJointState
 
 from forward_grid_mapper.commands import process_bag
 from forward_grid_mapper.commands.simulate import write_recording
@@ -374,13 +376,11 @@ class Broadcaster:
         self.sent.append(transform)
 
 
-def stand_in(monkeypatch: pytest.MonkeyPatch, **names: Any) -> None:
-    import sys
-
-    module = ModuleType('tf2_ros')
+def stand_in(monkeypatch: pytest.MonkeyPatch, module: str, **names: Any) -> None:
+    made = ModuleType(module)
     for name, value in names.items():
-        setattr(module, name, value)
-    monkeypatch.setitem(sys.modules, 'tf2_ros', module)
+        setattr(made, name, value)
+    monkeypatch.setitem(sys.modules, module, made)
 
 
 @pytest.fixture
@@ -401,8 +401,12 @@ def tf2_ros(monkeypatch: pytest.MonkeyPatch) -> type[Broadcaster]:
         def __init__(self, buffer: Any, node: Any, *, spin_thread: bool = False) -> None:
             pass
 
+    # a type of message that rclpy knows, with a field `transforms`, as TFMessage has it
+    stand_in(monkeypatch, 'tf2_msgs')
+    stand_in(monkeypatch, 'tf2_msgs.msg', TFMessage=MultiDOFJointState)
     stand_in(
         monkeypatch,
+        'tf2_ros',
         Buffer=Buffer,
         TransformListener=TransformListener,
         TransformException=Unknown,
@@ -463,18 +467,14 @@ def test_without_refine_poses_nothing_is_sent(inside: Callable[..., Inside], tf2
 
 
 def test_with_tf2_msgs_alone_it_goes_there_as_a_message(monkeypatch: pytest.MonkeyPatch) -> None:
-    import sys
-
     class TFMessage:
         def __init__(self, transforms: list[Any]) -> None:
             self.transforms = transforms
 
     made, sent = [], []
-    package, messages = ModuleType('tf2_msgs'), ModuleType('tf2_msgs.msg')
-    messages.TFMessage = TFMessage  # type: ignore[attr-defined]
     monkeypatch.setitem(sys.modules, 'tf2_ros', None)
-    monkeypatch.setitem(sys.modules, 'tf2_msgs', package)
-    monkeypatch.setitem(sys.modules, 'tf2_msgs.msg', messages)
+    stand_in(monkeypatch, 'tf2_msgs')
+    stand_in(monkeypatch, 'tf2_msgs.msg', TFMessage=TFMessage)
 
     class Node:
         def create_publisher(self, kind: Any, topic: str, qos: Any) -> Any:
