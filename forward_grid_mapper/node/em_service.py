@@ -172,8 +172,11 @@ class EmService:
             return bounded(taken[0][1], bound)
 
         def found(maps: MapSet) -> None:
-            # the transform to the map changes together with the maps
-            self._inbox.put(lambda: self._show(maps, mapper, taken[0][0], generation))
+            if isinstance(mapper, RefiningMapper) or moved:
+                # the transform to the map changes together with the maps
+                self._inbox.put(lambda: self._show_moved(maps, mapper, taken[0][0], generation))
+            else:
+                self._show(maps, generation)
 
         def finish(outcome: Outcome) -> None:
             # whoever waits is told the same
@@ -193,7 +196,7 @@ class EmService:
             # after a restart the journal's readings are all there is of the odometry before
             return Drive(recovered(Odometry.of(*odometry), held, mounts), held)
 
-        mapper = self._trajectory.mapper(parameters, drive)
+        mapper, moved = self._trajectory.mapper(parameters, drive), self._trajectory.on
         start = self.online.so_far() if self.online and self._trajectory.correction is None else None
         # it comes back if the run ends without a map, since the map so far is shown meanwhile
         before = self._publishers.ml_map
@@ -206,12 +209,16 @@ class EmService:
         buffer = self._associator.buffer
         return len(buffer), buffer.snapshot(), self._associator.odometry
 
-    def _show(self, maps: MapSet, mapper: Any, count: int, generation: int) -> None:
-        """Publish the maps of a run, and go on with its trajectory."""
+    def _show(self, maps: MapSet, generation: int) -> None:
+        """Publish the maps of a run; any thread."""
+        self._publishers.publish('ml_map', generation, maps.grid, maps.ml)
+        self._publishers.publish('uncertainty_map', generation, maps.grid, maps.uncertainty)
+
+    def _show_moved(self, maps: MapSet, mapper: Any, count: int, generation: int) -> None:
+        """Go on with the trajectory of a run, and publish its maps."""
         if generation == self._publishers.generation:
             self._trajectory.adopt(mapper.found if isinstance(mapper, RefiningMapper) else None, count)
-            self._publishers.publish('ml_map', generation, maps.grid, maps.ml)
-            self._publishers.publish('uncertainty_map', generation, maps.grid, maps.uncertainty)
+            self._show(maps, generation)
 
     def _wait_for_kernels(self, stop: Callable[[], bool]) -> None:
         self._kernels.wait('EM', stop)

@@ -61,8 +61,9 @@ def test_it_ends_em_and_the_map_of_before_comes_back(
     node = robot.node
     robot.drive(0, 30)
     assert robot.call(node.em.run_em)[0]
-    maps, before = node.em.maps, node.maps.latest['ml_map'].data
+    # once the map that the answer tells of is published
     wide = width(robot)
+    maps, before = node.em.maps, node.maps.latest['ml_map'].data
     with monkeypatch.context() as patch:
         endless = Endless(patch)
         first = asked(node.em.run_em)
