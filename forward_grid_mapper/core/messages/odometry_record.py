@@ -19,16 +19,16 @@ MOST_POSES = 300_000
 driving without a rest."""
 
 TOLERANCE = 1e-4
-"""Metres, and radians, by which the neighbours may miss a pose that goes; more where too few would."""
+"""Metres, and radians, by which the neighbours may miss a pose that goes in any case, as where the robot stands."""
+
+PART = 16_384
+"""Poses that are looked through at once when some have to go: it takes a few milliseconds."""
 
 OVERLAP = 60 * NANOSECONDS
 """Nanoseconds of the drive before that stay when another one begins: readings are late by less."""
 
 MOST_LATE = 1024
 """Poses that came late and wait to be sorted in: it costs the same for many."""
-
-LARGEST_SHARE = 0.75
-"""Part of the poses that may stay when some go, so that they seldom have to."""
 
 
 class OdometryRecord:
@@ -56,7 +56,7 @@ class OdometryRecord:
 
     def clear(self) -> None:
         """Forget every pose."""
-        self._size, self._anew = 0, False
+        self._size, self._next, self._anew = 0, 0, False
         self._late: dict[int, Pose2] = {}
         self._stamp = np.empty(1024, np.int64)
         self._pose = np.empty((1024, 3))
@@ -70,7 +70,10 @@ class OdometryRecord:
                 self._sort_in()
             return
         if size == len(self._stamp):
-            self._stamp, self._pose = _longer(self._stamp, size + 1024), _longer(self._pose, size + 1024)
+            rows = max(2 * size, 1024)
+            if self._most:
+                rows = max(size + 1, min(rows, self._most + 1))
+            self._stamp, self._pose = _longer(self._stamp, rows), _longer(self._pose, rows)
         self._stamp[size] = stamp
         self._pose[size] = pose
         self._size = size + 1
@@ -118,28 +121,33 @@ class OdometryRecord:
             self._thin()
 
     def _thin(self) -> None:
-        """Let poses go that lie between their neighbours, never two in a row, until enough have gone."""
-        tolerance = TOLERANCE
-        while self._size > LARGEST_SHARE * self._most:
-            stay = _telling(self._stamp[: self._size], self._pose[: self._size], tolerance)
-            self._stamp, self._pose = self._stamp[: self._size][stay], self._pose[: self._size][stay]
-            self._size = len(self._stamp)
-            tolerance *= 4.0
+        """Let poses of a part of the drive go that lie between their neighbours; the next time, of the next part."""
+        begin = self._next if self._next < self._size - 2 else 0
+        end = min(begin + PART, self._size)
+        stay = np.ones(self._size, np.bool_)
+        stay[begin:end] = _telling(self._stamp[begin:end], self._pose[begin:end])
+        self._next = begin + int(np.count_nonzero(stay[begin:end]))
+        self._stamp, self._pose = self._stamp[: self._size][stay], self._pose[: self._size][stay]
+        self._size = len(self._stamp)
 
 
-def _telling(stamp: NDArray[np.int64], pose: Floats, tolerance: float) -> NDArray[np.bool_]:
-    """Return the poses that stay, shape (M,): every other one, and those that lie off the line between these."""
+def _telling(stamp: NDArray[np.int64], pose: Floats) -> NDArray[np.bool_]:
+    """Return the poses that stay, shape (M,).
+
+    Of every other one those go that lie nearest to the line between the poses beside them, half of them at least.
+    """
     stay = np.ones(len(stamp), np.bool_)
     before, middle, after = slice(0, -2, 2), slice(1, -1, 2), slice(2, None, 2)
     part = ((stamp[middle] - stamp[before]) / (stamp[after] - stamp[before]))[:, None]
     whole, half = pose[after] - pose[before], pose[middle] - pose[before]
     for turn in (whole[:, 2], half[:, 2]):
         turn[:] = np.remainder(turn + np.pi, 2 * np.pi) - np.pi
-    stay[middle] = np.abs(half - part * whole).max(1) > tolerance
+    off = np.abs(half - part * whole).max(1)
+    stay[middle] = off > max(float(np.median(off)), TOLERANCE)
     return stay
 
 
 def _longer(column: NDArray[Any], rows: int) -> NDArray[Any]:
-    longer = np.empty((max(rows, 2 * len(column)), *column.shape[1:]), column.dtype)
+    longer = np.empty((rows, *column.shape[1:]), column.dtype)
     longer[: len(column)] = column
     return longer

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from forward_grid_mapper.core.messages.message_types import NANOSECONDS, OdometryMessage, Pose2, RangeMessage
-from forward_grid_mapper.core.messages.odometry_record import LARGEST_SHARE, OVERLAP, OdometryRecord
+from forward_grid_mapper.core.messages.odometry_record import OVERLAP, PART, OdometryRecord
 from forward_grid_mapper.core.messages.pose_association import PoseAssociator
 
 
@@ -69,8 +69,21 @@ def test_when_some_go_enough_go() -> None:
     rng = random.Random(3)
     for k in range(101):
         record.add(k, Pose2(rng.random(), rng.random(), rng.random()))
-    assert len(record) <= LARGEST_SHARE * 100
+    assert len(record) <= 0.76 * 101
     assert record.snapshot()[0][[0, -1]].tolist() == [0, 100]
+
+
+def test_each_part_of_the_drive_gives_up_some() -> None:
+    most = 4 * PART
+    record, rng = OdometryRecord(most), random.Random(4)
+    for k in range(most + 3 * PART):
+        record.add(k, Pose2(rng.random(), rng.random(), rng.random()))
+    assert len(record) <= most
+    stamp = record.snapshot()[0]
+    assert stamp[0] == 0
+    parts = np.histogram(stamp, np.arange(0, most, PART))[0]
+    assert parts.min() > 0.4 * PART
+    assert parts.max() < 0.8 * PART
 
 
 def test_a_drive_that_begins_anew_begins_before_its_first_reading() -> None:
