@@ -135,6 +135,7 @@ INSTEAD = {
     'range_topics': 'give --range-topics',
     'odom_topic': 'give --odom-topic',
     'map_frame': "the maps are in odometry's frame",
+    'refine_poses': 'give --refine-poses',
     'save_directory': 'give --output',
 }
 """What to do offline in place of a parameter of the node."""

@@ -24,17 +24,19 @@ from ..core.runtime.threads import cores
 from ..core.search.search import Progress
 from ..files.quality_warning import quality_warning
 from .background import Worker
+from .refining import RefiningMapper
 
 
 @dataclass
 class Outcome:
     """How a run ended: `maps`, or None and the reason in `message`.
 
-    `warnings` say what is wrong with the readings, `health` how each sensor does.
+    `warnings` say what is wrong with the readings, `health` how each sensor does, `trajectory` what became of it.
     """
 
     maps: MapSet | None
     message: str
+    trajectory: str = ''
     warnings: list[str] = field(default_factory=list)
     health: dict[str, SensorHealth] = field(default_factory=dict)
 
@@ -48,7 +50,7 @@ class Run:
     `asked` whether somebody asked for its end alone.
     """
 
-    mapper: Mapper
+    mapper: Mapper | RefiningMapper
     parameters: Parameters
     readings: Callable[[], Readings]
     found: Callable[[MapSet], object] = lambda maps: None
