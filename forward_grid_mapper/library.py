@@ -18,19 +18,17 @@ from .core.maps.map_set import MapSet
 from .core.messages.extrinsics import Mount
 from .core.messages.message_types import NANOSECONDS, OdometryMessage, Pose2, RangeMessage
 from .core.messages.pose_association import PoseAssociator
-from .core.messages.quaternions import yaw_of
 from .core.messages.rep117 import ODOMETRY_REASONS, REASONS
+from .files.pose_files import poses_from_csv, poses_from_tum
 from .files.quality_warning import data_warnings
 from .files.results import write_results
 
-__all__ = ['Sonar', 'SonarMaps', 'make_maps', 'poses_from_tum']
+__all__ = ['Sonar', 'SonarMaps', 'make_maps', 'poses_from_csv', 'poses_from_tum']
 
 TURN = 2.0 * math.pi
 
 MANY = 0.2
 """Part of the ranges whose rejection for one reason is worth a warning."""
-
-_TUM_COLUMNS = 8
 
 
 @dataclass(frozen=True)
@@ -255,41 +253,3 @@ def _told_of_poses(associator: PoseAssociator) -> list[str]:
         f'{count} of {associator.odometry_received} poses were rejected: {ODOMETRY_REASONS[reason]}'
         for reason, count in associator.odometry_rejected.items()
     ]
-
-
-def poses_from_tum(path: Path | str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Read a trajectory in the format of the TUM benchmark, as evo and most SLAM tools write it.
-
-    Returns
-    -------
-    stamps : float64, shape (M,)
-        Seconds.
-    poses : float64, shape (M, 3)
-        x, y in metres and yaw in radians: the trajectory projected on the plane.
-
-    Raises
-    ------
-    InputError
-        If a line has not the eight numbers `stamp x y z qx qy qz qw`, or no orientation of a robot on a floor.
-    """
-    stamps, poses = [], []
-    try:
-        lines = Path(path).read_text(encoding='utf-8').splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f'{path} cannot be read: {error}') from None
-    for number, line in enumerate(lines, 1):
-        words = line.partition('#')[0].split()
-        if not words:
-            continue
-        try:
-            row = [float(word) for word in words]
-        except ValueError:
-            row = []
-        if len(row) != _TUM_COLUMNS or not all(map(math.isfinite, row)):
-            raise InputError(f'{path}, line {number}: not the eight numbers "stamp x y z qx qy qz qw"')
-        yaw = yaw_of(*row[4:])
-        if yaw is None:
-            raise InputError(f'{path}, line {number}: the quaternion is not normalised, or the robot stands on end')
-        stamps.append(row[0])
-        poses.append((row[1], row[2], yaw))
-    return np.array(stamps), np.array(poses).reshape(-1, 3)

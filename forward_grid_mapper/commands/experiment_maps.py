@@ -240,5 +240,6 @@ def corridor(options: argparse.Namespace, parameters: Parameters, ticker: Ticker
         f'with an F1 of at least 0.80: {len(good)}.'
     )
     world = cases[0].recording.world
+    truth = Tile('truth, with the smooth wall marked', world.grid, world.reference, marked=world.smooth_cells)
     tiles = [o.tile._replace(title=f'{name}, F1 {o.f1:.2f}, {fewest_doors(o)}/6 doors') for name, o in named.items()]
-    return '\n'.join(lines), [[Tile('truth', world.grid, world.reference)], *([tile] for tile in tiles)]
+    return '\n'.join(lines), [[truth], *([tile] for tile in tiles)]

@@ -11,6 +11,7 @@ from pathlib import Path
 
 from ..core.common.errors import OutputError, ParameterError
 from ..core.common.shell import command_line
+from ..core.foresight import only_if_foreseen
 from ..core.joint_learning import learn_jointly
 from ..core.learning.consistency import consistency_warnings
 from ..core.learning.input_warnings import input_warnings
@@ -44,7 +45,9 @@ def parser() -> argparse.ArgumentParser:
         '--rounds', type=int, default=5, metavar='N', help='at most so many rounds of map and updates (default 5)'
     )
     made.add_argument(
-        '--keep-going', action='store_true', help='hand out values although their map has lost walls of the first one'
+        '--keep-going',
+        action='store_true',
+        help='hand out values although their map has lost walls or held-out readings speak against it',
     )
     made.add_argument('-q', '--quiet', action='store_true', help='print nothing but warnings and errors')
     add_json_option(made)
@@ -69,6 +72,8 @@ def learn(options: argparse.Namespace) -> int:
     with Ticker(options.quiet) as ticker:
         drive = read_drive(bag, parameters, extrinsics, options.range_topics, options.odom_topic, ticker.reading)
         found = learn_jointly(drive.associator.readings, parameters, options.rounds, options.keep_going, ticker.mapping)
+        if not options.keep_going:
+            found = only_if_foreseen(found, drive.associator.readings, parameters, options.rounds, ticker.mapping)
         suspects = health_warning(sensor_health(found.maps))
     warnings_ = (
         *drive.source['warnings'],

@@ -12,7 +12,7 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -78,6 +78,23 @@ class Round:
         return sum(stretch.length for stretch in self.lost)
 
 
+class Foresight(NamedTuple):
+    """Mean log-likelihood of a reading held out, nats: of the map of the first values and of that of the learned ones.
+
+    Each is judged at the first values and at the learned ones.
+    """
+
+    first_at_first: float
+    first_at_learned: float
+    learned_at_first: float
+    learned_at_learned: float
+
+    @property
+    def better(self) -> bool:
+        """Whether the map of the learned values is not the worse one, whichever values judge."""
+        return self.learned_at_first >= self.first_at_first and self.learned_at_learned >= self.first_at_learned
+
+
 @dataclass(frozen=True)
 class Learned:
     """What learning found.
@@ -97,6 +114,8 @@ class Learned:
     maps : MapSet
         Of the accepted round.
     warnings : tuple of str
+    foresight : Foresight, optional
+        What readings that were held out say of the values, where they were asked (`foresight`).
     """
 
     parameters: Parameters
@@ -106,6 +125,7 @@ class Learned:
     converged: bool
     maps: MapSet
     warnings: tuple[str, ...]
+    foresight: Foresight | None = None
 
 
 def settle(forward: ForwardModel, occupied: NDArray[Any]) -> ModelParameters:

@@ -27,7 +27,7 @@ from .panels import Box, Picture, coarse
 # uncertain cell looks like neither. Path, dots and the path by odometry are blue, vermilion and purple of
 # the Okabe-Ito palette.
 _FREE, _OCCUPIED, UNKNOWN = '#ffffff', '#14171c', '#cfd9e4'
-PATH, _DOT, _BEFORE = '#0072b2', '#d55e00', '#cc79a7'
+PATH, DOT, _BEFORE = '#0072b2', '#d55e00', '#cc79a7'
 INK, FRAME = '#22262b', '#8b96a3'
 _PROBABILITY = LinearSegmentedColormap.from_list(
     'occupancy', [(0.0, _FREE), (0.2, '#fdf0d2'), (0.5, '#eeb04d'), (0.78, '#8a4a1c'), (1.0, _OCCUPIED)]
@@ -147,7 +147,7 @@ def _draw_overlay(axes: Axes, picture: Picture) -> None:
         # together they cover a hundredth of the panel at most, so that the map stays visible beneath them
         extent, points = axes.get_window_extent(), 72.0 / axes.figure.dpi
         size = float(np.clip(0.01 * extent.width * extent.height * points**2 / len(dots), 0.8, 9.0))
-        axes.scatter(dots[:, 0], dots[:, 1], s=size, color=_DOT, linewidths=0, alpha=0.85, zorder=3)
+        axes.scatter(dots[:, 0], dots[:, 1], s=size, color=DOT, linewidths=0, alpha=0.85, zorder=3)
     if not len(path):
         return
     before = picture.odometry_xy
@@ -219,7 +219,7 @@ def _foot(figure: Figure, picture: Picture) -> None:
         handles.append(Line2D([], [], color=_BEFORE, linewidth=1.3, linestyle=(0, (4, 2)), label='by odometry'))
     if count := len(picture.unexplained_xy):
         label = f'unexplained reading ({count:,})'
-        handles.append(Line2D([], [], linestyle='none', marker='o', markersize=4, color=_DOT, mew=0, label=label))
+        handles.append(Line2D([], [], linestyle='none', marker='o', markersize=4, color=DOT, mew=0, label=label))
     figure.legend(
         handles=handles,
         loc='center left',

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Wedge
 
 from ..core.common.readings import Readings
-from .drawing import CAPTION, DPI, EDGE, FRAME, GAP, HEAD, INK, PATH, UNKNOWN, WIDE, draw_map, draw_scale
+from .drawing import CAPTION, DOT, DPI, EDGE, FRAME, GAP, HEAD, INK, PATH, UNKNOWN, WIDE, draw_map, draw_scale
 from .panels import Curve, Tile
 
 
@@ -33,6 +33,10 @@ def draw_table(path: Path, title: str, rows: Sequence[Sequence[Tile]], view: tup
             axes.set_facecolor(UNKNOWN)
             shown = np.where(np.asarray(tile.values) < 0, np.nan, tile.values)
             draw_map(axes, shown, tile.grid.extent, (view[1] - view[0]) / (width * DPI))
+            if tile.marked is not None:
+                at_y, at_x = np.nonzero(tile.marked)
+                centers_x, centers_y = tile.grid.centers()
+                axes.scatter(centers_x[at_x], centers_y[at_y], s=9.0, marker='s', color=DOT, linewidths=0)
             axes.set(xlim=view[:2], ylim=view[2:], xticks=[], yticks=[])
             draw_scale(axes, view)
             if tile.readings is not None:

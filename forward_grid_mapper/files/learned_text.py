@@ -57,6 +57,7 @@ def learned_data(learned: Learned) -> dict[str, Any]:
         'rounds': rounds,
         'accepted_round': learned.accepted,
         'converged': learned.converged,
+        'foresight': learned.foresight and learned.foresight._asdict(),
         'parameters': learned.parameters.flat(),
     }
 
@@ -81,6 +82,12 @@ def _values(learned: Learned) -> Iterator[str]:
         error = f'{estimate.error:.4f}' if known else '–'
         interval = f'{estimate.low:.4f} … {estimate.high:.4f}' if known else '–'
         yield f'{row}{error:>11}{interval:>19}{estimate.readings:>11,.0f} readings'
+    if seen := learned.foresight:
+        yield (
+            f'  Held-out readings, nats each: {seen.learned_at_learned:.3f} with the map of the learned values, '
+            f'{seen.first_at_learned:.3f} with that of the first'
+        )
+        yield f'  ones; judged at the first values {seen.learned_at_first:.3f} and {seen.first_at_first:.3f}'
     yield textwrap.fill(_HOW, _WIDTH, initial_indent='  ', subsequent_indent='  ')
 
 

@@ -17,13 +17,14 @@ Box = tuple[float, float, float, float]
 class Tile(NamedTuple):
     """One map of the table: `values` are probabilities, or cells 0 and 1, with NaN or -1 where unknown.
 
-    The cones of `readings` are drawn over it.
+    The cones of `readings` are drawn over it, and the cells that are True in `marked` in the colour of dots.
     """
 
     title: str
     grid: Grid
     values: NDArray[Any]
     readings: Readings | None = None
+    marked: NDArray[np.bool_] | None = None
 
 
 class Curve(NamedTuple):
