@@ -387,9 +387,6 @@ def test_a_part_that_is_not_there(days: Path, tmp_path: Path, capsys: pytest.Cap
     assert 'has no reading in the part --start 900; its messages span' in said
 
 
-# ---- learning
-
-
 def test_learn_takes_several_drives(days: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert code_of(learn.main, days, '-o', tmp_path / 'a.yaml', '--rounds', 1, '--keep-going', '-q') == 0
     paths = sorted(days.iterdir(), reverse=True)
