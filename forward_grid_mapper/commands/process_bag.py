@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import argparse
+import math
 import sys
 import time
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 from ..core.common.errors import InputError, ParameterError
 from ..core.common.parameters import Parameters
 from ..core.joint_learning import map_and_learn
+from ..core.mapping import Mapper
 from ..core.maps.map_set import MapSet
+from ..core.tiled_mapping import TiledMapper
 from ..core.trajectory.refinement import Refinement, Refiner
 from ..core.trajectory.windows import Odometry
 from ..files.map_files import occupancy_values
@@ -62,6 +66,13 @@ def parser() -> argparse.ArgumentParser:
         help="take the drift out of wheel odometry: find the trajectory together with the map; kept as odometry's "
         'where readings that were held out do not speak for it',
     )
+    made.add_argument(
+        '--tiles',
+        type=float,
+        metavar='M',
+        help='map in tiles of that edge in metres, one after the other, which takes less memory; 20 or more for sonars '
+        'that reach 5 m',
+    )
     made.add_argument('--bag', dest='write_bag', action='store_true', help='also write the maps as a bag (mcap)')
     made.add_argument('-q', '--quiet', action='store_true', help='print nothing but errors and the folder')
     add_mapping_options(made)
@@ -75,6 +86,9 @@ def process(options: argparse.Namespace) -> int:
     if options.learn < 0:
         raise ParameterError('--learn: the number of rounds must not be negative')
     part = chosen_part(options)
+    if options.tiles is not None and not (math.isfinite(options.tiles) and options.tiles > 0):
+        raise ParameterError(f'--tiles {options.tiles:g}: give the edge of a tile in metres, above 0')
+    mapper = Mapper if options.tiles is None else partial(TiledMapper, size=options.tiles)
     output = Path(options.output) if options.output else free_name(Path.cwd(), f'{_stem(options.bags)}_maps')
     begin = time.perf_counter()
     # the folder first: if it cannot be written, that should be known before the work
@@ -98,7 +112,7 @@ def process(options: argparse.Namespace) -> int:
             seconds['trajectory'] = time.perf_counter() - begin - read
         moved = refined is not None and refined.accepted
         readings = refined.readings if refined is not None else drives.readings
-        maps = map_and_learn(readings, parameters, options.learn, ticker.mapping)
+        maps = map_and_learn(readings, parameters, options.learn, ticker.mapping, mapper)
         if not moved:
             maps = drives.with_live(maps)
         maps.statistics['seconds'] = {**seconds, **maps.statistics['seconds']}

@@ -175,6 +175,12 @@ def _result(data: dict[str, Any]) -> Iterator[str]:
         work.append('converged' if converged else 'NOT converged: max_iterations was reached')
     if work:
         yield from _line('Search', ', '.join(work))
+    if tiles := statistics.get('tiles'):
+        yield from _line(
+            'Tiles',
+            f'{tiles:,}, searched {statistics["searches_of_tiles"]:,} times; a reading belongs to '
+            f'{statistics["evaluations_of_a_reading"]:.2f} of them',
+        )
 
 
 def _seconds(data: dict[str, Any]) -> Iterator[str]:
