@@ -15,6 +15,7 @@ from .core.common.errors import InputError
 from .core.common.parameters import Parameters
 from .core.mapping import Mapper, Watch
 from .core.maps.map_set import MapSet
+from .core.messages.extrinsics import Mount
 from .core.messages.message_types import NANOSECONDS, OdometryMessage, Pose2, RangeMessage
 from .core.messages.pose_association import PoseAssociator
 from .core.messages.quaternions import yaw_of
@@ -46,6 +47,8 @@ class Sonar:
         The full angle of its cone, radians.
     max_range, min_range : float
         Metres. A range that is infinite, or not below `max_range`, says that nothing returned an echo.
+    pitch : float
+        How far it looks down, or up if negative (REP 103), radians; what it measures is projected on the plane.
     """
 
     x: float
@@ -54,15 +57,20 @@ class Sonar:
     field_of_view: float
     max_range: float
     min_range: float = 0.0
+    pitch: float = 0.0
 
     def __post_init__(self) -> None:
         try:
-            finite = all(map(math.isfinite, (self.x, self.y, self.yaw, self.max_range, self.min_range)))
+            finite = all(map(math.isfinite, (self.x, self.y, self.yaw, self.max_range, self.min_range, self.pitch)))
             self.field_of_view / 1.0
         except TypeError as error:
             raise InputError(f'{self}: a number is wanted: {error}') from None
         if abs(self.yaw) > TURN:
             raise InputError(f'yaw = {self.yaw:g} rad is more than a turn; did you mean radians({self.yaw:g})?')
+        if abs(self.pitch) > math.pi / 2:
+            raise InputError(
+                f'pitch = {self.pitch:g} rad is beyond straight down; did you mean radians({self.pitch:g})?'
+            )
         if not finite:
             raise InputError(f'{self}: pose and limits must be finite')
         if not 0.0 < self.field_of_view < math.pi:
@@ -210,7 +218,7 @@ def make_maps(
         raise InputError(f'no sensor is called {", ".join(unknown[:6])}; there are: {", ".join(sorted(sensors))}')
     if not odometry or not len(values):
         raise InputError(f'there are {len(odometry)} poses and {len(values)} ranges; it takes some of both')
-    mounted = {name: Pose2(s.x, s.y, s.yaw) for name, s in sensors.items()}
+    mounted: dict[str, Pose2] = {name: Mount(s.x, s.y, s.yaw, -s.pitch) for name, s in sensors.items()}
     associator = PoseAssociator(lambda base, frame, stamp: mounted.get(frame), chosen, patient=True)
     for pose in odometry:
         associator.add_odometry(pose)

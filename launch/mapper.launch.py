@@ -20,7 +20,8 @@ PARAMETERS = {
     'range_reliability': ('Quality of service of the Range subscriptions', RELIABILITY),
     'odom_reliability': ('Quality of service of the odometry subscription', RELIABILITY),
     'map_frame': ("Frame of the maps, if another than odometry's, such as map with a localiser", None),
-    'online': ('Whether the ML map and the uncertainty map follow every reading', SWITCH),
+    'online': ('Whether the maximum likelihood map and the uncertainty map follow every reading', SWITCH),
+    'autostart': ('Whether the mapper starts by itself; if not, a lifecycle manager has to start it', SWITCH),
     'journal': ('Folder of the journal, which gives accepted readings back after a restart', None),
 }
 

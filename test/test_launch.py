@@ -161,10 +161,11 @@ def test_parameters_that_are_launch_arguments_reach_the_node_with_their_types(de
         'odom_reliability': 'best_effort',
         'map_frame': 'map',
         'online': 'true',
+        'autostart': 'false',
         'journal': '/var/lib/robot/map_journal',
     }
     _, _, chosen = launched(description, **given)['mapper']['parameters']
-    assert chosen == {**given, 'range_topics': ['left', 'right'], 'online': True}
+    assert chosen == {**given, 'range_topics': ['left', 'right'], 'online': True, 'autostart': False}
     for name, value in chosen.items():
         assert find(name).check(value) == (tuple(value) if isinstance(value, list) else value)
     *_, alone = launched(description, online='false')['mapper']['parameters']

@@ -14,15 +14,17 @@ from ..core.common.errors import OutputError, ParameterError
 from ..core.common.shell import command_line
 from ..core.joint_learning import learn_jointly
 from ..core.learning.sensor_health import health_warning, sensor_health
-from ..files.learned_text import learned_text, parameter_file_text, write_new_file
+from ..files.learned_text import learned_data, learned_text, parameter_file_text, write_new_file
 from ..files.output_folder import readable
 from ..files.parameter_file import load_parameters, parse_sensor
 from ..files.quality_warning import reading_warnings
+from ..files.report import json_text
 from ..recordings.drives import read_drives
 from .console import Ticker, run
 from .options import (
     BagParser,
     add_bag_options,
+    add_json_option,
     add_mapping_options,
     add_part_options,
     chosen_parameters,
@@ -39,6 +41,7 @@ def parser() -> argparse.ArgumentParser:
         description='Learn p_hit, p_rand, p_lost and sigma from recorded drives, in turn with the map: prints each '
         'value with its standard error, and warns of values that lose smooth walls or rest on few readings. Look at '
         'the maps of process_bag before you drive by them.',
+        epilog='example: learn MY_BAG -o learned.yaml',
     )
     made.add_bags('one or more: ROS 2 bag folder, single .mcap or .db3 file, ROS 1 .bag, journal, or folder of bags')
     made.add_argument(
@@ -53,6 +56,7 @@ def parser() -> argparse.ArgumentParser:
         '--keep-going', action='store_true', help='hand out values although their map has lost walls of the first one'
     )
     made.add_argument('-q', '--quiet', action='store_true', help='print nothing but warnings and errors')
+    add_json_option(made)
     add_mapping_options(made)
     return made
 
@@ -92,7 +96,9 @@ def learn(options: argparse.Namespace) -> int:
         *filter(None, [suspects]),
     )
     found = dataclasses.replace(found, warnings=warnings_)
-    if options.quiet:
+    if options.json:
+        print(json_text({'file': output and readable(output), **learned_data(found)}), end='')
+    elif options.quiet:
         for warning in warnings_:
             print(f'{COMMAND}: warning: {warning}', file=sys.stderr)
     else:
@@ -101,7 +107,7 @@ def learn(options: argparse.Namespace) -> int:
         ros = load_parameters(options.params).node if options.params else {}
         bags = ', '.join(readable(Path(word)) for word in options.bags)
         write_new_file(output, parameter_file_text(found, extrinsics, ros, bags))
-        if not options.quiet:
+        if not options.quiet and not options.json:
             print(f'\nthe parameters are in {output}; compare the maps with and without them:')
             print(f'  {_mapping(options, output)}')
     return 0

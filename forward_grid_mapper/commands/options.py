@@ -18,6 +18,13 @@ from ..files.parameter_text import dump_parameters
 from ..recordings.drive import Part
 
 
+def add_json_option(parser: argparse.ArgumentParser) -> None:
+    """Add `--json`."""
+    parser.add_argument(
+        '--json', action='store_true', help='print the result as JSON, and nothing else on standard output'
+    )
+
+
 class BagParser(argparse.ArgumentParser):
     """A parser of commands that read a bag, which may also stand behind an option that takes several words.
 
@@ -61,7 +68,9 @@ class BagParser(argparse.ArgumentParser):
             self.error(f'no bag is given, or it does not exist{hint}')
         if getattr(options, 'range_topics', None) is not None:
             # a comma cannot be part of a topic's name
-            options.range_topics = [t for word in options.range_topics for t in word.split(',') if t]
+            options.range_topics = [t for word in options.range_topics for t in word.split(',') if t.strip()]
+            if not options.range_topics:
+                self.error('argument --range-topics: the name of a topic is expected, not an empty one')
         return options
 
     def _behind_options(self, options: argparse.Namespace) -> list[str]:
@@ -81,8 +90,10 @@ class BagParser(argparse.ArgumentParser):
         return []
 
 
-def add_topic_options(parser: argparse.ArgumentParser) -> None:
-    """Add `--range-topics` and `--odom-topic`."""
+def add_topic_options(
+    parser: argparse.ArgumentParser, odometry: str = 'Odometry topic (needed if the bag has several)'
+) -> None:
+    """Add `--range-topics` and `--odom-topic`, with this help."""
     parser.add_argument(
         '--range-topics',
         nargs='+',
@@ -90,12 +101,16 @@ def add_topic_options(parser: argparse.ArgumentParser) -> None:
         metavar='TOPIC',
         help='Range topics, parted by spaces or commas; may be repeated (default: all in the bag)',
     )
-    parser.add_argument('--odom-topic', metavar='TOPIC', help='Odometry topic (needed if the bag has several)')
+    parser.add_argument('--odom-topic', metavar='TOPIC', help=odometry)
 
 
 def add_bag_options(parser: argparse.ArgumentParser) -> None:
     """Add `--range-topics`, `--odom-topic` and `--sensor`."""
-    add_topic_options(parser)
+    add_topic_options(
+        parser,
+        'topic with the poses of the robot: Odometry, PoseStamped, PoseWithCovarianceStamped, or /tf for those of '
+        'base_link (needed if the bag has several)',
+    )
     parser.add_argument(
         '--sensor',
         action='append',

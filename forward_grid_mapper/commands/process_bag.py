@@ -6,9 +6,10 @@ import argparse
 import math
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 from ..core.common.errors import InputError, ParameterError
 from ..core.common.parameters import Parameters
@@ -21,14 +22,16 @@ from ..core.trajectory.windows import Odometry
 from ..files.map_files import occupancy_values
 from ..files.output_folder import free_name, output_folder, readable
 from ..files.parameter_file import parse_sensor
-from ..files.report_text import report_text
+from ..files.report import json_text, report_text
 from ..files.results import write_results
 from ..files.trajectory_text import trajectory_data, tum_text
 from ..recordings.drives import Drives, read_drives
 from .console import Ticker, run
+from .desktop import show
 from .options import (
     BagParser,
     add_bag_options,
+    add_json_option,
     add_mapping_options,
     add_part_options,
     chosen_parameters,
@@ -42,9 +45,10 @@ def parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
     made = BagParser(
         COMMAND,
-        description='Map recorded drives: reads sonar Range and Odometry from ROS 1 or ROS 2 bags and writes the live '
-        'log-odds map, the maximum likelihood map and the uncertainty map. Several drives make one map; their poses '
+        description='Map recorded drives: reads sonar Range and Odometry from ROS 1 or ROS 2 bags and writes the '
+        'standard map, the maximum likelihood map and the uncertainty map. Several drives make one map; their poses '
         'must be in one map frame.',
+        epilog='example: process_bag MY_BAG --sensor sonar_left=0.1,0.15,90deg -o maps --show',
     )
     made.add_bags(
         'ROS 2 bag folder, single .mcap or .db3 file, ROS 1 .bag, journal of the node, folder of bags, or a pattern '
@@ -75,6 +79,8 @@ def parser() -> argparse.ArgumentParser:
     )
     made.add_argument('--bag', dest='write_bag', action='store_true', help='also write the maps as a bag (mcap)')
     made.add_argument('-q', '--quiet', action='store_true', help='print nothing but errors and the folder')
+    add_json_option(made)
+    made.add_argument('--show', action='store_true', help="open the report with the desktop's browser")
     add_mapping_options(made)
     return made
 
@@ -129,13 +135,23 @@ def process(options: argparse.Namespace) -> int:
         report = write_results(folder, maps, source, path, _title(drives), extras=extras, odometry_xy=before)
         if options.write_bag:
             _write_bag(folder / 'maps.mcap_bag', maps, drives)
+    tell(options, report, output)
+    if options.show:
+        show(output / 'report.html')
+    return 0
+
+
+def tell(options: argparse.Namespace, report: Mapping[str, Any], output: Path) -> None:
+    """Print what came out, as the options want it."""
+    if options.json:
+        print(json_text({'folder': readable(output), **report}), end='')
+        return
     if not options.quiet:
-        print(report_text(report), end='')
+        print(report_text(dict(report)), end='')
     else:
         for warning in report['warnings']:
             print(f'{COMMAND}: warning: {warning}', file=sys.stderr)
     print(f'maps are in {output}')
-    return 0
 
 
 def _stem(words: Sequence[str]) -> str:

@@ -33,6 +33,34 @@ def learned_text(learned: Learned) -> str:
     return '\n\n'.join('\n'.join(lines) for part in parts if (lines := list(part))) + '\n'
 
 
+def learned_data(learned: Learned) -> dict[str, Any]:
+    """Return the same for programs: values with their standard errors, rounds, and warnings."""
+    start, model = learned.rounds[0].model, learned.parameters.model
+    values = {}
+    for name in LEARNED:
+        estimate = learned.estimates.get(name)
+        sure = {} if estimate is None else {k: getattr(estimate, k) for k in ('error', 'low', 'high', 'readings')}
+        values[name] = {'start': getattr(start, name), 'learned': getattr(model, name), **sure}
+    rounds = [
+        {
+            **{name: getattr(r.model, name) for name in LEARNED},
+            'log_likelihood': r.log_likelihood,
+            'occupied': r.occupied,
+            'unexplained': r.unexplained,
+            'lost_m': r.lost_length,
+        }
+        for r in learned.rounds
+    ]
+    return {
+        'warnings': list(learned.warnings),
+        'values': values,
+        'rounds': rounds,
+        'accepted_round': learned.accepted,
+        'converged': learned.converged,
+        'parameters': learned.parameters.flat(),
+    }
+
+
 def _warnings(learned: Learned) -> Iterator[str]:
     if learned.warnings:
         yield f'WARNINGS ({len(learned.warnings)})'

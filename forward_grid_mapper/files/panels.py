@@ -8,17 +8,40 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.common.grid import Grid
+from ..core.common.readings import Readings
 
 Box = tuple[float, float, float, float]
 """Left, right, bottom, top in metres."""
 
 
 class Tile(NamedTuple):
-    """One map of the table: `values` are probabilities, or cells 0 and 1, with NaN or -1 where unknown."""
+    """One map of the table: `values` are probabilities, or cells 0 and 1, with NaN or -1 where unknown.
+
+    The cones of `readings` are drawn over it.
+    """
 
     title: str
     grid: Grid
     values: NDArray[Any]
+    readings: Readings | None = None
+
+
+class Curve(NamedTuple):
+    """A density in 1/m over ranges in metres, both float64 of shape (N,)."""
+
+    x: NDArray[np.float64]
+    y: NDArray[np.float64]
+
+
+def coarse(values: NDArray[Any], step: int) -> NDArray[np.float32]:
+    """Return a map in blocks of `step` cells, each with the largest of its values; NaN where all of them are.
+
+    Walls one cell thick stay, and do not fall between the pixels of a picture. Rows and columns are filled up with NaN.
+    """
+    pad = [(0, -n % step) for n in values.shape]
+    part = np.pad(np.asarray(values, np.float32), pad, constant_values=np.nan)
+    part = np.fmax.reduce(part.reshape(part.shape[0] // step, step, -1), axis=1)
+    return np.asarray(np.fmax.reduce(part.reshape(part.shape[0], -1, step), axis=2))
 
 
 class Panel(NamedTuple):

@@ -20,7 +20,7 @@ from ..core.maps.map_set import MapSet
 from .output_folder import output_errors
 from .report_text import report_text
 
-__all__ = ['report_data', 'report_text', 'write_report']
+__all__ = ['json_text', 'report_data', 'report_text', 'write_report']
 
 
 def report_data(maps: MapSet, source: Mapping[str, Any]) -> dict[str, Any]:
@@ -73,8 +73,8 @@ def report_data(maps: MapSet, source: Mapping[str, Any]) -> dict[str, Any]:
             if (value := maps.parameters.flat()[row.name]) != row.default
         },
     }
-    plain: dict[str, Any] = _plain(data)
-    return plain
+    made: dict[str, Any] = plain(data)
+    return made
 
 
 def write_report(folder: Path | str, data: dict[str, Any]) -> None:
@@ -86,7 +86,7 @@ def write_report(folder: Path | str, data: dict[str, Any]) -> None:
         If they cannot be written.
     """
     texts = {
-        'report.json': json.dumps(data, indent=2, ensure_ascii=False, allow_nan=False) + '\n',
+        'report.json': json_text(data),
         'report.txt': report_text(data),
     }
     for name, text in texts.items():
@@ -127,14 +127,19 @@ def _map(maps: MapSet) -> dict[str, Any]:
     }
 
 
-def _plain(value: Any) -> Any:
+def json_text(data: Mapping[str, Any]) -> str:
+    """Return data as lines of JSON, whatever numpy types are in it; a number that is not finite is null."""
+    return json.dumps(plain(data), indent=2, ensure_ascii=False, allow_nan=False) + '\n'
+
+
+def plain(value: Any) -> Any:
     """Return `value` of Python's own types, as JSON knows them."""
     if isinstance(value, Mapping):
-        return {str(key): _plain(item) for key, item in value.items()}
+        return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, (np.ndarray, np.generic)):
-        return _plain(value.tolist())
+        return plain(value.tolist())
     if isinstance(value, (list, tuple, set, frozenset)):
-        return [_plain(item) for item in value]
+        return [plain(item) for item in value]
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     return value if value is None or isinstance(value, (str, int)) else str(value)

@@ -151,7 +151,7 @@ def _map(data: dict[str, Any]) -> Iterator[str]:
         'Map', f'{size}: {grid["width"]} x {grid["height"]} cells of {cell:g} m, corner ({x:.2f}, {y:.2f})'
     )
     cells = (f'{_number(grid.get(f"{kind}_cells"))} {word}' for kind, word in _KINDS)
-    yield from _line('ML map', ', '.join(cells))
+    yield from _line('Cells', f'{", ".join(cells)} in the maximum likelihood map')
 
 
 _KINDS = (('occupied', 'occupied'), ('free', 'free'), ('unknown', 'not observed'))

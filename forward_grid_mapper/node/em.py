@@ -44,7 +44,8 @@ class Run:
     """One run of EM on what `readings` returns, from map `start` or from the empty one.
 
     `stage` and `progress` say where it stands; `ended` is set when its thread has done all that it does for it. `found`
-    is called with the maps as soon as they are there, in the thread.
+    is called with the maps as soon as they are there, in the thread. `shown` says whether the map so far was published,
+    `why` which service cancelled the run.
     """
 
     mapper: Mapper
@@ -57,6 +58,8 @@ class Run:
     count: int = 0
     progress: Progress | None = None
     cancelled: bool = False
+    shown: bool = False
+    why: str = ''
     ended: threading.Event = field(default_factory=threading.Event)
     waiting: list[Callable[[Outcome], object]] = field(default_factory=list)
 

@@ -99,6 +99,23 @@ class EmService:
         else:
             self._start(done)
 
+    def cancel(self, reply: Reply) -> None:
+        """Cancel the run that goes on, forget nothing, and answer when it has ended."""
+        run = self.current
+        if run is None:
+            reply.send(False, 'EM does not run: there is nothing to cancel')
+            return
+
+        def ended(outcome: Outcome) -> None:
+            if outcome.maps is not None:
+                reply.send(False, 'EM had found its maps before it could be cancelled; they are published')
+            else:
+                reply.send(True, f'{outcome.message} (after {run.seconds:.1f} s); readings and earlier maps are kept')
+
+        run.why = run.why or 'cancel_em'
+        run.waiting.append(ended)
+        self.worker.cancel()
+
     def when_there_are_maps(self, done: Callable[[Outcome], object]) -> None:
         """Have `done` called with the latest maps: at once, when the run that goes on has ended, or after a new one."""
         run = self.current
@@ -113,6 +130,8 @@ class EmService:
 
     def reset(self) -> None:
         """Forget the maps, and cancel the run that goes on."""
+        if self.current is not None:
+            self.current.why = 'reset'
         self.worker.cancel()
         self._generation = self._publishers.generation
         self.maps, self.wrong_input, self.last_run = None, [], 'none since the reset'
@@ -139,13 +158,19 @@ class EmService:
             self._publishers.publish('uncertainty_map', generation, maps.grid, maps.uncertainty)
 
         def finish(outcome: Outcome) -> None:
+            # whoever waits is told the same
             if generation != self._publishers.generation:
-                # whoever waits is told the same
                 outcome.maps, outcome.message = None, 'EM was cancelled by reset'
+            elif outcome.maps is None and run.cancelled and run.why:
+                outcome.message = f'EM was cancelled by {run.why}'
             self._finish(outcome, taken[0][0])
+            if outcome.maps is None and run.shown:
+                self._publishers.publish('ml_map', generation, *before)
 
         parameters = self._parameters()
         start = self.online.so_far() if self.online else None
+        # it comes back if the run ends without a map, since the map so far is shown meanwhile
+        before = self._publishers.ml_map
         run = Run(Mapper(parameters), parameters, readings, found, start)
         self._generation = generation
         self.worker.start(run, finish)
@@ -156,6 +181,9 @@ class EmService:
         if maps is None:
             self.last_run = outcome.message
             self._logger.warning(f'EM: {outcome.message}')
+            if self.online:
+                # what it showed while EM ran was not published
+                self.online.show()
             return
         self.maps, self.explained = maps, count
         self.wrong_input = outcome.warnings
@@ -194,4 +222,5 @@ class EmService:
         found = run.mapper.so_far()
         if found is not None and not run.cancelled:
             self._logger.info(f'EM: {run}')
+            run.shown = True
             self._publishers.publish('ml_map', generation, *found)

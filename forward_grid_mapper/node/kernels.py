@@ -22,6 +22,8 @@ class Kernels:
     ----------
     stage : str
         What is being compiled; empty when all is there.
+    working : bool
+        Whether its thread still compiles or imports, during which the interpreter must not be taken down.
     """
 
     def __init__(self, log: Callable[[str], object], error: Callable[[str], object], online: bool) -> None:
@@ -31,9 +33,11 @@ class Kernels:
         self._steps = {name: step for name, step in warm_up.STEPS.items() if online or name != 'online map'}
         self._done = {name: threading.Event() for name in self._steps}
         self.stage = next(iter(self._steps))
+        self.working = False
 
     def begin(self, ready: Callable[[], None]) -> None:
         """Begin to compile; `ready` is called, in another thread, when the live map has its kernels."""
+        self.working = True
         self._log('preparing kernels; the first start compiles them, which takes half a minute and more')
         begin = time.monotonic()
         # the collector would go through all that the compiler made again and again, and keep the executor waiting
@@ -84,3 +88,4 @@ class Kernels:
         # what is there by now stays; the collector need not look at it again
         gc.freeze()
         gc.enable()
+        self.working = False

@@ -105,6 +105,10 @@ class OnlineWorker:
         wanted, self._start = self._map, (maps.grid, maps.searched)
         self.worker.put(lambda: self._adopt(wanted, maps))
 
+    def show(self) -> None:
+        """Have the map published again, even if it does not change."""
+        self._changed = True
+
     def so_far(self) -> tuple[Grid, NDArray[np.int8]] | None:
         """Return the grid and the map to start EM from, as of the last snapshot, or None if there is none yet."""
         return self._start

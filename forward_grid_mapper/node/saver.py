@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from ..core.common.errors import MapperError
 from ..core.maps.map_set import MapSet
-from ..files.output_folder import free_name
+from ..files.output_folder import expanded, free_name
 from ..files.quality_warning import thinned
 from ..files.results import write_results
 from .background import Worker
@@ -72,7 +71,7 @@ class Saver:
             warnings.append(f'{newer} readings came after EM: only the live map has them; call run_em before save_maps')
         if note := thinned(len(maps.readings), explained):
             warnings.append(note)
-        parent = Path(account.folder).expanduser().resolve()
+        parent = expanded(account.folder).resolve()
         folder = free_name(parent, f'maps_{time.strftime("%Y-%m-%d_%H-%M-%S")}')
         path_xy = np.array(account.path, np.float64).reshape(-1, 2)
         report = write_results(folder, maps, account.source, path_xy, account.title)

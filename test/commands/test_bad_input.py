@@ -421,6 +421,8 @@ def test_options_that_cannot_be(
         (['--learn', 'much'], '--learn'),
         (['--sett', 'p_hit=0.5', '--unknown'], 'unrecognized arguments'),
         (['--params'], '--params'),
+        (['--range-topics', ''], 'argument --range-topics: the name of a topic is expected'),
+        (['--range-topics', ','], 'argument --range-topics: the name of a topic is expected'),
     ],
 )
 def test_command_lines_that_cannot_be(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from pathlib import Path
 
@@ -41,6 +42,19 @@ def test_values_errors_and_rounds_are_told(bag: Path, capsys: pytest.CaptureFixt
     assert 'conditional on the map' in text and '95 %' in text
     assert re.search(r'^  0 .* 0\.0 m$', text, re.MULTILINE) and re.search(r'^  2 .* kept$', text, re.MULTILINE)
     assert all(len(line) <= 110 for line in text.splitlines())
+
+
+def test_json_has_the_values_and_nothing_else_is_printed(
+    tmp_path: Path, bag: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / 'learned.yaml'
+    found = json.loads(said(capsys, bag, '--rounds', 2, '--json', '-o', file))
+    assert found['file'] == str(file)
+    values = load_parameters(file).values
+    for name in LEARNED:
+        assert found['values'][name]['start'] == getattr(Parameters().model, name)
+        assert found['values'][name]['learned'] == found['parameters'][name] == pytest.approx(values[name], rel=1e-6)
+    assert len(found['rounds']) > found['accepted_round'] >= 0
 
 
 def test_the_file_is_what_process_bag_takes(

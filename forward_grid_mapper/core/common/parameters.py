@@ -235,7 +235,7 @@ class SearchParameters:
 
 @dataclass(frozen=True)
 class LiveMapParameters:
-    """The standard log-odds map ((3), (4), (14)-(16) of the paper), updated reading by reading."""
+    """The standard map: log odds ((3), (4), (14)-(16) of the paper), updated reading by reading."""
 
     live_p_occupied: float = _param(
         0.8,
@@ -281,7 +281,8 @@ class NodeParameters:
     )
     online: bool = _param(
         False,
-        'Keep the ML map and the uncertainty map up to date with every reading, and start EM from there.',
+        'Keep the maximum likelihood map and the uncertainty map up to date with every reading, and start EM from '
+        'there.',
         read_only=True,
     )
     publish_rate: float = _param(
@@ -291,6 +292,11 @@ class NodeParameters:
         '',
         'Folder of the journal, which keeps every accepted reading on disk and gives them back after a restart; empty: '
         'none.',
+        read_only=True,
+    )
+    autostart: bool = _param(
+        True,
+        'Start at once; if not, a lifecycle manager configures and activates the node.',
         read_only=True,
     )
     save_directory: str = _param('~/forward_grid_mapper', 'Folder in which save_maps makes a new folder at each call.')
@@ -340,7 +346,7 @@ class Parameter:
             int: 'a whole number',
             bool: 'true or false',
             str: 'text',
-            tuple: 'a list of text',
+            tuple: 'a list of text, none of it empty',
         }[self.type]
         if isinstance(value, np.generic):
             value = value.item()

@@ -1,4 +1,4 @@
-"""The standard log-odds map ((3), (4) and (14)-(16) of the paper), updated reading by reading.
+"""The standard map: log odds ((3), (4) and (14)-(16) of the paper), updated reading by reading.
 
 Inverse sensor model. A reading adds to the cells of its cone, weighted by the strength of the beam there
 (`cone.strength`), so that the edge of the cone says little. With d the distance of a cell:

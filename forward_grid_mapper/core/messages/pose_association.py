@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from ..common.parameters import Parameters
 from ..common.readings import Readings
+from .extrinsics import ExtrinsicsLookup, Later, Mount, project
 from .limit_watch import LimitWatch
 from .map_extent import MapExtent, possible
 from .message_types import NANOSECONDS, OdometryMessage, Pose2, RangeMessage
@@ -24,17 +25,6 @@ from .pose_history import PoseHistory
 from .reading_buffer import ReadingBuffer
 from .rep117 import LONGEST_NAME, Measurement, measure
 from .robot_path import RobotPath
-
-
-class Later:
-    """What a lookup answers when the pose may still become known."""
-
-
-LATER = Later()
-
-ExtrinsicsLookup = Callable[[str, str, int], 'Pose2 | Later | None']
-"""(base frame, sensor frame, stamp in ns) → pose of the sensor in the base frame, `LATER`, or None if unknown."""
-
 
 JUMP = NANOSECONDS
 """Odometry older than the newest by more than this means that the clock jumped back, not that messages overtook."""
@@ -66,7 +56,7 @@ class PoseAssociator:
         Messages by reason (`REASONS`, `ODOMETRY_REASONS`).
     rejected_by_frame : dict of frame_id → Counter
     unknown_frames : set of str
-        Sensor frames without a mounting pose.
+        Sensor frames whose mounting pose is not known now.
     map_frame, base_frame : str
         The frames of the first odometry message; empty before it.
     time_jumps : int
@@ -92,7 +82,7 @@ class PoseAssociator:
         Parameters
         ----------
         extrinsics : callable
-            Answers where a sensor sits on the robot.
+            Answers where a sensor sits on the robot (`extrinsics`).
         parameters : Parameters, optional
         patient : bool
             Keep all odometry and let readings wait for it without a bound, as befits a file: then the readings accepted
@@ -124,7 +114,7 @@ class PoseAssociator:
         self._path = RobotPath()
         self._history = PoseHistory()
         self._newest_range: int | None = None
-        self._held: deque[tuple[Measurement, Pose2]] = deque()
+        self._held: deque[tuple[Measurement, Pose2, Later]] = deque()
         self._retrying = 0
         self._next_try = self._next_look = 0
         self._at_once = at_once or sys.maxsize
@@ -240,8 +230,8 @@ class PoseAssociator:
         for measured in sorted(self._waiting):
             self._reject(measured.frame_id, 'no_odometry' if newest is None else 'after_odometry')
         self._waiting.clear()
-        for measured, _ in self._held:
-            self._reject_unknown(measured)
+        for measured, _, why in self._held:
+            self._reject_unplaced(measured, why.reason)
         self._held.clear()
 
     def restore(self, readings: Readings) -> int:
@@ -276,15 +266,17 @@ class PoseAssociator:
         frame = name if name in known or new else OTHERS
         self.rejected_by_frame.setdefault(frame, Counter())[reason] += count
 
-    def _reject_unknown(self, measured: Measurement) -> None:
-        if len(self.unknown_frames) < MOST_FRAMES:
+    def _reject_unplaced(self, measured: Measurement, reason: str) -> None:
+        if reason == 'unknown_extrinsics' and len(self.unknown_frames) < MOST_FRAMES:
             self.unknown_frames.add(measured.frame_id)
-        self._reject(measured.frame_id, 'unknown_extrinsics')
+        self._reject(measured.frame_id, reason)
 
     def _jump_back(self, newest: int) -> None:
         self._settle_up_to(newest)
         self.time_jumps += 1
-        for frame_id, count in Counter(m.frame_id for m in (*self._waiting, *(held for held, _ in self._held))).items():
+        for frame_id, count in Counter(
+            m.frame_id for m in (*self._waiting, *(held for held, _, _ in self._held))
+        ).items():
             self._reject(frame_id, 'time_jump', count)
         self._waiting.clear()
         self._held.clear()
@@ -331,9 +323,9 @@ class PoseAssociator:
         while left and self._retrying:
             self._retrying -= 1
             left -= 1
-            measured, pose = self._held.popleft()
+            measured, pose, why = self._held.popleft()
             if measured.stamp < limit and measured.arrival < oldest:
-                self._reject_unknown(measured)
+                self._reject_unplaced(measured, why.reason)
             else:
                 self._add_extrinsics(measured, pose)
         return left
@@ -376,13 +368,20 @@ class PoseAssociator:
         """Add the sensor's pose on the robot to the robot's, and keep the reading."""
         extrinsic = self._extrinsics(self.base_frame, measured.frame_id, measured.stamp)
         if isinstance(extrinsic, Later):
-            self._held.append((measured, pose))
+            if extrinsic.reason != 'unknown_extrinsics':
+                self.unknown_frames.discard(measured.frame_id)
+            self._held.append((measured, pose, extrinsic))
             return
         if extrinsic is None:
-            self._reject_unknown(measured)
+            self._reject_unplaced(measured, 'unknown_extrinsics')
+            return
+        self.unknown_frames.discard(measured.frame_id)
+        if isinstance(extrinsic, str):
+            self._reject(measured.frame_id, extrinsic)
             return
         sensor = pose.compose(extrinsic)
-        reason = self._extent.admit(sensor, measured, self._all)
+        reason = project(measured, extrinsic.elevation) if isinstance(extrinsic, Mount) else ''
+        reason = reason or self._extent.admit(sensor, measured, self._all)
         if reason:
             self._reject(measured.frame_id, reason)
             return
