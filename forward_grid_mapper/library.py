@@ -239,7 +239,7 @@ def make_maps(
     for reason, count in associator.rejected.items():
         if count > MANY * len(values):
             before.append(f'{count} of {len(values)} ranges were rejected as {reason}: {REASONS[reason]}')
-    judged = tuple(data_warnings(maps, mounted))
+    judged = tuple(data_warnings(maps, {'extrinsics': mounted}))
     path = np.array(associator.path, np.float64).reshape(-1, 2)
     rejected = dict(associator.rejected)
     counts = {'received': len(values), 'accepted': len(associator.buffer), 'rejected': rejected}

@@ -106,8 +106,8 @@ def test_the_report_warns_of_what_the_result_warns_of(tmp_path: Path) -> None:
 def test_poses_of_sensors_are_compared_with_the_readings_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[Any] = []
 
-    def turned(maps: Any, extrinsics: Any) -> list[str]:
-        asked.append(extrinsics)
+    def turned(maps: Any, source: Any) -> list[str]:
+        asked.append(source['extrinsics'])
         return ['sensors are turned']
 
     monkeypatch.setattr(library, 'data_warnings', turned)

@@ -12,7 +12,7 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -151,26 +151,37 @@ def settle(forward: ForwardModel, occupied: NDArray[Any]) -> ModelParameters:
     return dataclasses.replace(model, p_lost=0.0) if model.p_lost < _NO_LOSS else model
 
 
+class Runs(Protocol):
+    """Makes maps of readings: `Mapper`, or `TiledMapper`."""
+
+    def run(self, readings: Readings, watch: Watch) -> MapSet:
+        """Return the maps of readings."""
+
+
 def map_and_learn(
-    readings: Readings, parameters: Parameters, rounds: int, watch: Watch = lambda stage, progress: None
+    readings: Readings,
+    parameters: Parameters,
+    rounds: int,
+    watch: Watch = lambda stage, progress: None,
+    mapper: Callable[[Parameters], Runs] = Mapper,
 ) -> MapSet:
     """Return the maps after so many rounds of one update of the model each, without any check of what comes out.
 
-    The seconds of a stage are those of all rounds together.
+    The seconds of a stage are those of all rounds together. `mapper` makes what makes the maps.
 
     Raises
     ------
     InputError
         If there are no readings, or they span too large a map.
     """
-    maps = Mapper(parameters).run(readings, watch)
+    maps = mapper(parameters).run(readings, watch)
     seconds = dict(maps.statistics['seconds'])
     for _ in range(rounds):
         watch('learning', None)
         begun = time.perf_counter()
         parameters = dataclasses.replace(parameters, model=learn(maps.forward_model(), maps.ml))
         seconds['learning'] = seconds.get('learning', 0.0) + time.perf_counter() - begun
-        maps = Mapper(parameters).run(readings, watch)
+        maps = mapper(parameters).run(readings, watch)
         for stage, more in maps.statistics['seconds'].items():
             seconds[stage] += more
     maps.statistics['seconds'] = seconds

@@ -39,6 +39,8 @@ DPI = 150
 EDGE, HEAD, _FOOT, _LABELS, CAPTION, GAP = 0.3, 0.8, 0.8, 0.55, 0.42, 0.3
 # Below this width the legend would run into the scale of probabilities.
 _MIN_WIDTH = 11.3
+# Drives whose start and end are marked.
+_MOST_MARKED = 12
 WIDE = 2.6
 # Pixels of a cell, at least: below that walls of one cell are hardly seen.
 _CELL = 2.5
@@ -142,21 +144,25 @@ def _frame(axes: Axes, title: str, view: tuple[float, float, float, float], oute
 
 
 def _draw_overlay(axes: Axes, picture: Picture) -> None:
-    dots, path = picture.unexplained_xy, picture.path_xy
+    dots, paths = picture.unexplained_xy, picture.paths
     if len(dots):
         # together they cover a hundredth of the panel at most, so that the map stays visible beneath them
         extent, points = axes.get_window_extent(), 72.0 / axes.figure.dpi
         size = float(np.clip(0.01 * extent.width * extent.height * points**2 / len(dots), 0.8, 9.0))
         axes.scatter(dots[:, 0], dots[:, 1], s=size, color=DOT, linewidths=0, alpha=0.85, zorder=3)
-    if not len(path):
+    if not paths:
         return
     before = picture.odometry_xy
     if len(before):
         axes.plot(before[:, 0], before[:, 1], color=_BEFORE, linewidth=1.1, linestyle=(0, (4, 2)), zorder=3.5)
     halo = [patheffects.withStroke(linewidth=2.4, foreground='white', alpha=0.9)]
-    axes.plot(path[:, 0], path[:, 1], color=PATH, linewidth=1.4, path_effects=halo, solid_joinstyle='round', zorder=4)
-    for marker, xy in zip(_path_markers(_heading(path)), (path[0], path[-1]), strict=True):
-        axes.add_line(_marker_line(marker, xy[0], xy[1]))
+    for path in paths:
+        x, y = path.T
+        axes.plot(x, y, color=PATH, linewidth=1.4, path_effects=halo, solid_joinstyle='round', zorder=4)
+    # of many drives the marks would hide the map
+    for path in paths if len(paths) <= _MOST_MARKED else []:
+        for marker, xy in zip(_path_markers(_heading(path)), (path[0], path[-1]), strict=True):
+            axes.add_line(_marker_line(marker, xy[0], xy[1]))
 
 
 def _heading(path: np.ndarray) -> float:
@@ -209,12 +215,11 @@ def _foot(figure: Figure, picture: Picture) -> None:
         Patch(facecolor=_OCCUPIED, label='occupied', **edge),
         Patch(facecolor=UNKNOWN, label='not observed', **edge),
     ]
-    if len(picture.path_xy):
-        handles += [
-            Line2D([], [], color=PATH, linewidth=1.6, label='path of the robot'),
-            _marker_line(start, 0, 0, label='start'),
-            _marker_line(end, 0, 0, label='end'),
-        ]
+    if count := len(picture.paths):
+        label = 'path of the robot' if count == 1 else f'paths of {count} drives'
+        handles.append(Line2D([], [], color=PATH, linewidth=1.6, label=label))
+        if count <= _MOST_MARKED:
+            handles += [_marker_line(start, 0, 0, label='start'), _marker_line(end, 0, 0, label='end')]
     if len(picture.odometry_xy):
         handles.append(Line2D([], [], color=_BEFORE, linewidth=1.3, linestyle=(0, (4, 2)), label='by odometry'))
     if count := len(picture.unexplained_xy):

@@ -56,7 +56,8 @@ class Panel(NamedTuple):
 class Picture(NamedTuple):
     """What is drawn. `view` is the box shown; points are in metres; `overlay` is the panel that bears them.
 
-    `odometry_xy` is the path that odometry gives, where it is another one than `path_xy`.
+    `path_xy` is parted by rows of NaN where there are several drives. `odometry_xy` is the path that odometry gives,
+    where it is another one than `path_xy`.
     """
 
     title: str
@@ -67,3 +68,11 @@ class Picture(NamedTuple):
     path_xy: NDArray[np.float64]
     unexplained_xy: NDArray[np.float64]
     odometry_xy: NDArray[np.float64] = np.zeros((0, 2))
+
+    @property
+    def paths(self) -> list[NDArray[np.float64]]:
+        """The path of each drive, none of them empty."""
+        known = np.isfinite(self.path_xy).all(axis=1)
+        parts = np.split(self.path_xy, np.flatnonzero(~known))
+        parts = [part[np.isfinite(part).all(axis=1)] for part in parts]
+        return [part for part in parts if len(part)]

@@ -36,7 +36,7 @@ def write_picture(
     path : Path or str
     maps : MapSet
     path_xy : float64, shape (P, 2)
-        Where the robot was, in order, metres; may be empty.
+        Where the robot was, in order, metres; may be empty. A row of NaN parts two drives.
     title : str
     reference : (Grid, int8 array), optional
         The true map, −1 unknown, 0 free, 1 occupied, drawn as one more panel.
@@ -69,7 +69,6 @@ def compose(
     odometry_xy: NDArray[np.float64] = NOWHERE,
 ) -> Picture:
     """Choose what the picture shows; the parameters are those of `write_picture`."""
-    path_xy = path_xy[np.isfinite(path_xy).all(axis=1)]
     alpha = maps.parameters.search.alpha
     named: list[tuple[str, Grid, NDArray[Any]]] = [
         ('Standard map', maps.grid, maps.live),
@@ -108,6 +107,7 @@ def view_of(maps: MapSet, path_xy: NDArray[np.float64]) -> Box:
         x, y = grid.origin
         left, right = x + columns[0] * grid.resolution, x + (columns[-1] + 1) * grid.resolution
         bottom, top = y + rows[0] * grid.resolution, y + (rows[-1] + 1) * grid.resolution
+    path_xy = path_xy[np.isfinite(path_xy).all(axis=1)]
     if len(path_xy):
         left, bottom = np.minimum((left, bottom), path_xy.min(axis=0))
         right, top = np.maximum((right, top), path_xy.max(axis=0))

@@ -5,16 +5,17 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .. import __version__
 from ..core.common.grid import UNKNOWN
 from ..core.common.parameters import TABLE
-from ..core.learning.sensor_health import SensorHealth, health_warning, sensor_health
+from ..core.learning.sensor_health import health_warning, sensor_health
 from ..core.maps.map_set import MapSet
 from .output_folder import output_errors
 from .report_text import report_text
@@ -32,7 +33,8 @@ def report_data(maps: MapSet, source: Mapping[str, Any]) -> dict[str, Any]:
         Where the readings came from. All keys are optional: `bag`, `range_topics`, `odom_topic`, `odom_frame`,
         `map_frame`, `mounts_from`, `extrinsics` (poses of the sensors on the robot, by frame), `stamps` (first and
         last, nanoseconds), `duration_s`, `path_m`, `counts` (`received`, `accepted`, `rejected` by reason), `sensors`
-        (by frame: `accepted`, `no_echo`, `unexplained`), `warnings`. Others are kept as they are under `input`.
+        (by frame: `accepted`, `no_echo`, `unexplained`), `warnings`; of several drives `drives`, a list of such
+        mappings. Others are kept as they are under `input`.
 
     Returns
     -------
@@ -42,8 +44,9 @@ def report_data(maps: MapSet, source: Mapping[str, Any]) -> dict[str, Any]:
     rest = dict(source)
     counts = dict(rest.pop('counts', None) or {})
     counts.setdefault('accepted', len(maps.readings))
+    drives = rest.pop('drives', None)
     health = sensor_health(maps)
-    sensors = _sensors(maps, health)
+    sensors = {name: {**row, 'health': dataclasses.asdict(health[name])} for name, row in _sensors(maps).items()}
     for name, row in (rest.pop('sensors', None) or {}).items():
         sensors[name] = {**sensors.get(name, {}), **row}
     statistics = dict(maps.statistics)
@@ -53,6 +56,7 @@ def report_data(maps: MapSet, source: Mapping[str, Any]) -> dict[str, Any]:
         'input': rest,
         'counts': counts,
         'sensors': sensors,
+        **({'drives': _drives(maps, drives)} if drives else {}),
         'map': _map(maps),
         'result': {
             'readings': len(maps.readings),
@@ -91,18 +95,23 @@ def write_report(folder: Path | str, data: dict[str, Any]) -> None:
             path.write_text(text, encoding='utf-8')
 
 
-def _sensors(maps: MapSet, health: Mapping[str, SensorHealth]) -> dict[str, dict[str, Any]]:
-    readings = maps.readings
-    table = {}
-    for index, name in enumerate(readings.sensor_names):
-        mine = readings.sensor == index
-        table[name] = {
-            'accepted': int(np.count_nonzero(mine)),
-            'no_echo': int(np.count_nonzero(mine & ~readings.echo)),
-            'unexplained': int(np.count_nonzero(mine & maps.unexplained)),
-            'health': dataclasses.asdict(health[name]),
-        }
-    return table
+def _sensors(maps: MapSet, which: NDArray[np.bool_] | None = None) -> dict[str, dict[str, Any]]:
+    """Return the counts of each sensor, of all readings or of those that `which` marks."""
+    readings, size = maps.readings, len(maps.readings.sensor_names)
+    marked = np.ones(len(readings), np.bool_) if which is None else which
+    masks = {'accepted': marked, 'no_echo': marked & ~readings.echo, 'unexplained': marked & maps.unexplained}
+    counts = {kind: np.bincount(readings.sensor[mask], minlength=size).tolist() for kind, mask in masks.items()}
+    return {name: {kind: counts[kind][k] for kind in masks} for k, name in enumerate(readings.sensor_names)}
+
+
+def _drives(maps: MapSet, drives: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Return what is known of each drive, with the counts of its sensors."""
+    rows = []
+    for number, drive in enumerate(drives):
+        sensors = _sensors(maps, maps.readings.drive == number)
+        mine = {name: row for name, row in sensors.items() if row['accepted']}
+        rows.append({**drive, 'unexplained': sum(row['unexplained'] for row in mine.values()), 'sensors': mine})
+    return rows
 
 
 def _map(maps: MapSet) -> dict[str, Any]:

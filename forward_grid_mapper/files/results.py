@@ -43,7 +43,7 @@ def write_results(
     source : mapping
         What `report_data` asks for.
     path_xy : float64, shape (P, 2)
-        Where the robot drove, metres.
+        Where the robot drove, metres; a row of NaN parts two drives.
     title : str
         Of the picture.
     reference : (Grid, int8 array), optional
@@ -73,7 +73,7 @@ def write_results(
         write_readings(folder / 'readings.npz', maps)
         warnings = [
             *(source.get('warnings') or []),
-            *(data_warnings(maps, source.get('extrinsics') or {}) if judged is None else judged),
+            *(data_warnings(maps, source) if judged is None else judged),
         ]
         before = NOWHERE if odometry_xy is None else odometry_xy
         try:

@@ -119,6 +119,11 @@ class Extrinsics:
         """The poses of the sensors that were asked for and did not move on the robot, by frame."""
         return {frame: pose for frame, pose in self._used.items() if frame not in self._moved}
 
+    @property
+    def known(self) -> dict[str, Pose2]:
+        """Those, and the ones that parameters give."""
+        return {**self._given, **{frame.lstrip('/'): pose for frame, pose in self.fixed.items()}}
+
     def __call__(self, base_frame: str, frame: str, stamp: int) -> Pose2 | Later | str | None:
         """Return the pose of a sensor at a stamp, as `ExtrinsicsLookup` has it."""
         pose = self._look_up(base_frame, frame, stamp)

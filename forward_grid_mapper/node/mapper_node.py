@@ -13,8 +13,9 @@ from typing import Any
 from rclpy.clock import Clock, ClockType
 from std_srvs.srv import SetBool, Trigger
 
-from ..core.common.errors import MapperError
+from ..core.common.errors import MapperError, ParameterError
 from ..core.common.parameters import Parameters
+from ..core.maps.log_odds_map import LogOddsMap
 from ..core.messages.message_types import NANOSECONDS
 from ..core.messages.pose_association import PoseAssociator
 from ..core.messages.reading_buffer import bounded
@@ -34,6 +35,7 @@ from .map_publishers import MapPublishers
 from .online import OnlineSnapshot, OnlineWorker
 from .reporter import Reporter
 from .saver import Account, Saver
+from .trajectory import Trajectory
 
 NAME = 'forward_grid_mapper'
 FEED_PERIOD = 0.02
@@ -101,18 +103,23 @@ class MapperNode(ManagedNode):
             raise MapperError(f'{odometry} cannot be a topic of Range and of odometry: set range_topics or odom_topic')
         transforms = Transforms.of(self)
         extrinsics = Extrinsics(self._given_extrinsics, transforms)
-        self._map_frame = MapFrame(node.map_frame, transforms, self.parameters.association.pose_timeout)
-        if node.map_frame and not transforms.available:
+        # with refine_poses it is this node that gives the transform
+        looked_up = '' if node.refine_poses else node.map_frame
+        self._map_frame = MapFrame(looked_up, transforms, self.parameters.association.pose_timeout)
+        if looked_up and not transforms.available:
             raise MapperError(f'map_frame is {node.map_frame}, but tf2_ros is not installed to look it up')
         self.associator = PoseAssociator(extrinsics, self.parameters, at_once=AT_ONCE)
         self.journal = JournalKeeper(self, node.journal, self.associator)
         inbox = self.inbox = Inbox(self)
-        kernels = self.kernels = Kernels(log.info, log.error, node.online)
-        self.maps = MapPublishers(self, self.parameters.grid.resolution, self._frame, self._up_to_date)
+        kernels = self.kernels = Kernels(log.info, log.error, node.online, node.refine_poses)
+        self.trajectory = trajectory = Trajectory(self, self.associator, self._steady)
+        self.maps = MapPublishers(self, self.parameters.grid.resolution, lambda: trajectory.frame, self._up_to_date)
+        trajectory.publishing, trajectory.changed = self.maps.worker, self._map_anew
+        trajectory.begin()
         self.live = LiveMap(self.parameters, self._show_live, log.error, lambda: kernels.wait('live map'))
-        self.em = EmService(lambda: self.parameters, self.associator, self.maps, inbox, kernels, log)
+        self.em = EmService(lambda: self.parameters, self.associator, trajectory, self.maps, inbox, kernels, log)
         self._extrinsics = extrinsics
-        self.em.extrinsics = lambda: extrinsics.fixed
+        self.em.extrinsics, self.em.mounts = lambda: extrinsics.fixed, lambda: extrinsics.known
         self.online = self.em.online = self._online_worker(kernels) if node.online else None
         self.saver = Saver(self.em, self.live, self._account, log)
         self._aside = Worker('readings', log.error)
@@ -129,6 +136,7 @@ class MapperNode(ManagedNode):
             self.live,
             self.em,
             self.journal,
+            self.trajectory,
             kernels,
             self.workers,
         )
@@ -233,6 +241,11 @@ class MapperNode(ManagedNode):
     # parameters
 
     def _accept(self, parameters: Parameters) -> None:
+        refine = self.parameters.node.refine_poses, parameters.node.refine_poses
+        if self._started and parameters.node.map_frame and refine[0] != refine[1]:
+            raise ParameterError(
+                'refine_poses says who gives the transform from map_frame, which is set: restart the node to change it'
+            )
         before, self.parameters = self.parameters, parameters
         if not self._started:
             return
@@ -254,14 +267,24 @@ class MapperNode(ManagedNode):
 
     # maps
 
-    def _frame(self) -> str:
-        return self.associator.map_frame or self.parameters.node.map_frame
+    def _map_anew(self, live: LogOddsMap | None, count: int) -> None:
+        """Go on along another trajectory: from the live map of the first `count` readings, and without the online map.
+
+        Without a live map only the frame has another name.
+        """
+        if live is None:
+            self.live.touch()
+            return
+        self.live.replace(live)
+        self._fed['live'] = count
+        self._restart_online()
+        self._feed()
 
     def _feed(self) -> None:
         """Hand the readings that came to the maps; their threads add them."""
         buffer = self.associator.buffer
         if len(buffer) > self._fed['live']:
-            self.live.offer(buffer.snapshot(self._fed['live']))
+            self.live.offer(buffer.snapshot(self._fed['live']), self.trajectory.place)
             self._fed['live'] = len(buffer)
         if self.online is None:
             return
@@ -269,7 +292,7 @@ class MapperNode(ManagedNode):
             if buffer.bound and self.online.kept > buffer.bound + buffer.bound // 4:
                 self._restart_online()
             else:
-                self.online.offer(buffer.snapshot(self._fed['online']))
+                self.online.offer(buffer.snapshot(self._fed['online']), self.trajectory.place)
                 self._fed['online'] = len(buffer)
         self.online.tick()
 
@@ -310,8 +333,8 @@ class MapperNode(ManagedNode):
         if self.online:
             buffer = self.associator.buffer
             self._fed['online'] = len(buffer)
-            held, bound = buffer.snapshot(), buffer.bound
-            self.online.restart(self.parameters, (lambda: bounded(held, bound)) if len(held) else None)
+            held, bound, place = buffer.snapshot(), buffer.bound, self.trajectory.place or (lambda readings: readings)
+            self.online.restart(self.parameters, (lambda: place(bounded(held, bound))) if len(held) else None)
 
     # services
 
@@ -324,6 +347,7 @@ class MapperNode(ManagedNode):
         self.intake.forget()
         kept = self.journal.reset()
         # late subscribers must not get the maps that were forgotten
+        self.trajectory.begin()
         self.maps.clear()
         self.em.reset()
         self.live.restart(self.parameters, self.maps.generation)
@@ -345,7 +369,7 @@ class MapperNode(ManagedNode):
             'range_topics': [self.resolve_topic_name(topic) for topic in node.range_topics],
             'odom_topic': self.resolve_topic_name(node.odom_topic),
             'odom_frame': associator.map_frame,
-            'map_frame': associator.map_frame,
+            'map_frame': self.trajectory.frame,
             'base_frame': associator.base_frame,
             'extrinsics': self._extrinsics.fixed,
             'counts': {
@@ -357,5 +381,5 @@ class MapperNode(ManagedNode):
             },
             'warnings': [*associator.limits.warnings(), *self.intake.loss_note()],
         }
-        path = list(associator.path)
-        return Account(source, len(associator.buffer), path, node.save_directory, f'Maps of {name}')
+        path, odometry = list(associator.path), associator.odometry
+        return Account(source, len(associator.buffer), path, odometry, node.save_directory, f'Maps of {name}')

@@ -74,10 +74,10 @@ class OnlineWorker:
         self._next = 0.0
         self.worker.put(prepare)
 
-    def offer(self, readings: Readings) -> None:
-        """Have readings added soon."""
+    def offer(self, readings: Readings, place: Callable[[Readings], Readings] | None = None) -> None:
+        """Have readings added soon, where `place` puts them."""
         wanted = self._map
-        self.worker.put(lambda: self._add(wanted, lambda: readings))
+        self.worker.put(lambda: self._add(wanted, lambda: place(readings) if place else readings))
 
     def restart(self, parameters: Parameters, readings: Callable[[], Readings] | None = None) -> None:
         """Forget the map; begin anew with other parameters and, if given, the readings that `readings` returns.

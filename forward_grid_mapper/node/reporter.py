@@ -19,6 +19,7 @@ from .journal_keeper import JournalKeeper
 from .kernels import Kernels
 from .live import LiveMap
 from .surroundings import Surroundings
+from .trajectory import Trajectory
 
 
 class Reporter:
@@ -34,13 +35,14 @@ class Reporter:
         live: LiveMap,
         em: EmService,
         journal: JournalKeeper,
+        trajectory: Trajectory,
         kernels: Kernels,
         workers: Iterable[Worker],
     ) -> None:
         """Prepare; `workers` are all that work in the background."""
         self._node, self._health, self._intake, self._associator = node, health, intake, associator
         self._extrinsics, self._map_frame, transforms = frames
-        self._live, self._em, self._journal = live, em, journal
+        self._live, self._em, self._journal, self._trajectory = live, em, journal, trajectory
         self._kernels, self._workers = kernels, list(workers)
         self._surroundings = Surroundings(
             node, intake.subscriptions, transforms.topics, lambda: bool(associator.unknown_frames)
@@ -70,7 +72,7 @@ class Reporter:
         )
         faults = [*self._intake.faults(), *self._surroundings.faults()]
         diagnostics.add_faults(statuses[0], [*faults, *self._associator.limits.warnings(), *self._em.wrong_input])
-        statuses += self._journal.statuses(name)
+        statuses += [*self._journal.statuses(name), *self._trajectory.statuses(name)]
         counts = self._associator.buffer.counts()
         statuses.append(self._em.sensors.status(name, counts, self._silent(counts)))
         statuses.append(self._background(name))

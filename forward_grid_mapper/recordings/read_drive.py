@@ -16,7 +16,7 @@ from ..core.messages.pose_association import PoseAssociator
 from ..core.messages.rep117 import ODOMETRY_REASONS, REASONS
 from ..files.journal import drive_file
 from ..files.output_folder import readable
-from .drive import Drive, LogOddsMapOfAll, thinning_note
+from .drive import WHOLE, Drive, LogOddsMapOfAll, Part, thinning_note
 from .journal_drive import read_journal
 
 __all__ = ['Drive', 'Extrinsics', 'read_drive']
@@ -85,6 +85,7 @@ def read_drive(
     range_topics: Sequence[str] | None = None,
     odom_topic: str | None = None,
     progress: Callable[[int, int], None] | None = None,
+    part: Part = WHOLE,
 ) -> Drive:
     """Read a bag and bring its readings into the map frame, or take those of a journal.
 
@@ -98,27 +99,38 @@ def read_drive(
         Topics to use; by default those found by type.
     progress : callable, optional
         Called with (done, total) messages.
+    part : Part
+        What to take, by stamps; the drive begins with its first message on these topics.
 
     Raises
     ------
     BagError
         If the bag cannot be read, or the topics are not there or ambiguous.
     InputError
-        If not a single reading got a pose; says why.
+        If not a single reading got a pose, or none is of that part; says why.
     """
     # a pipe would be waited for, a device may have no end
     plain = Path(path).is_dir() or Path(path).is_file()
     journal = drive_file(Path(path)) if plain else None
     if journal is not None:
-        return read_journal(journal, parameters, extrinsics, range_topics, odom_topic)
+        return read_journal(journal, parameters, extrinsics, range_topics, odom_topic, part)
     with Bag(path) as bag:
         topics = bag.choose_topics(range_topics, odom_topic, any_poses=True)
         lookup = Extrinsics(extrinsics, bag.static_transforms())
         associator = PoseAssociator(lookup, parameters, patient=True)
         live = LogOddsMapOfAll(associator, parameters)
+        left_out = [math.inf, -math.inf]
         spans: dict[str, list[int]] = {'ranges': [], 'odometry': []}
+        bounds: tuple[float, float] | None = None
+        # the poses before and after a reading place it
+        margin = parameters.association.max_pose_gap * NANOSECONDS
         for message in bag.messages(topics, progress):
             ranged = isinstance(message, RangeMessage)
+            bounds = bounds or part.bounds(message.stamp)
+            beyond = 0 if ranged else margin
+            if not part.whole and not bounds[0] - beyond <= message.stamp < bounds[1] + beyond:
+                left_out[0], left_out[1] = min(left_out[0], message.stamp), max(left_out[1], message.stamp)
+                continue
             span = spans['ranges' if ranged else 'odometry']
             if not span:
                 span += [message.stamp, message.stamp]
@@ -131,6 +143,10 @@ def read_drive(
         undecodable = dict(bag.undecodable)
         warnings = _warnings(bag, associator, lookup)
     if not len(associator.buffer):
+        if not associator.received and left_out[0] <= left_out[1]:
+            raise InputError(
+                f'{path} has no reading in the part {part}; its messages span {(left_out[1] - left_out[0]) / 1e9:.1f} s'
+            )
         raise _nothing_associated(associator, lookup, spans, undecodable)
     stamps = associator.readings.stamp
     source = {

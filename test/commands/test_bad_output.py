@@ -36,7 +36,7 @@ def no_work(monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(*arguments: object, **options: object) -> None:
         raise AssertionError('the bag was read first')
 
-    monkeypatch.setattr(process_bag, 'read_drive', refuse)
+    monkeypatch.setattr(process_bag, 'read_drives', refuse)
 
 
 @pytest.mark.usefixtures('no_work')

@@ -128,10 +128,15 @@ class Inside:
             reporter._out.publish = publish
         return dict(found[part])
 
-    def call(self, handler: Callable[[Any], None], request: Any = None) -> tuple[Any, ...]:
-        """Call a service, and turn the executor until it answers."""
+    def begin(self, handler: Callable[[Any], None], request: Any = None) -> Answer:
+        """Call a service, and return what it will answer with."""
         answer = Answer(request)
         handler(answer)
+        return answer
+
+    def call(self, handler: Callable[[Any], None], request: Any = None) -> tuple[Any, ...]:
+        """Call a service, and turn the executor until it answers."""
+        answer = self.begin(handler, request)
         self.until(lambda: answer.sent)
         assert len(answer.sent) == 1
         return answer.sent[0]

@@ -61,8 +61,9 @@ def test_it_ends_em_and_the_map_of_before_comes_back(
     node = robot.node
     robot.drive(0, 30)
     assert robot.call(node.em.run_em)[0]
-    maps, before = node.em.maps, node.maps.latest['ml_map'].data
-    wide = width(robot)
+    # of EM, or the online map that goes on from there
+    robot.until(lambda: width(robot) > 3)
+    wide, maps, before = width(robot), node.em.maps, node.maps.latest['ml_map'].data
     with monkeypatch.context() as patch:
         endless = Endless(patch)
         first = asked(node.em.run_em)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from types import SimpleNamespace
 
 import pytest
 
@@ -94,6 +95,9 @@ def test_names_that_cannot_be_shown_and_too_many_are_not_kept(clock: Clock) -> N
 def test_diagnostics_name_the_silent_sensor(inside: Callable[..., Inside], monkeypatch: pytest.MonkeyPatch) -> None:
     robot = inside(**{'sensors.other.pose': [0.1, 0.0, 1.0]}).start()
     clock = Clock(monkeypatch)
+    told: list[str] = []
+    log = SimpleNamespace(info=told.append, warning=told.append, error=told.append)
+    monkeypatch.setattr(robot.node, 'get_logger', lambda: log)
 
     def drive(first: int, *frames: str) -> None:
         for k in range(first, first + 50):
@@ -119,3 +123,8 @@ def test_diagnostics_name_the_silent_sensor(inside: Callable[..., Inside], monke
     robot.call(robot.node.reset)
     drive(200, 'other')
     assert robot.status('sensors')['level'] == OK
+    assert [line for line in told if 'sensors that' in line] == [
+        'sensors that send nothing any more, while others do: other',
+        'sensors that send again: other',
+        'sensors that send nothing any more, while others do: sonar',
+    ]

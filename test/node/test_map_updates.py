@@ -215,7 +215,10 @@ def test_everybody_has_the_latest_map_whatever_happens(network: Network, updates
         elif what < 0.3:
             values = np.pad(values, ((0, int(rng.integers(3))), (int(rng.integers(3)), 0)), constant_values=-1)
             column -= 1
-        elif what < 0.33:
+        elif what < 0.36:
+            # of the same size, but elsewhere
+            values, column = np.roll(values, 1, axis=1), column + 1
+        elif what < 0.39:
             frame = {'odom': 'map', 'map': 'odom'}[frame]
         values = values.copy()
         for _ in range(int(rng.integers(4))):
@@ -226,6 +229,7 @@ def test_everybody_has_the_latest_map_whatever_happens(network: Network, updates
         for listener in network.listeners:
             assert np.array_equal(listener.cells, expected)
             assert listener.map is not None and listener.map.header.frame_id == frame
+            assert listener.map.info.origin.position.x == pytest.approx(0.1 * column)
     assert others or any(isinstance(sent, Update) for sent in network.sent)
 
 
@@ -263,6 +267,14 @@ def test_the_node_sends_them_beside_its_live_map(
     latest = robot.node.maps.latest['live_map']
     assert not wholes
     assert 0 < sent[0].width <= latest.info.width
+    # somebody comes who does not follow, when nothing changes any more
+    robot.until(lambda: not robot.node.maps.worker.waiting)
+    everybody = {b'1': ('/', 'rviz'), b'2': ('/', 'saver')}
+    monkeypatch.setattr(
+        map_updates, 'listeners', lambda node, topic: everybody if topic.endswith('live_map') else {b'1': ('/', 'rviz')}
+    )
+    robot.until(lambda: wholes)
+    assert wholes.pop().data == robot.node.maps.latest['live_map'].data
     assert robot.call(robot.node.reset)[0]
     robot.until(lambda: wholes)
     assert wholes[0].info.width == 1

@@ -30,7 +30,7 @@ def allowed(tag: str, access: str) -> set[str]:
 
 
 def test_the_policy_names_what_the_node_has(start: Any, robot: Robot) -> None:
-    start(*RELIABLE, '-p', 'use_sim_time:=true')
+    start(*RELIABLE, '-p', 'use_sim_time:=true', '-p', 'refine_poses:=true')
     robot.meet()
     robot.until(lambda: 'readings' in robot.diagnostics)
     node = robot.node
@@ -43,7 +43,7 @@ def test_the_policy_names_what_the_node_has(start: Any, robot: Robot) -> None:
     # tf2_ros and map_msgs may not be installed
     assert received | WITH_TF == allowed('topics', 'subscribe')
     published = names(node.get_publisher_names_and_types_by_node(NAME, '/'))
-    assert published | WITH_MAP_MSGS == allowed('topics', 'publish')
+    assert published | WITH_MAP_MSGS | {'/tf'} == allowed('topics', 'publish')
     assert names(node.get_service_names_and_types_by_node(NAME, '/')) == allowed('services', 'reply')
 
 

@@ -191,3 +191,94 @@ def test_inclined_and_steep_sensors(inside: Callable[..., Inside]) -> None:
     readings = robot.status('readings')
     assert readings['rejected: steep_sensor'] == '3'
     assert readings['frames without a pose'] == ''
+
+
+class Log:
+    """A logger whose lines the test reads."""
+
+    def __init__(self) -> None:
+        self.lines: list[str] = []
+        self.info = self.warning = self.error = self.lines.append
+
+    def count(self, text: str) -> int:
+        return sum(text in line for line in self.lines)
+
+
+@pytest.fixture
+def log(monkeypatch: pytest.MonkeyPatch) -> Callable[[Inside], Log]:
+    def watch(robot: Inside) -> Log:
+        made = Log()
+        monkeypatch.setattr(robot.node, 'get_logger', lambda: made)
+        return made
+
+    return watch
+
+
+def test_the_log_tells_once_of_a_sensor_without_a_pose_and_of_its_pose(
+    inside: Callable[..., Inside], log: Callable[[Inside], Log]
+) -> None:
+    robot = begun(inside, pose_timeout=0.1, max_pose_gap=0.6)
+    told, node = log(robot), robot.node
+    k = 0
+    while not node.associator.unknown_frames:
+        from_tower(robot, k, 5)
+        robot.spin(0.3)
+        k += 5
+    for _ in range(3):
+        robot.status('readings')
+    assert told.count('no pose on the robot for sensor tower') == 1
+    buffer: Any = node._extrinsics._transforms._buffer
+    pose = Transform()
+    pose.rotation.w = 1.0
+    buffer.set_transform_static(pose, '')
+    from_tower(robot, k, 5)
+    for _ in range(3):
+        assert robot.status('readings')['frames without a pose'] == ''
+    assert told.count('sensor tower has a pose on the robot now') == 1
+    # a reset forgets which frames are unknown, and that is no news of a pose
+    node.associator.unknown_frames.add('tower')
+    robot.status('readings')
+    robot.call(node.reset)
+    robot.status('readings')
+    assert told.count('has a pose on the robot now') == 1
+
+
+def test_the_log_tells_once_of_a_map_frame_without_its_transform_and_of_its_end(
+    inside: Callable[..., Inside], log: Callable[[Inside], Log]
+) -> None:
+    robot = begun(inside, map_frame='map')
+    told, frame, k = log(robot), robot.node._map_frame, 0
+
+    def drive() -> None:
+        nonlocal k
+        k += 1
+        robot.odometry(100.0 + 0.1 * k)
+
+    robot.until(lambda: (drive(), frame.fault())[1])
+    for _ in range(3):
+        robot.status('readings')
+    assert told.count('no reading gets a pose: TF has no transform from map (map_frame) to odom') == 1
+    # the robot stands still for a while: that is no transform
+    robot.until(lambda: not frame.fault())
+    robot.status('readings')
+    assert told.count('the transform to map_frame is there') == 0
+    pose = Transform()
+    pose.rotation.w = 1.0
+    frame._transforms._buffer.lookup_transform = lambda *names: SimpleNamespace(transform=pose)
+    drive()
+    for _ in range(3):
+        robot.status('readings')
+    assert told.count('the transform to map_frame is there') == 1
+
+
+def test_the_log_tells_once_of_a_steep_sensor(inside: Callable[..., Inside], log: Callable[[Inside], Log]) -> None:
+    robot = begun(inside)
+    told = log(robot)
+    pose = Transform()
+    pose.rotation.y, pose.rotation.w = math.sin(0.75), math.cos(0.75)
+    buffer: Any = robot.node._extrinsics._transforms._buffer
+    buffer.set_transform_static(pose, '')
+    from_tower(robot, 0, 5)
+    for _ in range(3):
+        robot.status('readings')
+    assert told.count('readings of tower are rejected: the sensor looks up or down') == 1

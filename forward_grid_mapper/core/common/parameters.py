@@ -276,8 +276,14 @@ class NodeParameters:
     )
     map_frame: str = _param(
         '',
-        "Frame of the maps, if another than odometry's, whose transform to odometry's frame TF gives.",
+        "Frame of the maps, if another than odometry's: TF gives its transform to odometry's frame, or with "
+        "refine_poses this node does, by default from 'map'.",
         read_only=True,
+    )
+    refine_poses: bool = _param(
+        False,
+        'Take the drift out of odometry when run_em is called, and publish the transform from map to odom. Needs walls '
+        "at right angles; odometry's poses stay where readings that were held out do not speak for others.",
     )
     online: bool = _param(
         False,

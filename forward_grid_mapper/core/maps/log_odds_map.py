@@ -25,7 +25,7 @@ from ..common.parameters import Parameters
 from ..common.readings import Readings
 from ..runtime.jit import kernel
 from ..sensor.cone import rows_of, runs_of, strength
-from ..sensor.cone_table import Cones, Floats, cone_of, cone_table, grid_of
+from ..sensor.cone_table import Cones, Floats, check_size, cone_of, cone_table, grid_of
 
 QUANTUM = 2.0**-20
 MARGIN = 64
@@ -141,6 +141,24 @@ class LogOddsMap:
             math.log(q / (1 - q)) for q in (p.live.live_p_occupied, p.live.live_p_free, p.live.live_p_free_no_echo)
         )
         _add(table, gains, self._log_odds)
+
+    def add_map(self, other: LogOddsMap) -> None:
+        """Add all that another map of the same lattice says; it comes to the same as adding its readings.
+
+        Raises
+        ------
+        InputError
+            If the grid would exceed `max_cells`; the map is unchanged.
+        """
+        if not other.grid.size:
+            return
+        grid = self.grid.union(other.grid)
+        check_size(grid, self._parameters.grid)
+        self.grid = grid
+        self._grow()
+        mine, theirs = self._log_odds[self._stored.window(other.grid)], other.log_odds()
+        known = ~np.isnan(theirs)
+        mine[known] = np.where(np.isnan(mine[known]), 0.0, mine[known]) + theirs[known]
 
     def log_odds(self, grid: Grid | None = None) -> Floats:
         """Return a copy of the log-odds on `grid` (by default the map's own); NaN is not observed.

@@ -62,9 +62,11 @@ class PoseAssociator:
     time_jumps : int
         How often odometry's clock jumped back.
     behind : bool
-        Whether more readings than `at_once` can be placed now: call `settle` before the next message is added.
+        Whether more than `at_once` readings can be placed now: call `settle` before the next message.
     settled : int
         Readings placed, rejected or looked at again so far: how much work there was.
+    record : OdometryRecord
+        Of the poses that odometry gave.
     limits : LimitWatch
         Warns of ranges and limits in different units.
     """
@@ -103,25 +105,23 @@ class PoseAssociator:
         self._patient = patient
         self.buffer = ReadingBuffer(self.parameters.max_readings)
         self.limits = LimitWatch()
-        self.received = self.odometry_received = 0
+        self.received = self.odometry_received = self.time_jumps = 0
         self.rejected: Counter[str] = Counter()
         self.odometry_rejected: Counter[str] = Counter()
         self.rejected_by_frame: dict[str, Counter[str]] = {}
         self.unknown_frames: set[str] = set()
         self.map_frame = self.base_frame = ''
-        self.time_jumps = 0
         self._waiting: list[Measurement] = []
-        self._path = RobotPath()
-        self._history = PoseHistory()
+        self._path, self._history = RobotPath(), PoseHistory(patient)
+        self.record = self._history.record
         self._newest_range: int | None = None
         self._held: deque[tuple[Measurement, Pose2, Later]] = deque()
         self._retrying = 0
         self._next_try = self._next_look = 0
         self._at_once = at_once or sys.maxsize
         self._odometry_arrival = self._odometry_sent = 0.0
-        self.behind = False
+        self.behind = self._other_frame = False
         self.settled = 0
-        self._other_frame = False
 
     @property
     def waiting(self) -> int:
@@ -144,8 +144,9 @@ class PoseAssociator:
 
     @property
     def odometry(self) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """The poses of odometry that are held: stamps in ns, shape (M,), and x, y, yaw, shape (M, 3)."""
-        return self._history.held()
+        """The poses of the drive as odometry gave them: stamps in ns, shape (M,), and x, y, yaw, shape (M, 3)."""
+        stamps = self.buffer.snapshot().stamp
+        return self.record.snapshot(int(stamps.min()) if len(stamps) else None)
 
     def add_range(self, message: RangeMessage, sent: int = 0) -> None:
         """Take one Range message; `sent` is when it was published, nanoseconds of the system's clock, 0 if unknown."""
@@ -178,6 +179,7 @@ class PoseAssociator:
         if self._other_frame:
             self.map_frame = self.base_frame = ''
             self._history.clear()
+        self.record.begin_anew()
         self.buffer.clear()
         self.limits.clear()
         self.rejected.clear()
@@ -186,8 +188,7 @@ class PoseAssociator:
         self.unknown_frames.clear()
         self._waiting.clear()
         self._held.clear()
-        self._retrying = 0
-        self.behind = False
+        self._retrying, self.behind = 0, False
         self._path.clear()
         self.received = self.odometry_received = self.time_jumps = 0
         self._extent.clear()
