@@ -94,12 +94,7 @@ def changes_of(module: str, folder: Path) -> list[tuple[bool, str]]:
 
     test = [sys.executable, '-m', 'pytest', '-x', '-q', '-p', 'no:cacheprovider']
     test += [f'test/{name}.py' for name in MODULES[module]]
-    # half of the time is the search that conftest.py imports, which most of these tests do without
-    alone = subprocess.run([*test, '--noconftest'], cwd=folder, env=environment, check=False, capture_output=True)
-    if alone.returncode:
-        run(*test)
-    else:
-        test.append('--noconftest')
+    run(*test)
     text = CONFIGURATION.format(module=module, command=shlex.join(test), left_out=json.dumps(LEFT_OUT))
     configuration.write_text(text, encoding='utf-8')
     run('cosmic-ray', 'init', configuration, session)

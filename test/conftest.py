@@ -2,57 +2,13 @@
 
 from __future__ import annotations
 
-import math
 import signal
 import sys
-from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any
 
-import numpy as np
 import pytest
 
-from forward_grid_mapper.core.common.grid import Grid
-from forward_grid_mapper.core.common.parameters import ModelParameters, Parameters, SearchParameters
-from forward_grid_mapper.core.common.readings import Readings
-from forward_grid_mapper.core.messages.message_types import OdometryMessage, Pose2, RangeMessage
-from forward_grid_mapper.core.messages.pose_association import PoseAssociator
-from forward_grid_mapper.core.search.search import Search
-
 sys.path.insert(0, str(Path(__file__).parent))
-
-PLAIN_MODEL: dict[str, Any] = {
-    'max_incidence_angle': math.pi / 2,
-    'surface_offset': 0.0,
-    'likelihood_exponent': 1.0,
-}
-"""Every cone whole, obstacles at the centres of their cells, and independent readings."""
-
-PLAIN_SEARCH: dict[str, Any] = {
-    'end_cost': 0.0,
-    'least_passed': 0.0,
-    'neighbour_weight': 0.0,
-}
-"""Independent cells, and nothing made of the map that the search found."""
-
-PLAIN: dict[str, Any] = {**PLAIN_MODEL, **PLAIN_SEARCH}
-"""The model and the search of the paper, whatever the defaults are."""
-
-
-def plain_model(**values: Any) -> ModelParameters:
-    return ModelParameters(**{**PLAIN_MODEL, **values})
-
-
-def plain_search(**values: Any) -> SearchParameters:
-    return SearchParameters(**{**PLAIN_SEARCH, **values})
-
-
-class FlipsAlone(Search):
-    """A search that shifts no cell."""
-
-    def _shift(self, watch: object) -> int:
-        return 0
-
 
 SHARED = Path(__file__).resolve().parents[2] / 'shared'
 
@@ -65,24 +21,6 @@ def shared() -> Path:
     return SHARED
 
 
-def random_readings(rng: np.random.Generator, grid: Grid, count: int, z_max: float = 0.0) -> Readings:
-    """Readings from random places of the grid in random directions, one in four without echo."""
-    left, right, bottom, top = grid.extent
-    z_max = z_max or 1.2 * max(right - left, top - bottom)
-    z = rng.uniform(0.05, 1.0, count) * z_max
-    return Readings.from_columns(
-        names=('sonar',),
-        x=rng.uniform(left, right, count),
-        y=rng.uniform(bottom, top, count),
-        yaw=rng.uniform(-7, 7, count),
-        z=np.where(rng.random(count) < 0.25, z_max, z),
-        z_max=z_max,
-        half_angle=rng.uniform(0.03, 1.2, count),
-        sigma=np.where(rng.random(count) < 0.5, 0.0, rng.uniform(0.02, 0.2, count)),
-        stamp=np.arange(count),
-    )
-
-
 def pytest_configure() -> None:
     """Hear Ctrl-C, here and in the processes that tests start, even where the shell runs the tests in the background.
 
@@ -90,17 +28,3 @@ def pytest_configure() -> None:
     """
     if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
-
-
-def associated(
-    extrinsics: Mapping[str, Pose2], odometry: Iterable[OdometryMessage], ranges: Iterable[RangeMessage]
-) -> PoseAssociator:
-    """What a recording of these messages gives, in the order of their stamps."""
-    made = PoseAssociator(lambda base, frame, stamp: extrinsics.get(frame), Parameters(), patient=True)
-    for message in sorted([*odometry, *ranges], key=lambda m: m.stamp):
-        if isinstance(message, RangeMessage):
-            made.add_range(message)
-        else:
-            made.add_odometry(message)
-    made.finish()
-    return made

@@ -13,13 +13,13 @@ import numpy as np
 import pytest
 
 import forward_grid_mapper
-from conftest import associated
 from forward_grid_mapper import Sonar, SonarMaps, library, make_maps, poses_from_tum
 from forward_grid_mapper.core.common.errors import InputError, ParameterError
 from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.mapping import Mapper
 from forward_grid_mapper.simulation.drive import door_drive
 from forward_grid_mapper.simulation.sonar import NOISY, front_array
+from samples import associated
 
 PAGE = Path(__file__).resolve().parents[1] / 'docs' / 'library.md'
 

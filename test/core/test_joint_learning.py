@@ -8,7 +8,6 @@ from functools import lru_cache
 import numpy as np
 import pytest
 
-from conftest import PLAIN, random_readings
 from forward_grid_mapper.core import joint_learning
 from forward_grid_mapper.core.common.errors import InputError
 from forward_grid_mapper.core.common.grid import Grid, part_of
@@ -23,6 +22,7 @@ from forward_grid_mapper.core.sensor.forward_model import ForwardModel
 from forward_grid_mapper.simulation.drive import Recording, corridor_drive, door_drive
 from forward_grid_mapper.simulation.score import score_map, visible_surface
 from forward_grid_mapper.simulation.sonar import NoiseModel
+from samples import PLAIN, random_readings
 
 
 @lru_cache(maxsize=2)

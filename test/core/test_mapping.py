@@ -12,7 +12,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import naive
-from conftest import PLAIN, PLAIN_MODEL, random_readings
 from forward_grid_mapper.core import mapping
 from forward_grid_mapper.core.common.errors import Cancelled, InputError
 from forward_grid_mapper.core.common.grid import Grid
@@ -25,6 +24,7 @@ from forward_grid_mapper.core.search.prior import wall_prior
 from forward_grid_mapper.core.search.search import ROUNDING
 from forward_grid_mapper.core.sensor.forward_model import log_likelihood
 from forward_grid_mapper.simulation.drive import corridor_drive
+from samples import PLAIN, PLAIN_MODEL, random_readings
 
 AREA = Grid(0.1, -13, 4, 30, 20)
 

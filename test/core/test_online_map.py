@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 from failing import Allocations
 
-from conftest import PLAIN, random_readings
 from forward_grid_mapper.core import online_map
 from forward_grid_mapper.core.common.errors import InputError
 from forward_grid_mapper.core.common.grid import Grid, part_of
@@ -28,6 +27,7 @@ from forward_grid_mapper.recordings.read_drive import read_drive
 from forward_grid_mapper.simulation.drive import Recording, corridor_drive, door_drive
 from forward_grid_mapper.simulation.score import score_map, visible_surface
 from forward_grid_mapper.simulation.sonar import NOISY, sonar_ring
+from samples import PLAIN, random_readings
 
 AREA = Grid(0.1, -5, 3, 40, 30)
 

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 import naive
-from conftest import PLAIN, FlipsAlone, plain_model, plain_search, random_readings
 from forward_grid_mapper.core.common.errors import ParameterError
 from forward_grid_mapper.core.common.grid import Grid
 from forward_grid_mapper.core.common.parameters import ModelParameters, Parameters, find
@@ -31,6 +30,7 @@ from forward_grid_mapper.core.sensor.density import CUT
 from forward_grid_mapper.core.sensor.forward_model import ForwardModel, expectations, log_likelihood
 from forward_grid_mapper.simulation.drive import corridor_drive, door_drive
 from forward_grid_mapper.simulation.sonar import NOISY
+from samples import PLAIN, FlipsAlone, plain_model, plain_search, random_readings
 
 LINE = Grid(0.1, 0, 0, 12, 1)
 """One row of cells; cell c lies 0.05 + 0.1 c metres before a sensor at the origin."""

@@ -128,6 +128,10 @@ class Listener:
             assert time.monotonic() < deadline, f'{len(self.got)} messages came, then none'
             self._executor.spin_once(timeout_sec=0.05)
 
+    def publisher_of(self, topic: str) -> bool:
+        """Whether somebody publishes a topic."""
+        return bool(self._node.count_publishers(topic))
+
     def receive(self, replay: Replay) -> tuple[int, str, str]:
         """Take messages until a replay has ended; return its exit code, output and errors."""
         self.spin(until=lambda: not replay.running)

@@ -159,9 +159,11 @@ def test_a_signal_that_comes_twice_ends_it_in_order(dds: Wire, tmp_path: Path, n
 
 def test_it_can_be_stopped_while_it_waits(dds: Wire, tmp_path: Path) -> None:
     replay = dds.replay(write_bag(tmp_path))
-    time.sleep(1.5)
+    # that of one topic is too few to begin
+    listener = dds.listen({'/sonar': RANGE})
+    listener.spin(until=lambda: listener.publisher_of('/odom'))
     replay.signal(signal.SIGINT)
-    code, out, err = replay.end(10)
+    code, out, err = replay.end()
     assert code == 0, err
     assert 'stopped after 0 Range' in out
 

@@ -11,7 +11,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import naive
-from conftest import plain_model, random_readings
 from forward_grid_mapper.core.common.errors import Cancelled
 from forward_grid_mapper.core.common.grid import Grid
 from forward_grid_mapper.core.common.parameters import GridParameters, ModelParameters
@@ -26,6 +25,7 @@ from forward_grid_mapper.core.search.search import ROUNDING
 from forward_grid_mapper.core.sensor.cone_table import grid_of
 from forward_grid_mapper.core.sensor.density import CUT, causes_of
 from forward_grid_mapper.core.sensor.forward_model import expectations
+from samples import plain_model, random_readings
 
 GRID = Grid(0.1, -4, 7, 12, 9)
 WIDE = Grid(0.1, -7, 12, 41, 33)

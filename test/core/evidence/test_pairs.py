@@ -10,12 +10,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import naive
-from conftest import plain_model, random_readings
 from forward_grid_mapper.core.common.grid import Grid
 from forward_grid_mapper.core.evidence.evidence import Evidence
 from forward_grid_mapper.core.evidence.pairs import _sort, make, workspace_for
 from forward_grid_mapper.core.sensor.cone_table import walk
 from forward_grid_mapper.core.sensor.density import CUT
+from samples import plain_model, random_readings
 
 GRID = Grid(0.1, -7, 12, 41, 33)
 

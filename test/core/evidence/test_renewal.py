@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from test_evidence import snapshot
 
-from conftest import random_readings
 from forward_grid_mapper.core.common.grid import Grid
 from forward_grid_mapper.core.common.parameters import ModelParameters
 from forward_grid_mapper.core.common.readings import Readings
 from forward_grid_mapper.core.evidence import evidence as module
 from forward_grid_mapper.core.evidence.evidence import UNUSED, Evidence
 from forward_grid_mapper.core.evidence.updates import find_observing, flip
+from samples import random_readings
 
 GRID = Grid(0.1, -7, 12, 25, 20)
 MODEL = ModelParameters(sigma=0.06, p_hit=0.6, p_rand=0.1, p_lost=0.1, max_incidence_angle=0.7)

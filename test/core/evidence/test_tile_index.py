@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 import naive
-from conftest import plain_model, random_readings
 from forward_grid_mapper.core.common.grid import Grid
 from forward_grid_mapper.core.evidence.evidence import Evidence
 from forward_grid_mapper.core.evidence.tile_index import CHUNK, SHIFT, insert, more_chunks, no_tiles
+from samples import plain_model, random_readings
 
 
 @pytest.mark.parametrize('some', [naive.awkward_readings, random_readings])

@@ -15,7 +15,6 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from conftest import associated
 from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.common.readings import Readings
 from forward_grid_mapper.core.learning.consistency import consistency_warnings
@@ -24,6 +23,7 @@ from forward_grid_mapper.core.messages.message_types import NANOSECONDS, Odometr
 from forward_grid_mapper.files.quality_warning import quality_warning
 from forward_grid_mapper.simulation.drive import Recording, building_drive, corridor_drive, door_drive, drive
 from forward_grid_mapper.simulation.sonar import NOISE_FREE, NOISY, front_array, sonar_ring
+from samples import associated
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[3] / 'benchmarks'))
 

@@ -12,12 +12,12 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from conftest import associated
 from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.learning.input_warnings import input_warnings
 from forward_grid_mapper.core.messages.message_types import OdometryMessage, Pose2, RangeMessage
 from forward_grid_mapper.simulation.drive import building_drive, corridor_drive, door_drive
 from forward_grid_mapper.simulation.sonar import NOISE_FREE, NOISY, SonarArray, front_array, sonar_ring
+from samples import associated
 
 
 class Messages(NamedTuple):

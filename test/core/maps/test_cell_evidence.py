@@ -7,7 +7,6 @@ import math
 import numpy as np
 import pytest
 
-from conftest import random_readings
 from forward_grid_mapper.core.common.grid import Grid
 from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.common.readings import Readings
@@ -15,6 +14,7 @@ from forward_grid_mapper.core.mapping import Mapper
 from forward_grid_mapper.core.maps.cell_evidence import NOTHING, CellEvidence, cell_evidence
 from forward_grid_mapper.core.maps.map_set import MapSet
 from forward_grid_mapper.core.sensor.forward_model import expectations
+from samples import random_readings
 
 AREA = Grid(0.1, -8, -5, 26, 20)
 

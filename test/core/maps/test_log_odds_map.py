@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 import naive
-from conftest import random_readings
 from forward_grid_mapper.core.common.constants import ARC_DEPTH
 from forward_grid_mapper.core.common.errors import InputError
 from forward_grid_mapper.core.common.grid import Grid
 from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.common.readings import Readings
 from forward_grid_mapper.core.maps.log_odds_map import LogOddsMap
+from samples import random_readings
 
 AREA = Grid(0.1, -10, 5, 20, 16)
 

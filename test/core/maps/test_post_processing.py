@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 import naive
-from conftest import plain_model, random_readings
 from forward_grid_mapper.core.common.constants import FREE_MARGIN, MOST_AGAINST_EXTENSION
 from forward_grid_mapper.core.common.grid import Grid
 from forward_grid_mapper.core.common.parameters import ModelParameters
@@ -20,6 +19,7 @@ from forward_grid_mapper.core.maps.free_space import expected_passes
 from forward_grid_mapper.core.maps.post_processing import post_process
 from forward_grid_mapper.core.maps.wall_extension import extend
 from forward_grid_mapper.core.runtime import threads
+from samples import plain_model, random_readings
 
 GRID = Grid(0.1, 0, 0, 14, 11)
 MOST_AGAINST = MOST_AGAINST_EXTENSION * GRID.resolution

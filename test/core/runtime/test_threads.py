@@ -10,13 +10,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from conftest import PLAIN_MODEL, PLAIN_SEARCH, random_readings
 from forward_grid_mapper.core.common.grid import Grid
 from forward_grid_mapper.core.common.parameters import ModelParameters, Parameters, SearchParameters
 from forward_grid_mapper.core.evidence.evidence import Evidence
 from forward_grid_mapper.core.mapping import Mapper
 from forward_grid_mapper.core.runtime import threads
 from forward_grid_mapper.core.search.search import Search, SearchResult
+from samples import PLAIN_MODEL, PLAIN_SEARCH, random_readings
 
 AREA = Grid(0.1, -13, 4, 60, 50)
 

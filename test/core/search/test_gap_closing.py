@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 import naive
-from conftest import plain_model, plain_search, random_readings
 from forward_grid_mapper.core.common.constants import (
     MOST_AGAINST_GAP,
     MOST_AGAINST_METRE,
@@ -26,6 +25,7 @@ from forward_grid_mapper.core.search.gap_closing import close_gaps, remove_short
 from forward_grid_mapper.core.search.prior import Prior, wall_prior
 from forward_grid_mapper.core.search.search import LEAST, Search
 from forward_grid_mapper.core.sensor.forward_model import log_likelihood
+from samples import plain_model, plain_search, random_readings
 
 GRID = Grid(0.1, 0, 0, 24, 14)
 MODEL = plain_model(p_hit=0.7, p_rand=0.4, p_lost=0.4, sigma=0.05)

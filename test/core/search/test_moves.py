@@ -10,7 +10,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import naive
-from conftest import plain_model, random_readings
 from forward_grid_mapper.core.common.grid import Grid
 from forward_grid_mapper.core.common.parameters import ModelParameters
 from forward_grid_mapper.core.common.readings import Readings
@@ -23,6 +22,7 @@ from forward_grid_mapper.core.search.prior import Prior
 from forward_grid_mapper.core.search.search import LEAST
 from forward_grid_mapper.core.search.shifts import best_shifts, see_any, shift_in_order, try_shifts, unsettle
 from forward_grid_mapper.core.sensor.forward_model import expectations, log_likelihood
+from samples import plain_model, random_readings
 
 GRID = Grid(0.1, 0, 0, 12, 9)
 NOTHING = (0.0, 0.0)

@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
 import naive
-from conftest import plain_search
 from forward_grid_mapper.core.common.parameters import SearchParameters
 from forward_grid_mapper.core.evidence.neighbourhood import (
     EAST,
@@ -34,6 +33,7 @@ from forward_grid_mapper.core.search.prior import (
     shapes,
     wall_prior,
 )
+from samples import plain_search
 
 sides = st.tuples(st.integers(1, 5), st.integers(1, 5))
 maps = sides.flatmap(lambda shape: arrays.arrays(np.uint8, shape, elements=st.integers(0, 1)))

@@ -12,7 +12,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import naive
-from conftest import FlipsAlone, plain_model, plain_search, random_readings
 from forward_grid_mapper.core.common.errors import Cancelled
 from forward_grid_mapper.core.common.grid import Grid
 from forward_grid_mapper.core.common.parameters import ModelParameters, SearchParameters
@@ -25,6 +24,7 @@ from forward_grid_mapper.core.search.flips import gain_of
 from forward_grid_mapper.core.search.prior import Prior, independent_prior, odds_given_neighbours, wall_prior
 from forward_grid_mapper.core.search.search import FEW, LEAST, Progress, Search
 from forward_grid_mapper.core.sensor.forward_model import log_likelihood
+from samples import FlipsAlone, plain_model, plain_search, random_readings
 
 GRID = Grid(0.1, 0, 0, 12, 9)
 MODEL = plain_model(p_hit=0.6, p_rand=0.1, p_lost=0.1, sigma=0.06)

@@ -8,12 +8,12 @@ import math
 import numpy as np
 import pytest
 
-from conftest import random_readings
 from forward_grid_mapper.core.common.grid import Grid
 from forward_grid_mapper.core.common.parameters import ModelParameters, Parameters
 from forward_grid_mapper.core.common.readings import Readings
 from forward_grid_mapper.core.evidence.evidence import Evidence
 from forward_grid_mapper.core.sensor.bounds import reading_bounds
+from samples import random_readings
 
 GRID = Grid(0.1, 0, 0, 30, 20)
 MODELS = [

@@ -11,7 +11,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import naive
-from conftest import plain_model, random_readings
 from forward_grid_mapper.core.common.grid import Grid, cone_boxes
 from forward_grid_mapper.core.common.parameters import GridParameters, ModelParameters
 from forward_grid_mapper.core.common.readings import Readings
@@ -26,6 +25,7 @@ from forward_grid_mapper.core.sensor.cone_table import (
     walk,
     walk_resized,
 )
+from samples import plain_model, random_readings
 
 GRID = Grid(0.1, -7, 12, 41, 33)
 

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 import naive
-from conftest import random_readings
 from forward_grid_mapper.core.common.constants import MOST_HIT
 from forward_grid_mapper.core.common.grid import Grid
 from forward_grid_mapper.core.common.parameters import ModelParameters
@@ -18,6 +17,7 @@ from forward_grid_mapper.core.learning.model_update import learn
 from forward_grid_mapper.core.sensor.density import CUT, hit_parameter, hit_probability
 from forward_grid_mapper.core.sensor.forward_model import ForwardModel, expectations, log_likelihood
 from forward_grid_mapper.core.sensor.surface_normals import SurfaceNormals
+from samples import random_readings
 
 GRID = Grid(0.1, 3, -4, 4, 3)
 

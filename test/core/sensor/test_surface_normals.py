@@ -11,7 +11,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import naive
-from conftest import plain_model, random_readings
 from forward_grid_mapper.core.common.constants import LEAST_AGREEMENT, LEAST_WEIGHT, WEIGHT_CELL
 from forward_grid_mapper.core.common.grid import Grid
 from forward_grid_mapper.core.common.parameters import ModelParameters
@@ -28,6 +27,7 @@ from forward_grid_mapper.core.sensor.surface_normals import (
     normals_of,
     on_larger_grid,
 )
+from samples import plain_model, random_readings
 
 GRID = Grid(0.1, -7, 12, 25, 20)
 MODEL = ModelParameters(sigma=0.06, p_hit=0.6, p_rand=0.1, p_lost=0.1, max_incidence_angle=0.7)

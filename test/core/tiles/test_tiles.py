@@ -15,7 +15,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import naive
-from conftest import random_readings
 from forward_grid_mapper.core.common.errors import Cancelled, InputError
 from forward_grid_mapper.core.common.grid import Grid
 from forward_grid_mapper.core.common.parameters import Parameters
@@ -34,6 +33,7 @@ from forward_grid_mapper.core.tiles.tiling import Tiling
 from forward_grid_mapper.simulation.drive import corridor_drive, drive
 from forward_grid_mapper.simulation.sonar import NOISY, front_array
 from forward_grid_mapper.simulation.world import rooms_world
+from samples import random_readings
 
 AREA = Grid(0.1, -13, 7, 60, 45)
 PAPER = {'end_cost': 0.0, 'least_passed': 0.0, 'max_incidence_angle': math.pi / 2}
