@@ -1,4 +1,4 @@
-"""Drives through buildings drawn by chance, whose walls are of many materials: what maps are tuned on, and held against.
+"""Drives through buildings drawn by chance, whose walls are of many materials, to tune maps on and to judge them.
 
 Floor plans are a corridor or two with rooms on both sides and a hall, turned by any angle, so that no wall runs along
 the lattice. Walls have two faces. Each piece of 3 m is of one material, which returns echoes up to an incidence of its
@@ -181,7 +181,9 @@ def way_through(plan: Plan, rng: np.random.Generator) -> Floats:
         floor[a[1] : b[1] + 1, a[0] : b[0] + 1] = True
     for x0, y0, x1, y1 in segments:
         t = np.linspace(0, 1, 2 + int(math.hypot(x1 - x0, y1 - y0) / 0.02))
-        walls[((y0 + t * (y1 - y0) - low[1]) / step).astype(int), ((x0 + t * (x1 - x0) - low[0]) / step).astype(int)] = 1
+        walls[
+            ((y0 + t * (y1 - y0) - low[1]) / step).astype(int), ((x0 + t * (x1 - x0) - low[0]) / step).astype(int)
+        ] = 1
     room = floor & (ndimage.distance_transform_edt(~walls) * step > CLEARANCE)
     index = np.full(shape, -1)
     index[room] = np.arange(room.sum())
@@ -202,7 +204,7 @@ def way_through(plan: Plan, rng: np.random.Generator) -> Floats:
     def nearest(x: float, y: float) -> int:
         return int(np.abs(cells - [(y - low[1]) / step, (x - low[0]) / step]).sum(1).argmin())
 
-    left, bottom, right, top = plan.floors[0]
+    left, bottom, _, top = plan.floors[0]
     at = nearest(left + 0.8, (bottom + top) / 2)
     path = [at]
     for k in rng.permutation(len(plan.rooms)):
@@ -285,7 +287,7 @@ def seen_by_laser(segments: Floats, poses: Floats) -> tuple[Floats, tuple[float,
         far = np.where(met, distance[0], LASER)
         along = np.arange(0.0, LASER, CELL / 2)
         inside = along[None, :] < far[:, None] - CELL / 2
-        for s, target in ((along, inside), ):
+        for s, target in ((along, inside),):
             x = pose[0] + np.cos(angles)[:, None] * s
             y = pose[1] + np.sin(angles)[:, None] * s
             rows = ((y[target] - low[1]) / CELL).astype(int)
