@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..runtime.jit import kernel
-from ..sensor.cone import HALF_WIDTH, axis_run, make_cone, rows_of
+from ..sensor.cone import HALF_WIDTH, axis_run, make_cone
 from ..sensor.cone_table import UNIT
 
 QUANTUM = 2.0**-20
@@ -91,9 +91,14 @@ def is_steep(direction: int, directions: int) -> bool:
 
 
 @kernel
-def _lattice_place(metres: float, resolution: float, corner: int) -> float:
-    """Return a coordinate in cells, in whole units: so where a sensor is in a cell does not depend on the corner."""
-    return float(np.rint(metres * (1.0 / resolution) / UNIT) * UNIT - corner)
+def _lattice_place(metres: float, resolution: float) -> tuple[int, float]:
+    """Return the lattice index of the cell of a coordinate, and how far into it that is, cells.
+
+    Cones are walked from their own cell on, so that no rounding depends on where the grid has its corner.
+    """
+    cells = np.rint(metres * (1.0 / resolution) / UNIT) * UNIT
+    cell = math.floor(cells)
+    return int(cell), cells - cell
 
 
 @kernel
@@ -176,13 +181,15 @@ def add_readings(beams: Beams, model: InverseModel, lattice: Lattice, planes: An
         if beams.half_angle[t] != half_angle:
             half_angle = beams.half_angle[t]
             sine, cosine = math.sin(half_angle), math.cos(half_angle)
-        x = _lattice_place(beams.x[t], lattice.resolution, lattice.column)
-        y = _lattice_place(beams.y[t], lattice.resolution, lattice.row)
+        column, x = _lattice_place(beams.x[t], lattice.resolution)
+        row, y = _lattice_place(beams.y[t], lattice.resolution)
+        column, row = column - lattice.column, row - lattice.row
         axis_x, axis_y = math.cos(beams.yaw[t]), math.sin(beams.yaw[t])
         width, height = lattice.width, lattice.height
         k = direction_of(beams.yaw[t], directions)
         if is_steep(k, directions):
-            x, y, axis_x, axis_y, width, height = y, x, axis_y, axis_x, height, width
+            x, y, axis_x, axis_y = y, x, axis_y, axis_x
+            column, row, width, height = row, column, height, width
         z = beams.z[t] / lattice.resolution
         if beams.z[t] < beams.z_max[t]:
             reach, free = z + model.behind, max(z - model.before, 0.0)
@@ -198,13 +205,13 @@ def add_readings(beams: Beams, model: InverseModel, lattice: Lattice, planes: An
         near = make_cone(x, y, axis, half, (min(reach, thin), 0.0))
         edges = _edge(cone.right_x, cone.right_y), _edge(-cone.left_x, -cone.left_y)
         beam, plane = (axis_x, axis_y, sine * sine), planes[k]
-        for row in range(*rows_of(cone, height)):
-            v, begin = row + 0.5 - y, row * width
+        for across in range(max(cone.bottom, -row), min(cone.top, height - 1 - row) + 1):
+            v, begin = across + 0.5 - y, (row + across) * width + column
             first, last = _wedge_run(edges, ends.reach2, x, v)
-            first, last = max(first, 0), min(last, width - 1)
-            if near.bottom <= row <= near.top:
-                a, b = axis_run(near, row)
-                a, b = max(a, 0), min(b, width - 1)
+            first, last = max(first, -column), min(last, width - 1 - column)
+            if near.bottom <= across <= near.top:
+                a, b = axis_run(near, across)
+                a, b = max(a, -column), min(b, width - 1 - column)
                 if a <= b and (last < first or a > last + 1 or first > b + 1):
                     _add_run(plane, (begin + a, begin + b + 1), (a + 0.5 - x, v), beam, ends)
                 elif a <= b:

@@ -34,7 +34,6 @@ def test_what_a_run_takes_is_what_it_is_said_to_take(
     finally:
         tracemalloc.stop()
     told = least_memory(maps.grid.size, len(readings), threads)
-    print('TAKEN', taken, told)
     assert told / 2 < taken < told
 
 
