@@ -172,7 +172,7 @@ class Fuzz:
             expected = not len(self.associator.readings) or 'more than max_cells' in str(error)
             require(expected, f'EM failed: {error}')
             return
-        require(bool(np.isin(maps.ml, (-1, 0, 1)).all()), 'the ML map has another value')
+        require(bool(np.isin(maps.ml, (-1, 0, 1)).all()), 'the maximum likelihood map has another value')
         require(bool(np.isfinite(maps.log_likelihood) and np.isfinite(maps.objective)), 'the likelihood is not finite')
         seen = maps.ml >= 0
         require(bool(np.isfinite(maps.uncertainty[seen]).all()), 'the uncertainty map is not finite where observed')

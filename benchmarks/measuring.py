@@ -114,7 +114,7 @@ def timed(work: Callable[[], object], runs: int) -> float:
 
 
 class Timing(dict[str, float]):
-    """Medians over runs, in seconds: each stage, and `total`, all but the live map, which no other map needs.
+    """Medians over runs, in seconds: each stage, and `total`, all but the standard map, which no other map needs.
 
     `maps` are those of the last run, `others` is what other processes used of the machine at most.
     """
@@ -127,7 +127,7 @@ class Timing(dict[str, float]):
             begin = time.perf_counter()
             self.maps = Mapper(parameters).run(readings)
             seconds = dict(self.maps.statistics['seconds'])
-            seconds['total'] = time.perf_counter() - begin - seconds['live map']
+            seconds['total'] = time.perf_counter() - begin - seconds['standard map']
             return seconds
 
         stages, self.others = undisturbed(run, runs)

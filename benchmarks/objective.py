@@ -70,7 +70,7 @@ def reach(source: Path, target: Path) -> None:
     for _ in range(RUNS):
         begin = time.perf_counter()
         maps = Mapper(parameters).run(readings)
-        seconds.append(time.perf_counter() - begin - maps.statistics['seconds']['live map'])
+        seconds.append(time.perf_counter() - begin - maps.statistics['seconds']['standard map'])
     g = maps.grid
     lattice = np.array([g.resolution, g.column, g.row, g.width, g.height])
     where = np.array(str(Path(forward_grid_mapper.__file__).parent))

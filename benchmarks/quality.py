@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""How good the maps are: the default, the paper's plain ML map, and the standard map at its best gains.
+"""How good the maps are: the default, the paper's plain maximum likelihood map, and the standard map at its best gains.
 
 usage: quality.py [--quick] [--ablate] [--set NAME=VALUE ...] [--runs 5] [--pictures DIR]
 
@@ -241,7 +241,7 @@ def print_drawn(base: dict[str, Any], quick: bool) -> None:
         'constant: the fraction of occupied cells everywhere; standard: the standard map at its best gains and scale;'
     )
     print('true: the default but with the parameters of the sensor model that the readings were drawn with;')
-    print('mapped: the default, over cells that its ML map knows as free or occupied; rest: (43) with these')
+    print('mapped: the default, over cells that its map knows as free or occupied; rest: (43) with these')
     print('parameters, the best prior, and every cell but the one asked for taken from the true map')
 
 

@@ -1,4 +1,4 @@
-"""Pictures of what `quality.py` maps: the truth, the standard map, the paper's plain ML map, and the default's."""
+"""Pictures of what `quality.py` maps: the truth, the standard map, the maximum likelihood map of the paper and ours."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from quality_scores import Figures, Standard, score
 from quality_worlds import Case
 
-from forward_grid_mapper.commands.experiment import GAINS
+from forward_grid_mapper.commands.experiment_maps import GAINS
 from forward_grid_mapper.core.common.grid import Grid
 from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.mapping import Mapper

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from quality_worlds import Case
 
-from forward_grid_mapper.commands.experiment import GAINS, standard_map
+from forward_grid_mapper.commands.experiment_maps import GAINS, standard_map
 from forward_grid_mapper.core.common.grid import Grid
 from forward_grid_mapper.simulation.score import score_map
 

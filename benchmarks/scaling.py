@@ -4,7 +4,8 @@
 usage: scaling.py [--runs 5] [--patience 0] [--most 1e8] [--plot scaling.png]
 
 Two ways to more pairs: more readings on the same cells, and finer cells for the same readings. Prints medians of the
-time from readings in the map frame to ML map and uncertainty map, and the peak memory of a process of its own for each.
+time from readings in the map frame to maximum likelihood map and uncertainty map, and the peak memory of a process of
+its own for each.
 """
 
 from __future__ import annotations
@@ -105,7 +106,7 @@ def plot(path: Path, series: dict[str, list[Point]]) -> None:
         right.plot(pairs, [p.peak / 1e6 for p in points], mark + '-', color=color, label=name)
     left.plot(ends, [e * 100e-9 for e in ends], '--', color='#8b96a3', linewidth=1, label='100 ns a pair')
     right.plot(ends, [e * 12e-6 for e in ends], '--', color='#8b96a3', linewidth=1, label='12 bytes a pair')
-    for axes, what in ((left, 'seconds to ML map and uncertainty map'), (right, 'growth of peak memory in MB')):
+    for axes, what in ((left, 'seconds to the maps'), (right, 'growth of peak memory in MB')):
         axes.set(xscale='log', yscale='log', xlabel='pairs of a cell and a reading', title=what)
         axes.grid(color='#e3e7ec', linewidth=0.7)
         axes.legend(frameon=False)

@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Time and memory from readings to ML map and uncertainty map, warm, with ratios measured in the same run.
+"""Time and memory from readings to maximum likelihood and uncertainty map, warm, with ratios measured in the same run.
 
 usage: speed.py [--runs 5] [--patience 0] [--only jobs threads memory live table2]
 
@@ -82,10 +82,10 @@ def measure_job(readings: Readings, resolution: float, runs: int) -> dict[str, f
 
 def jobs(runs: int) -> None:
     """Print the table of jobs."""
-    print('\nFrom readings to ML map and uncertainty map; seconds')
+    print('\nFrom readings to maximum likelihood map and uncertainty map; seconds')
     print(
         f'{"":22s}{"readings":>9s}{"cells":>9s}{"pairs":>12s}{"index":>8s}{"search":>8s}{"uncert.":>8s}'
-        f'{"total":>8s}{"target":>8s}{"live map":>10s}{"EM / live":>11s}{"others":>8s}'
+        f'{"total":>8s}{"target":>8s}{"standard":>10s}{"EM / standard":>15s}{"others":>8s}'
     )
     found = []
     for job in JOBS:
@@ -94,8 +94,8 @@ def jobs(runs: int) -> None:
         found.append((job, len(readings), f))
         print(
             f'{job.name:22s}{len(readings):9d}{f["cells"]:9.0f}{f["pairs"]:12.0f}{f["index"]:8.3f}{f["search"]:8.3f}'
-            f'{f["uncertainty"]:8.3f}{f["total"]:8.3f}{job.target:8.2f}{f["live map"]:10.4f}'
-            f'{(f["index"] + f["search"]) / f["live map"]:9.1f} x{f["others"]:8.0%}',
+            f'{f["uncertainty"]:8.3f}{f["total"]:8.3f}{job.target:8.2f}{f["standard map"]:10.4f}'
+            f'{(f["index"] + f["search"]) / f["standard map"]:9.1f} x{f["others"]:8.0%}',
             flush=True,
         )
     print(

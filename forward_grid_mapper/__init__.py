@@ -19,9 +19,9 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from .library import Sonar, SonarMaps, make_maps, poses_from_tum
+    from .library import Sonar, SonarMaps, make_maps, poses_from_csv, poses_from_tum
 
-__all__ = ['Sonar', 'SonarMaps', '__version__', 'make_maps', 'poses_from_tum']
+__all__ = ['Sonar', 'SonarMaps', '__version__', 'make_maps', 'poses_from_csv', 'poses_from_tum']
 
 __version__ = '0.1.0'
 

@@ -1,3 +1,4 @@
+# PYTHON_ARGCOMPLETE_OK
 """The entry of every command: `python3 -m forward_grid_mapper COMMAND …`, and one script each once it is installed.
 
 Signals get their handlers before the commands' modules are imported, which takes a second.
@@ -7,12 +8,13 @@ from __future__ import annotations
 
 import difflib
 import importlib
+import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from . import __version__
-from .commands import signals
+from .commands import completion, signals
 
 COMMANDS = {
     'mapper': ('node.main', 'the ROS 2 node: map while driving'),
@@ -50,6 +52,23 @@ def run(command: str, arguments: Sequence[str] | None = None) -> int:
         signals.leave_silently()
 
 
+def _to_a_pipe(work: Callable[[], int]) -> int:
+    """Do the work of a command, whose output may go to somebody who stops reading before its end, such as `head`."""
+    try:
+        try:
+            return work()
+        finally:
+            # a command may have closed it
+            if not sys.stdout.closed:
+                sys.stdout.flush()
+    except BrokenPipeError:
+        if not signals.nobody_reads():
+            raise
+        # the end of the interpreter must not find anything to write
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
+
+
 def _what_brings(package: str) -> str:
     """Say how a package that is not installed can be."""
     extra = f'pip install "forward_grid_mapper[{EXTRAS[package]}]", or .[{EXTRAS[package]}] in a checkout'
@@ -60,51 +79,56 @@ def _what_brings(package: str) -> str:
 
 def mapper() -> int:
     """Run `mapper`; return its exit code."""
-    return run('mapper')
+    return _to_a_pipe(lambda: run('mapper'))
 
 
 def process_bag() -> int:
     """Run `process_bag`; return its exit code."""
-    return run('process_bag')
+    return _to_a_pipe(lambda: run('process_bag'))
 
 
 def explain() -> int:
     """Run `explain`; return its exit code."""
-    return run('explain')
+    return _to_a_pipe(lambda: run('explain'))
 
 
 def learn() -> int:
     """Run `learn`; return its exit code."""
-    return run('learn')
+    return _to_a_pipe(lambda: run('learn'))
 
 
 def replay_bag() -> int:
     """Run `replay_bag`; return its exit code."""
-    return run('replay_bag')
+    return _to_a_pipe(lambda: run('replay_bag'))
 
 
 def simulate() -> int:
     """Run `simulate`; return its exit code."""
-    return run('simulate')
+    return _to_a_pipe(lambda: run('simulate'))
 
 
 def experiment() -> int:
     """Run `experiment`; return its exit code."""
-    return run('experiment')
+    return _to_a_pipe(lambda: run('experiment'))
 
 
 def warm_up() -> int:
     """Run `warm_up`; return its exit code."""
-    return run('warm_up')
+    return _to_a_pipe(lambda: run('warm_up'))
 
 
 def demo() -> int:
     """Run `demo`; return its exit code."""
-    return run('demo')
+    return _to_a_pipe(lambda: run('demo'))
 
 
 def main() -> int:
     """Run the command named by the first argument."""
+    return _to_a_pipe(_main)
+
+
+def _main() -> int:
+    completion.complete(COMMANDS, __package__)
     given = sys.argv[1] if len(sys.argv) > 1 else ''
     if given in COMMANDS:
         return run(given, sys.argv[2:])

@@ -15,21 +15,20 @@ from .core.common.errors import InputError
 from .core.common.parameters import Parameters
 from .core.mapping import Mapper, Watch
 from .core.maps.map_set import MapSet
+from .core.messages.extrinsics import Mount
 from .core.messages.message_types import NANOSECONDS, OdometryMessage, Pose2, RangeMessage
 from .core.messages.pose_association import PoseAssociator
-from .core.messages.quaternions import yaw_of
 from .core.messages.rep117 import ODOMETRY_REASONS, REASONS
+from .files.pose_files import poses_from_csv, poses_from_tum
 from .files.quality_warning import data_warnings
 from .files.results import write_results
 
-__all__ = ['Sonar', 'SonarMaps', 'make_maps', 'poses_from_tum']
+__all__ = ['Sonar', 'SonarMaps', 'make_maps', 'poses_from_csv', 'poses_from_tum']
 
 TURN = 2.0 * math.pi
 
 MANY = 0.2
 """Part of the ranges whose rejection for one reason is worth a warning."""
-
-_TUM_COLUMNS = 8
 
 
 @dataclass(frozen=True)
@@ -46,6 +45,8 @@ class Sonar:
         The full angle of its cone, radians.
     max_range, min_range : float
         Metres. A range that is infinite, or not below `max_range`, says that nothing returned an echo.
+    pitch : float
+        How far it looks down, or up if negative (REP 103), radians; what it measures is projected on the plane.
     """
 
     x: float
@@ -54,15 +55,20 @@ class Sonar:
     field_of_view: float
     max_range: float
     min_range: float = 0.0
+    pitch: float = 0.0
 
     def __post_init__(self) -> None:
         try:
-            finite = all(map(math.isfinite, (self.x, self.y, self.yaw, self.max_range, self.min_range)))
+            finite = all(map(math.isfinite, (self.x, self.y, self.yaw, self.max_range, self.min_range, self.pitch)))
             self.field_of_view / 1.0
         except TypeError as error:
             raise InputError(f'{self}: a number is wanted: {error}') from None
         if abs(self.yaw) > TURN:
             raise InputError(f'yaw = {self.yaw:g} rad is more than a turn; did you mean radians({self.yaw:g})?')
+        if abs(self.pitch) > math.pi / 2:
+            raise InputError(
+                f'pitch = {self.pitch:g} rad is beyond straight down; did you mean radians({self.pitch:g})?'
+            )
         if not finite:
             raise InputError(f'{self}: pose and limits must be finite')
         if not 0.0 < self.field_of_view < math.pi:
@@ -210,7 +216,7 @@ def make_maps(
         raise InputError(f'no sensor is called {", ".join(unknown[:6])}; there are: {", ".join(sorted(sensors))}')
     if not odometry or not len(values):
         raise InputError(f'there are {len(odometry)} poses and {len(values)} ranges; it takes some of both')
-    mounted = {name: Pose2(s.x, s.y, s.yaw) for name, s in sensors.items()}
+    mounted: dict[str, Pose2] = {name: Mount(s.x, s.y, s.yaw, -s.pitch) for name, s in sensors.items()}
     associator = PoseAssociator(lambda base, frame, stamp: mounted.get(frame), chosen, patient=True)
     for pose in odometry:
         associator.add_odometry(pose)
@@ -233,7 +239,7 @@ def make_maps(
     for reason, count in associator.rejected.items():
         if count > MANY * len(values):
             before.append(f'{count} of {len(values)} ranges were rejected as {reason}: {REASONS[reason]}')
-    judged = tuple(data_warnings(maps, mounted))
+    judged = tuple(data_warnings(maps, {'extrinsics': mounted}))
     path = np.array(associator.path, np.float64).reshape(-1, 2)
     rejected = dict(associator.rejected)
     counts = {'received': len(values), 'accepted': len(associator.buffer), 'rejected': rejected}
@@ -247,41 +253,3 @@ def _told_of_poses(associator: PoseAssociator) -> list[str]:
         f'{count} of {associator.odometry_received} poses were rejected: {ODOMETRY_REASONS[reason]}'
         for reason, count in associator.odometry_rejected.items()
     ]
-
-
-def poses_from_tum(path: Path | str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Read a trajectory in the format of the TUM benchmark, as evo and most SLAM tools write it.
-
-    Returns
-    -------
-    stamps : float64, shape (M,)
-        Seconds.
-    poses : float64, shape (M, 3)
-        x, y in metres and yaw in radians: the trajectory projected on the plane.
-
-    Raises
-    ------
-    InputError
-        If a line has not the eight numbers `stamp x y z qx qy qz qw`, or no orientation of a robot on a floor.
-    """
-    stamps, poses = [], []
-    try:
-        lines = Path(path).read_text(encoding='utf-8').splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f'{path} cannot be read: {error}') from None
-    for number, line in enumerate(lines, 1):
-        words = line.partition('#')[0].split()
-        if not words:
-            continue
-        try:
-            row = [float(word) for word in words]
-        except ValueError:
-            row = []
-        if len(row) != _TUM_COLUMNS or not all(map(math.isfinite, row)):
-            raise InputError(f'{path}, line {number}: not the eight numbers "stamp x y z qx qy qz qw"')
-        yaw = yaw_of(*row[4:])
-        if yaw is None:
-            raise InputError(f'{path}, line {number}: the quaternion is not normalised, or the robot stands on end')
-        stamps.append(row[0])
-        poses.append((row[1], row[2], yaw))
-    return np.array(stamps), np.array(poses).reshape(-1, 3)

@@ -20,7 +20,9 @@ PARAMETERS = {
     'range_reliability': ('Quality of service of the Range subscriptions', RELIABILITY),
     'odom_reliability': ('Quality of service of the odometry subscription', RELIABILITY),
     'map_frame': ("Frame of the maps, if another than odometry's, such as map with a localiser", None),
-    'online': ('Whether the ML map and the uncertainty map follow every reading', SWITCH),
+    'refine_poses': ('Whether run_em takes the drift out of odometry, in frame map', SWITCH),
+    'online': ('Whether the maximum likelihood map and the uncertainty map follow every reading', SWITCH),
+    'autostart': ('Whether the mapper starts by itself; if not, a lifecycle manager has to start it', SWITCH),
     'journal': ('Folder of the journal, which gives accepted readings back after a restart', None),
 }
 
@@ -127,7 +129,11 @@ def start(context):
         # the configuration names topics from the root, which a namespace moves
         remappings=[
             *TRANSFORMS,
-            *((f'/{PACKAGE}/{name}', 'map' if name == given['map'] else f'{PACKAGE}/{name}') for name in MAPS),
+            *(
+                (f'/{PACKAGE}/{name}{ending}', ('map' if name == given['map'] else f'{PACKAGE}/{name}') + ending)
+                for name in MAPS
+                for ending in ('', '_updates')
+            ),
             ('/odom', LaunchConfiguration('odom')),
         ],
         arguments=['-d', LaunchConfiguration('rviz_config')],

@@ -260,7 +260,7 @@ def library_names() -> frozenset[str]:
     for node in ast.walk(tree_of(PACKAGE / 'library.py')):
         if isinstance(node, ast.FunctionDef):
             found |= {node.name} | {arg.arg for arg in node.args.args}
-    for path in (PACKAGE / 'library.py', PACKAGE / 'core' / 'maps' / 'map_set.py'):
+    for path in (PACKAGE / 'library.py', PACKAGE / 'files' / 'pose_files.py', PACKAGE / 'core' / 'maps' / 'map_set.py'):
         found |= {name.rpartition('.')[2] for name in names_in(path)}
     return frozenset(found)
 

@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import re
+import runpy
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
+import yaml
 from doc_names import DEPRECATED, PAGES, ROOT, wrong_commands, wrong_defaults, wrong_links, wrong_names
 from test_layers import BELOW, CORE
 
@@ -21,6 +25,12 @@ ALLOWED = {
     'mode: raw': 'a line of map_server files',
     'use_sim_time:=true': 'a parameter of every ROS node',
     'set_parameters': 'a service of every ROS node',
+    '~/change_state': 'a service of every lifecycle node',
+    '~/get_state': 'a service of every lifecycle node',
+    'manager.yaml': 'a file of the user',
+    'node_names': "a parameter of Nav2's lifecycle manager",
+    '~/live_map_updates': "the live map's topic and an ending",
+    'map_updates': "the map's topic and an ending",
     'NUMBA_CACHE_DIR': 'an environment variable of numba',
     '~/.cache': 'a folder of the user',
     '~/.ros/log': 'a folder of the user',
@@ -41,6 +51,7 @@ ALLOWED = {
     'header.frame_id': 'a field of messages',
     'child_frame_id': 'a field of odometry',
     'base_link': 'a usual name of a frame',
+    'base_footprint': 'a usual name of a frame',
     'inf': 'a number that is not finite',
     'sonar_left': 'a name of a sensor, as an example',
     '/map': 'the topic of the map in Nav2, where a launch argument sends one of ours',
@@ -49,6 +60,7 @@ ALLOWED = {
     'ml_map.yaml': 'a name of a map and an ending',
     'global_frame: odom': 'a setting of Nav2',
     '/robot1/forward_grid_mapper/run_em': 'a service of a node in a namespace',
+    'mkdocs serve': 'a command of mkdocs',
     'pip install --break-system-packages rosbags': 'a command of pip',
 }
 """Words in code spans that name nothing in the repository, and why they may stand there."""
@@ -63,6 +75,19 @@ def test_the_readme_leads_to_every_page() -> None:
     text = (ROOT / 'README.md').read_text(encoding='utf-8')
     assert [page.name for page in PAGES if page.parent.name == 'docs' and f'(docs/{page.name})' not in text] == []
     assert len(text.splitlines()) < 100, 'the rest belongs to docs/'
+
+
+def test_the_site_leads_to_every_page() -> None:
+    def pages(items: list[Any]) -> Iterator[str]:
+        for item in items:
+            for entry in item.values() if isinstance(item, dict) else [item]:
+                yield from pages(entry) if isinstance(entry, list) else [entry]
+
+    site = yaml.safe_load((ROOT / 'mkdocs.yml').read_text(encoding='utf-8'))
+    beside = runpy.run_path(str(ROOT / 'scripts' / 'site_pages.py'))['PAGES']
+    expected = [*beside.values(), *(page.name for page in PAGES if page.parent.name == 'docs')]
+    assert sorted(pages(site['nav'])) == sorted(expected)
+    assert all((ROOT / name).is_file() for name in beside)
 
 
 @of_each_page

@@ -149,8 +149,9 @@ def test_a_namespace_moves_what_rviz_listens_to_with_the_node(description: list[
     renamed = dict(rviz['remappings'])
     displays = yaml.safe_load((ROOT / config.removeprefix('share/forward_grid_mapper/')).read_text())
     for display in displays['Visualization Manager']['Displays']:
-        if topic := display.get('Topic', {}).get('Value'):
-            assert not renamed[topic].startswith('/'), f'{topic} would not follow the namespace'
+        for kind in ('Topic', 'Update Topic'):
+            if topic := display.get(kind, {}).get('Value'):
+                assert not renamed[topic].startswith('/'), f'{topic} would not follow the namespace'
     assert renamed['/odom'] == 'wheels'
 
 
@@ -161,10 +162,11 @@ def test_parameters_that_are_launch_arguments_reach_the_node_with_their_types(de
         'odom_reliability': 'best_effort',
         'map_frame': 'map',
         'online': 'true',
+        'autostart': 'false',
         'journal': '/var/lib/robot/map_journal',
     }
     _, _, chosen = launched(description, **given)['mapper']['parameters']
-    assert chosen == {**given, 'range_topics': ['left', 'right'], 'online': True}
+    assert chosen == {**given, 'range_topics': ['left', 'right'], 'online': True, 'autostart': False}
     for name, value in chosen.items():
         assert find(name).check(value) == (tuple(value) if isinstance(value, list) else value)
     *_, alone = launched(description, online='false')['mapper']['parameters']
@@ -184,6 +186,8 @@ def test_one_of_the_maps_goes_where_nav2_expects_it(description: list[Call]) -> 
     assert [pair for pair in nodes['mapper']['remappings'] if pair[1] == 'map'] == [('~/ml_map', 'map')]
     renamed = dict(nodes['rviz2']['remappings'])
     assert renamed['/forward_grid_mapper/ml_map'] == 'map'
+    # the mapper names them after the map's own topic
+    assert renamed['/forward_grid_mapper/ml_map_updates'] == 'map_updates'
     assert renamed['/forward_grid_mapper/live_map'] == 'forward_grid_mapper/live_map'
     assert not [pair for pair in launched(description)['mapper']['remappings'] if pair[1] == 'map']
 

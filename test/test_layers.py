@@ -22,7 +22,7 @@ BELOW = {
 }
 """The packages that each package may import from, beside itself."""
 
-CORE = ('common', 'runtime', 'sensor', 'messages', 'evidence', 'search', 'maps', 'learning', 'trajectory')
+CORE = ('common', 'runtime', 'sensor', 'messages', 'evidence', 'search', 'maps', 'tiles', 'learning', 'trajectory')
 """The layers of the core, from the bottom up; the modules beside them are above all."""
 
 OUTSIDE = {

@@ -106,8 +106,8 @@ def test_the_report_warns_of_what_the_result_warns_of(tmp_path: Path) -> None:
 def test_poses_of_sensors_are_compared_with_the_readings_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[Any] = []
 
-    def turned(maps: Any, extrinsics: Any) -> list[str]:
-        asked.append(extrinsics)
+    def turned(maps: Any, source: Any) -> list[str]:
+        asked.append(source['extrinsics'])
         return ['sensors are turned']
 
     monkeypatch.setattr(library, 'data_warnings', turned)
@@ -214,3 +214,34 @@ def test_importing_the_package_imports_no_kernel() -> None:
     assert subprocess.run([sys.executable, '-c', code], check=False).returncode == 0
     with pytest.raises(AttributeError, match='make_map'):
         forward_grid_mapper.make_map  # noqa: B018
+
+
+def test_what_an_inclined_sensor_measures_is_that_of_a_level_one_in_the_plane() -> None:
+    """The ranges along the inclined axis, and the cone whose shadow is the level one's."""
+    arrays, pitch = given(), 0.5
+    level = make_maps(**arrays)
+    along = 1.0 / math.cos(pitch)
+    inclined = {
+        name: Sonar(
+            *(s.x, s.y, s.yaw),
+            2.0 * math.asin(math.sin(s.field_of_view / 2) * math.cos(pitch)),
+            *(s.max_range * along, s.min_range * along, pitch),
+        )
+        for name, s in arrays['sensors'].items()
+    }
+    found = make_maps(**{**arrays, 'ranges': [r * along for r in arrays['ranges']], 'sensors': inclined})
+    assert found.maps.readings.z == pytest.approx(level.maps.readings.z)
+    assert found.maps.readings.half_angle == pytest.approx(level.maps.readings.half_angle)
+    assert np.array_equal(found.maps.ml, level.maps.ml)
+
+
+def test_steep_sensors_are_rejected_in_words() -> None:
+    arrays = given()
+    name, sensor = next(iter(arrays['sensors'].items()))
+    steep = Sonar(sensor.x, sensor.y, sensor.yaw, sensor.field_of_view, sensor.max_range, sensor.min_range, -1.5)
+    found = make_maps(**{**arrays, 'sensors': {**arrays['sensors'], name: steep}})
+    assert found.rejected['steep_sensor'] == arrays['sensor_of'].count(name)
+    with pytest.raises(InputError, match=r'steep_sensor \(the sensor looks up or down'):
+        make_maps(**{**arrays, 'sensors': dict.fromkeys(arrays['sensors'], steep)})
+    with pytest.raises(InputError, match=r'did you mean radians\(30\)'):
+        Sonar(0.0, 0.0, 0.0, 0.3, 4.0, pitch=30.0)

@@ -10,6 +10,7 @@ import pytest
 
 from forward_grid_mapper.bags.static_transforms import StaticTransforms
 from forward_grid_mapper.core.common.errors import InputError
+from forward_grid_mapper.core.messages.extrinsics import Mount
 from forward_grid_mapper.core.messages.message_types import Pose2, odometry_message
 from forward_grid_mapper.node.frames import Extrinsics, Transforms
 
@@ -42,8 +43,7 @@ def by_tf(quaternion: XYZW, x: float = 1.0) -> Pose2 | None:
     found = SimpleNamespace(transform=SimpleNamespace(translation=translation, rotation=rotation))
     buffer = SimpleNamespace(lookup_transform=lambda *names: found)
     pose = Extrinsics({}, Transforms(buffer))('base', 'sonar', 0)
-    assert pose is None or isinstance(pose, Pose2)
-    return pose
+    return pose if isinstance(pose, Pose2) else None
 
 
 everywhere = pytest.mark.parametrize('convert', [by_odometry, by_bag, by_tf])
@@ -94,3 +94,11 @@ def test_a_position_that_is_not_finite_is_refused(convert: Convert, x: float) ->
 @everywhere
 def test_a_frame_upside_down_turns_the_other_way(convert: Convert) -> None:
     assert convert((math.cos(0.25), math.sin(0.25), 0.0, 0.0)) == pytest.approx((1.0, 2.0, 0.5))
+
+
+@pytest.mark.parametrize('pitch', [0.0, 0.5, -0.9])
+def test_bag_and_tf_see_the_same_elevation(pitch: float) -> None:
+    found = by_bag(turned(0.5, pitch)), by_tf(turned(0.5, pitch))
+    for mount in found:
+        assert isinstance(mount, Mount)
+        assert mount.elevation == pytest.approx(-pitch)

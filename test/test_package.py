@@ -27,12 +27,14 @@ NAME = 'forward_grid_mapper'
 DEPENDENCIES = {
     'exec_depend': {
         *('diagnostic_msgs', 'geometry_msgs', 'launch', 'launch_ros', 'nav_msgs', 'rclpy'),
-        *('rosgraph_msgs', 'sensor_msgs', 'std_srvs', 'tf2_msgs', 'tf2_ros_py'),
-        *('builtin_interfaces', 'rcl_interfaces', 'rviz2'),
+        *('map_msgs', 'rosgraph_msgs', 'sensor_msgs', 'std_srvs', 'tf2_msgs', 'tf2_ros_py'),
+        *('builtin_interfaces', 'lifecycle_msgs', 'rcl_interfaces', 'rviz2'),
         *('python3-matplotlib', 'python3-numba', 'python3-numpy', 'python3-rosbags-pip', 'python3-scipy'),
         'python3-yaml',
     },
-    'test_depend': {'python3-hypothesis', 'python3-pil', 'python3-pytest', 'python3-pytest-xdist'},
+    'test_depend': {
+        *('python3-argcomplete', 'python3-hypothesis', 'python3-pil', 'python3-pytest', 'python3-pytest-xdist'),
+    },
 }
 """Names of ROS packages, and keys of rosdep for the rest."""
 
@@ -104,6 +106,13 @@ def test_pip_installs_what_rosdep_installs(setup: dict[str, Any]) -> None:
     assert {IMPORTS.get(key, key.removeprefix('python3-')) for key in keys} == by_pip
     for line in extras['ros']:
         assert line.startswith('ros-jazzy-')
+
+
+def test_files_that_are_no_modules_are_installed_too(setup: dict[str, Any]) -> None:
+    package = ROOT / NAME
+    installed = {path for pattern in setup['package_data'][NAME] for path in package.glob(pattern)}
+    others = {path for path in package.rglob('*') if path.is_file() and path.suffix not in ('.py', '.pyc')}
+    assert {path for path in others if '__pycache__' not in path.parts} == installed
 
 
 def test_every_command_can_be_started(setup: dict[str, Any]) -> None:
@@ -198,7 +207,7 @@ def test_rviz_shows_the_three_maps() -> None:
         assert display['Topic']['Durability Policy'] == 'Transient Local'
         assert display['Topic']['Reliability Policy'] == 'Reliable'
     assert {display['Name']: display['Alpha'] for display in maps if display['Enabled'] and display['Alpha'] == 1} == {
-        'ML map': 1
+        'Maximum likelihood map': 1
     }
     assert displays['Odometry path']['Topic']['Value'] == '/odom'
     assert displays['TF']['Enabled']

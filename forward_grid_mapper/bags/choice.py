@@ -6,17 +6,21 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 from ..core.common.errors import BagError
+from .decoder import TF_MESSAGE
+from .poses import BASE_FRAMES, ODOMETRY, POSES
+
+__all__ = ['ODOMETRY', 'RANGE', 'Topics', 'choose_topics']
 
 RANGE = 'sensor_msgs/msg/Range'
-ODOMETRY = 'nav_msgs/msg/Odometry'
 Contents = Mapping[str, tuple[str, int]]
 
 
 class Topics(NamedTuple):
-    """The topics to map from, named as the bag names them."""
+    """The topics to map from, named as the bag names them; `odom_type` is one of `POSES`."""
 
     range_topics: tuple[str, ...]
     odom_topic: str
+    odom_type: str = ODOMETRY
 
 
 def choose_topics(
@@ -24,6 +28,7 @@ def choose_topics(
     range_topics: Sequence[str] | None,
     odom_topic: str | None,
     frames_of: Callable[[str], str],
+    any_poses: bool = False,
 ) -> Topics:
     """Return the named topics, or where none is named those found by type.
 
@@ -35,6 +40,9 @@ def choose_topics(
         The user's choice; a leading slash makes no difference.
     frames_of : callable
         Describes the frames of an odometry topic, for the user to choose by.
+    any_poses : bool
+        Whether other messages with poses of the robot will do, `POSES`: stamped poses where there is no Odometry, and
+        transforms where their topic is named.
 
     Raises
     ------
@@ -43,40 +51,54 @@ def choose_topics(
     """
     ranges = _of_type(contents, RANGE)
     if range_topics is not None:
-        ranges = list(dict.fromkeys(_named(contents, topic, RANGE, '--range-topics') for topic in range_topics))
+        ranges = list(dict.fromkeys(_named(contents, topic, (RANGE,), '--range-topics') for topic in range_topics))
     if not ranges:
         raise BagError(f'The bag has no sensor_msgs/Range messages to map from. {_listing(contents)}')
+    kinds = tuple(POSES) if any_poses else (ODOMETRY,)
     if odom_topic is not None:
-        return Topics(tuple(ranges), _named(contents, odom_topic, ODOMETRY, '--odom-topic'))
-    odometry = _of_type(contents, ODOMETRY)
-    if not odometry:
+        topic = _named(contents, odom_topic, kinds, '--odom-topic')
+        return Topics(tuple(ranges), topic, contents[topic][0])
+    # stamped poses only where there is no odometry, since they may be goals; transforms only if asked for
+    found = _of_type(contents, ODOMETRY) or [
+        t for kind in kinds if kind != TF_MESSAGE for t in _of_type(contents, kind)
+    ]
+    if not found:
         raise BagError(
-            f'The bag has no nav_msgs/Odometry messages, which give the poses of the robot. {_listing(contents)}'
+            f'The bag has no nav_msgs/Odometry messages, which give the poses of the robot.{_moving(contents, kinds)} '
+            f'{_listing(contents)}'
         )
-    if len(odometry) > 1:
-        lines = (f'\n  {topic}: {contents[topic][1]} messages, {frames_of(topic)}' for topic in odometry)
+    if len(found) > 1:
+        lines = (f'\n  {topic}: {contents[topic][1]} messages, {frames_of(topic)}' for topic in found)
         raise BagError('The bag has several odometry topics; choose one with `--odom-topic`:' + ''.join(lines))
-    return Topics(tuple(ranges), odometry[0])
+    return Topics(tuple(ranges), found[0], contents[found[0]][0])
+
+
+def _moving(contents: Contents, kinds: Sequence[str]) -> str:
+    """Return what to do where transforms may have the poses; empty where they have none."""
+    topics = [topic for topic in _of_type(contents, TF_MESSAGE) if not topic.endswith('tf_static')]
+    if not topics or TF_MESSAGE not in kinds:
+        return ''
+    return f' `--odom-topic {topics[0]}` takes those of {BASE_FRAMES[0]} from its transforms.'
 
 
 def _of_type(contents: Contents, msgtype: str) -> list[str]:
     return sorted(topic for topic, (kind, count) in contents.items() if kind == msgtype and count)
 
 
-def _named(contents: Contents, name: str, msgtype: str, option: str) -> str:
+def _named(contents: Contents, name: str, kinds: tuple[str, ...], option: str) -> str:
     topic = next((t for t in contents if t.strip('/') == name.strip('/')), None)
     if topic is None:
         problem = f'The bag has no topic {name!r}'
-    elif contents[topic][0] != msgtype:
-        problem = f'Topic {name!r} has the type {contents[topic][0]}, not {msgtype}'
+    elif contents[topic][0] not in kinds:
+        problem = f'Topic {name!r} has the type {contents[topic][0]}, not {kinds[0]}'
     elif not contents[topic][1]:
         problem = f'Topic {name!r} has no messages in this bag'
     else:
         return topic
-    candidates = ', '.join(_of_type(contents, msgtype))
+    candidates = ', '.join(topic for kind in kinds for topic in _of_type(contents, kind))
     if candidates:
         raise BagError(f'{problem}; `{option}` can be: {candidates}.')
-    raise BagError(f'{problem}, nor any other {msgtype}. {_listing(contents)}')
+    raise BagError(f'{problem}, nor any other {kinds[0]}. {_listing(contents)}')
 
 
 def _listing(contents: Contents) -> str:

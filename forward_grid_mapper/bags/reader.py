@@ -9,17 +9,15 @@ from types import TracebackType
 from typing import Any
 
 from ..core.common.errors import BagError, InputError
-from ..core.messages.message_types import OdometryMessage, RangeMessage, odometry_message, range_message
-from .choice import ODOMETRY, RANGE, Topics, choose_topics
+from ..core.messages.message_types import OdometryMessage, RangeMessage, range_message
+from .choice import RANGE, Topics, choose_topics
 from .decoder import TF_MESSAGE, decoder_of
 from .opening import open_sources, repair_hint
+from .poses import POSES
 from .source import Channel, Source, one_line
 from .static_transforms import StaticTransforms
 
-_CONVERSIONS: dict[str, Callable[[Any], RangeMessage | OdometryMessage]] = {
-    RANGE: range_message,
-    ODOMETRY: odometry_message,
-}
+_CONVERSIONS: dict[str, Callable[[Any], RangeMessage | OdometryMessage | None]] = {RANGE: range_message, **POSES}
 _PROGRESS_STEP = 1000
 
 
@@ -83,15 +81,19 @@ class Bag:
             counts[channel.topic] += channel.total
         return {topic: (' | '.join(sorted(types[topic])), counts[topic]) for topic in sorted(types)}
 
-    def choose_topics(self, range_topics: Sequence[str] | None = None, odom_topic: str | None = None) -> Topics:
+    def choose_topics(
+        self, range_topics: Sequence[str] | None = None, odom_topic: str | None = None, any_poses: bool = False
+    ) -> Topics:
         """Return the topics to map from: those named, else all Range topics and the only Odometry topic.
+
+        With `any_poses` the only topic of stamped poses does where there is no Odometry.
 
         Raises
         ------
         BagError
             If a named topic is not there, or there is none, or several Odometry topics and none named.
         """
-        return choose_topics(self.topics(), range_topics, odom_topic, self._frames_of)
+        return choose_topics(self.topics(), range_topics, odom_topic, self._frames_of, any_poses)
 
     def messages(
         self, topics: Topics, progress: Callable[[int, int], None] | None = None
@@ -124,7 +126,8 @@ class Bag:
                     self._count_undecodable(channel)
                     continue
                 decoded += 1
-                yield converted
+                if converted is not None:
+                    yield converted
         if not decoded and self.truncated:
             raise BagError(
                 f'{self.path} is damaged or cut off ({self._reasons()}) and nothing of the chosen topics can be read; '
@@ -161,7 +164,7 @@ class Bag:
 
     def _begin(self, topics: Topics) -> set[tuple[str, str]]:
         """Return the (topic, type) pairs of the topics, whose undecodable messages are counted anew."""
-        wanted = {(topic, RANGE) for topic in topics.range_topics} | {(topics.odom_topic, ODOMETRY)}
+        wanted = {(topic, RANGE) for topic in topics.range_topics} | {(topics.odom_topic, topics.odom_type)}
         for topic, _ in wanted:
             self.undecodable.pop(topic, None)
         return wanted
@@ -197,9 +200,8 @@ class Bag:
         self.undecodable[channel.topic] = self.undecodable.get(channel.topic, 0) + 1
 
     def _frames_of(self, topic: str) -> str:
-        for _, message in self._decoded({(topic, ODOMETRY)}):
-            if message is not None:
-                odometry = odometry_message(message)
+        for channel, message in self._decoded({(topic, kind) for kind in POSES}):
+            if message is not None and (odometry := POSES[channel.msgtype](message)) is not None:
                 return f'{odometry.frame_id or "?"} → {odometry.child_frame_id or "?"}'
         return 'none of them readable'
 

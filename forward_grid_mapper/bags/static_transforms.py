@@ -9,10 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.common.errors import InputError
-from ..core.messages.message_types import Pose2
-from ..core.messages.quaternions import STEEPEST, elevation_of, heading_of, rotation_of
+from ..core.messages.extrinsics import Mount, mount_of
+from ..core.messages.quaternions import STEEPEST, rotation_of
 
 Transform = NDArray[np.float64]  # homogeneous, shape (4, 4)
+
+
+class SteepSensorError(InputError):
+    """A sensor looks so steeply up or down that it says nothing of the plane."""
 
 
 class StaticTransforms:
@@ -61,18 +65,20 @@ class StaticTransforms:
         self._parents[child] = parent, transform
         self.rejected.pop(child, None)
 
-    def lookup(self, base_frame: str, sensor_frame: str) -> Pose2 | None:
+    def lookup(self, base_frame: str, sensor_frame: str) -> Mount | None:
         """Return the pose of the sensor on the robot, projected on the base frame's plane.
 
         Returns
         -------
-        Pose2 or None
+        Mount or None
             `yaw` is the direction of the sensor's x axis. None if the frames are not joined.
 
         Raises
         ------
+        SteepSensorError
+            If the sensor looks more than 60° up or down.
         InputError
-            If the sensor looks more than 60° up or down, or the frames are not joined because of a bad transform.
+            If the frames are not joined because of a bad transform.
         """
         base_frame, sensor_frame = _plain(base_frame), _plain(sensor_frame)
         to_base, to_sensor = self._ancestors(base_frame), self._ancestors(sensor_frame)
@@ -83,15 +89,14 @@ class StaticTransforms:
                     raise InputError(self.rejected[frame])
             return None
         pose = np.linalg.inv(to_base[common]) @ to_sensor[common]
-        forward = [float(v) for v in pose[:3, 0]]
-        yaw = heading_of(*forward)
-        if yaw is None:
-            side = 'up' if elevation_of(*forward) > 0 else 'down'
-            raise InputError(
+        mount = mount_of(float(pose[0, 3]), float(pose[1, 3]), pose[:3, 0].tolist())
+        if isinstance(mount, str):
+            side = 'up' if pose[2, 0] > 0 else 'down'
+            raise SteepSensorError(
                 f'Sensor {sensor_frame!r} looks {side}, more than {math.degrees(STEEPEST):.0f}° out of the plane of '
                 f'{base_frame!r}; leave its topic out or fix its transform (the beam goes along x).'
             )
-        return Pose2(float(pose[0, 3]), float(pose[1, 3]), yaw)
+        return mount
 
     def _ancestors(self, frame: str) -> dict[str, Transform]:
         """Return the frame itself and all above it, nearest first, with the pose of `frame` in each."""

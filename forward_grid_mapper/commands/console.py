@@ -73,7 +73,11 @@ def _still_printing() -> bool:
 class Ticker:
     """Shows on stderr what goes on, in one line that is rewritten; silent for the first second.
 
-    Used as a context manager. A thread keeps the clock running, since a stage may compile kernels without reporting.
+    Used as a context manager. A thread keeps the clock running, since a stage may compile kernels without reporting. If
+    it is quiet, it says only that kernels are compiled, once.
+
+    tqdm does not do this: its bars count towards a total, which a search does not have, they stand still while nothing
+    is reported, and in a pipe they write a carriage return where a log wants a line.
     """
 
     def __init__(self, quiet: bool = False, stream: TextIO | None = None) -> None:
@@ -88,22 +92,22 @@ class Ticker:
 
     def __enter__(self) -> Ticker:
         self._begin = time.monotonic()
-        if not self._quiet:
-            self._thread.start()
+        self._thread.start()
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._done.set()
-        if not self._quiet:
-            self._thread.join()
+        self._thread.join()
         if self._shown and self._stream.isatty():
             print('\r\033[K', end='', file=self._stream, flush=True)
 
     def say(self, text: str) -> None:
         """Set what is going on."""
-        self._text, self._compiles = text, False
+        self._text = text
+        if not self._quiet:
+            self._compiles = False
 
     def reading(self, done: int, total: int) -> None:
         """Report messages read, for `Bag.messages`."""
@@ -126,6 +130,9 @@ class Ticker:
         on_screen = self._stream.isatty()
         while not self._done.wait(0.2 if on_screen else 1.0):
             seconds = time.monotonic() - self._begin
+            if self._quiet:
+                self._tell_of_compiling(seconds)
+                continue
             if seconds < PATIENCE or not self._text:
                 continue
             # what was compiled a moment ago is shown until the next stage, so that the line does not flicker
@@ -139,6 +146,12 @@ class Ticker:
                 # a log file gets a line a change, at most one a second
                 self._shown = text
                 print(f'{seconds:4.0f} s  {text}', file=self._stream, flush=True)
+
+    def _tell_of_compiling(self, seconds: float) -> None:
+        """Say once, in a line that stays, why the first run takes so long."""
+        if seconds >= PATIENCE and not self._compiles and compiling():
+            self._compiles = True
+            print(COMPILES.strip('()'), file=self._stream, flush=True)
 
     def _columns(self) -> int:
         """Return the width of the terminal, which may change."""

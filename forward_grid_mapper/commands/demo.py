@@ -32,6 +32,7 @@ def parser() -> argparse.ArgumentParser:
         COMMAND,
         description="The main job for real: simulates the paper's drive past an open door into a bag, starts the node, "
         'replays the bag to it over DDS, runs EM, saves the maps, and scores them against the truth.',
+        epilog='example: demo --world corridor -o seen',
     )
     made.add_argument('-o', '--output', metavar='DIR', help='new folder (default: demo_output)')
     made.add_argument('--world', choices=('door', 'corridor'), default='door', help='default: door')
@@ -46,16 +47,20 @@ def parser() -> argparse.ArgumentParser:
 def score_all(maps: MapArchive, recording: Recording) -> dict[str, Scores]:
     """Score the three maps against the world of the recording."""
     visible = visible_surface(recording.world, recording.readings, SURFACE_DEPTH)
-    decided = {'live map': threshold(maps.live), 'ML map': maps.ml, 'uncertainty map': threshold(maps.uncertainty)}
+    decided = {
+        'standard map': threshold(maps.live),
+        'maximum likelihood map': maps.ml,
+        'uncertainty map': threshold(maps.uncertainty),
+    }
     return {name: score_map(cells, maps.grid, recording.world, visible) for name, cells in decided.items()}
 
 
 def score_table(scores: dict[str, Scores]) -> str:
     """Return the scores as lines of text."""
-    lines = [f'{"":16s}{"F1":>7s}{"precision":>11s}{"recall":>8s}{"false dots":>12s}   open width of each door, m']
+    lines = [f'{"":24s}{"F1":>7s}{"precision":>11s}{"recall":>8s}{"false dots":>12s}   open width of each door, m']
     for name, s in scores.items():
         doors = ' '.join(f'{width:.1f}' for width in s.door_widths)
-        lines.append(f'{name:16s}{s.f1:7.3f}{s.precision:11.3f}{s.recall:8.3f}{s.false_dots:12d}   {doors}')
+        lines.append(f'{name:24s}{s.f1:7.3f}{s.precision:11.3f}{s.recall:8.3f}{s.false_dots:12d}   {doors}')
     return '\n'.join(lines)
 
 
@@ -125,7 +130,7 @@ def demo(options: argparse.Namespace) -> int:
         left, right, bottom, top = recording.world.grid.extent
         tiles = [
             Tile('truth', recording.world.grid, recording.world.reference),
-            Tile('standard log-odds map', maps.grid, maps.live),
+            Tile('standard map', maps.grid, maps.live),
             Tile('maximum likelihood map', maps.grid, maps.ml),
             Tile('uncertainty map', maps.grid, maps.uncertainty),
         ]

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import argparse
 import math
+import sys
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +19,9 @@ from ..core.maps.cell_evidence import CellEvidence, cell_evidence
 from ..core.messages.message_types import NANOSECONDS
 from ..files.map_archive import MapArchive, read_npz
 from ..files.reading_archive import read_readings
+from ..files.report import json_text
 from .console import run
+from .options import add_json_option
 
 COMMAND = 'explain'
 STATES = {1: 'occupied', 0: 'free', -1: 'not observed'}
@@ -42,8 +46,9 @@ def parser() -> argparse.ArgumentParser:
     made.add_argument('x', type=float, help='in the map frame, metres')
     made.add_argument('y', type=float)
     made.add_argument(
-        '-n', '--readings', type=int, default=SHOWN, metavar='N', help=f'readings to list (default {SHOWN})'
+        '-n', '--readings', type=int, metavar='N', help=f'readings to list (default {SHOWN}; as JSON all of them)'
     )
+    add_json_option(made)
     return made
 
 
@@ -59,8 +64,48 @@ def explain(options: argparse.Namespace) -> int:
             f'y = {bottom:.2f} … {top:.2f} m'
         )
     found = cell_evidence(readings, maps.grid, maps.ml, maps.parameters, normals, (options.x, options.y))
-    print('\n'.join(explanation(maps, readings, found, max(options.readings, 0))))
+    if options.json:
+        print(json_text(explanation_data(maps, readings, found, options.readings)), end='')
+    else:
+        shown = SHOWN if options.readings is None else max(options.readings, 0)
+        print('\n'.join(explanation(maps, readings, found, shown)))
     return 0
+
+
+def explanation_data(
+    maps: MapArchive, readings: Readings, found: CellEvidence, shown: int | None = None
+) -> dict[str, Any]:
+    """Return the explanation for programs: nats, metres, and stamps in nanoseconds."""
+    cell = found.row, found.column
+    state = int(maps.ml[cell])
+    x, y = maps.grid.centers()
+    rows = [
+        {
+            'nats': found.nats[k],
+            'range': readings.z[i] if readings.echo[i] else None,
+            'distance': found.distance[k],
+            'ends_here': found.ends_here[k],
+            'stamp': readings.stamp[i],
+            'sensor': _name(readings, i),
+        }
+        for k, i in enumerate(found.readings[: None if shown is None else max(shown, 0)].tolist())
+    ]
+    return {
+        'row': found.row,
+        'column': found.column,
+        'x': x[found.column],
+        'y': y[found.row],
+        'state': STATES[state],
+        'uncertainty_map': maps.uncertainty[cell],
+        'standard_map': maps.live[cell],
+        'nats_of_readings': found.data,
+        'nats_of_prior': found.prior,
+        'nats_of_wall': found.wall,
+        'traversed': found.traversed,
+        'number_of_readings': len(found.readings),
+        'readings': rows,
+        'what_decides': _what_decides(maps, found, state),
+    }
 
 
 def _on_map(maps: MapArchive, x: float, y: float) -> bool:
@@ -76,7 +121,8 @@ def explanation(maps: MapArchive, readings: Readings, found: CellEvidence, shown
     cell, state = (found.row, found.column), int(maps.ml[found.row, found.column])
     x, y = (values[k] for values, k in zip(maps.grid.centers(), reversed(cell), strict=True))
     yield f'cell at x = {x:.2f} m, y = {y:.2f} m (row {found.row}, column {found.column}): {STATES[state]}'
-    yield f'  obstacle: {_percent(maps.uncertainty[cell])} (uncertainty map), {_percent(maps.live[cell])} (live map)'
+    uncertainty, standard = _percent(maps.uncertainty[cell]), _percent(maps.live[cell])
+    yield f'  obstacle: {uncertainty} (uncertainty map), {standard} (standard map)'
     count = len(found.readings)
     yield f'  {_nats(found.data)} nats from {count} readings, {_nats(found.prior)} from the prior of walls'
     groups = (
@@ -155,4 +201,14 @@ def _what_decides(maps: MapArchive, found: CellEvidence, state: int) -> str:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; return its exit code."""
-    return run(parser(), explain, arguments)
+    given = sys.argv[1:] if arguments is None else arguments
+    return run(parser(), explain, [_positional(word) for word in given])
+
+
+def _positional(word: str) -> str:
+    """Return a word so that argparse takes negative numbers such as -1e-1 for numbers, not for options."""
+    try:
+        float(word)
+    except ValueError:
+        return word
+    return f' {word}' if word.startswith('-') else word

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import math
 import os
 import sys
 from collections.abc import Sequence
@@ -11,16 +12,25 @@ from pathlib import Path
 
 from ..core.common.errors import OutputError, ParameterError
 from ..core.common.shell import command_line
+from ..core.foresight import only_if_foreseen
 from ..core.joint_learning import learn_jointly
-from ..core.learning.consistency import consistency_warnings
-from ..core.learning.input_warnings import input_warnings
 from ..core.learning.sensor_health import health_warning, sensor_health
-from ..files.learned_text import learned_text, parameter_file_text, write_new_file
+from ..files.learned_text import learned_data, learned_text, parameter_file_text, write_new_file
 from ..files.output_folder import readable
 from ..files.parameter_file import load_parameters, parse_sensor
-from ..recordings.read_drive import read_drive
+from ..files.quality_warning import reading_warnings
+from ..files.report import json_text
+from ..recordings.drives import read_drives
 from .console import Ticker, run
-from .options import BagParser, add_bag_options, add_mapping_options, chosen_parameters
+from .options import (
+    BagParser,
+    add_bag_options,
+    add_json_option,
+    add_mapping_options,
+    add_part_options,
+    chosen_parameters,
+    chosen_part,
+)
 
 COMMAND = 'learn'
 
@@ -29,22 +39,27 @@ def parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
     made = BagParser(
         COMMAND,
-        description='Learn p_hit, p_rand, p_lost and sigma from a recorded drive, in turn with the map: prints each '
+        description='Learn p_hit, p_rand, p_lost and sigma from recorded drives, in turn with the map: prints each '
         'value with its standard error, and warns of values that lose smooth walls or rest on few readings. Look at '
         'the maps of process_bag before you drive by them.',
+        epilog='example: learn MY_BAG -o learned.yaml',
     )
-    made.add_bag('ROS 2 bag folder, single .mcap or .db3 file, or ROS 1 .bag')
+    made.add_bags('one or more: ROS 2 bag folder, single .mcap or .db3 file, ROS 1 .bag, journal, or folder of bags')
     made.add_argument(
         '-o', '--output', metavar='FILE', help='new parameter YAML, for process_bag --params and for the node'
     )
     add_bag_options(made)
+    add_part_options(made)
     made.add_argument(
         '--rounds', type=int, default=5, metavar='N', help='at most so many rounds of map and updates (default 5)'
     )
     made.add_argument(
-        '--keep-going', action='store_true', help='hand out values although their map has lost walls of the first one'
+        '--keep-going',
+        action='store_true',
+        help='hand out values although their map has lost walls or held-out readings speak against it',
     )
     made.add_argument('-q', '--quiet', action='store_true', help='print nothing but warnings and errors')
+    add_json_option(made)
     add_mapping_options(made)
     return made
 
@@ -62,37 +77,54 @@ def learn(options: argparse.Namespace) -> int:
             raise OutputError(f'{output} exists; choose another file with --output, or remove it first')
         if not output.parent.is_dir():
             raise OutputError(f'{output.parent} is no folder; make it first, or choose another with --output')
-    bag = Path(options.bag)
+    part = chosen_part(options)
     with Ticker(options.quiet) as ticker:
-        drive = read_drive(bag, parameters, extrinsics, options.range_topics, options.odom_topic, ticker.reading)
-        found = learn_jointly(drive.associator.readings, parameters, options.rounds, options.keep_going, ticker.mapping)
+        drives = read_drives(
+            options.bags,
+            parameters,
+            extrinsics,
+            options.range_topics,
+            options.odom_topic,
+            part,
+            ticker.reading,
+            ticker.say,
+        )
+        found = learn_jointly(drives.readings, parameters, options.rounds, options.keep_going, ticker.mapping)
+        if not options.keep_going:
+            found = only_if_foreseen(found, drives.readings, parameters, options.rounds, ticker.mapping)
         suspects = health_warning(sensor_health(found.maps))
     warnings_ = (
-        *drive.source['warnings'],
+        *drives.source['warnings'],
         *ignored,
-        *input_warnings(found.maps.readings),
-        *consistency_warnings(found.maps.readings, drive.source.get('extrinsics') or {}, parameters),
+        *reading_warnings(found.maps.readings, drives.source, parameters),
         *found.warnings,
         *filter(None, [suspects]),
     )
     found = dataclasses.replace(found, warnings=warnings_)
-    if options.quiet:
+    if options.json:
+        print(json_text({'file': output and readable(output), **learned_data(found)}), end='')
+    elif options.quiet:
         for warning in warnings_:
             print(f'{COMMAND}: warning: {warning}', file=sys.stderr)
     else:
         print(learned_text(found), end='')
     if output is not None:
         ros = load_parameters(options.params).node if options.params else {}
-        write_new_file(output, parameter_file_text(found, extrinsics, ros, readable(bag)))
-        if not options.quiet:
+        bags = ', '.join(readable(Path(word)) for word in options.bags)
+        write_new_file(output, parameter_file_text(found, extrinsics, ros, bags))
+        if not options.quiet and not options.json:
             print(f'\nthe parameters are in {output}; compare the maps with and without them:')
-            print(f'  {_mapping(options, bag, output)}')
+            print(f'  {_mapping(options, output)}')
     return 0
 
 
-def _mapping(options: argparse.Namespace, bag: Path, parameters: Path) -> str:
+def _mapping(options: argparse.Namespace, parameters: Path) -> str:
     """Return the command that maps the same readings with the learned parameters."""
-    words: list[Path | str] = [bag, '--params', parameters]
+    words: list[Path | str] = [*map(Path, options.bags), '--params', parameters]
+    if options.start:
+        words += ['--start', f'{options.start!r}']
+    if math.isfinite(options.duration):
+        words += ['--duration', f'{options.duration!r}']
     if options.odom_topic:
         words += ['--odom-topic', options.odom_topic]
     if options.range_topics:

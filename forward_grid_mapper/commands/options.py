@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 import os
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
@@ -14,6 +15,14 @@ from ..core.messages.message_types import Pose2
 from ..files.output_folder import readable
 from ..files.parameter_file import load_parameters, parse_setting
 from ..files.parameter_text import dump_parameters
+from ..recordings.drive import Part
+
+
+def add_json_option(parser: argparse.ArgumentParser) -> None:
+    """Add `--json`."""
+    parser.add_argument(
+        '--json', action='store_true', help='print the result as JSON, and nothing else on standard output'
+    )
 
 
 class BagParser(argparse.ArgumentParser):
@@ -23,25 +32,34 @@ class BagParser(argparse.ArgumentParser):
     """
 
     _several: tuple[str, ...] = ('range_topics', 'remap')
+    _takes_bags = False
 
     def add_bag(self, help: str) -> None:
         """Add the argument `bag`."""
         # required all the same, see below
         self.add_argument('bag', help=help).required = False
 
+    def add_bags(self, help: str) -> None:
+        """Add the argument `bags`, of which there is at least one; they may stand on both sides of options."""
+        self.add_argument('bags', nargs='*', metavar='bag', help=help)
+        self.usage = f'{self.prog} bag [bag ...] [options]'
+        self._takes_bags = True
+
     def parse_args(  # type: ignore[override]
         self, args: Sequence[str] | None = None, namespace: argparse.Namespace | None = None
     ) -> argparse.Namespace:
         """Return the options; leaves with a usage message if they are wrong."""
-        options: argparse.Namespace = super().parse_args(args, namespace)
-        for name in self._several:
-            words = getattr(options, name, None)
-            # what names a file and does not name a topic's new name can only be the bag
-            if options.bag is None and words and ':=' not in words[-1] and os.path.lexists(words[-1]):
-                options.bag = words.pop()
-                if not words:
-                    self.error(f'argument --{name.replace("_", "-")}: expected one word or more before the bag')
-        if options.bag is None:
+        options: argparse.Namespace
+        if self._takes_bags:
+            options = super().parse_intermixed_args(args, namespace)
+        else:
+            options = super().parse_args(args, namespace)
+        found = [] if getattr(options, 'bags', None) or getattr(options, 'bag', None) else self._behind_options(options)
+        if found and self._takes_bags:
+            options.bags = found
+        elif found:
+            options.bag = found[-1]
+        if not (options.bags if self._takes_bags else options.bag):
             taken = next((name for name in self._several if getattr(options, name, None)), None)
             hint = ''
             if taken is not None:
@@ -50,12 +68,32 @@ class BagParser(argparse.ArgumentParser):
             self.error(f'no bag is given, or it does not exist{hint}')
         if getattr(options, 'range_topics', None) is not None:
             # a comma cannot be part of a topic's name
-            options.range_topics = [t for word in options.range_topics for t in word.split(',') if t]
+            options.range_topics = [t for word in options.range_topics for t in word.split(',') if t.strip()]
+            if not options.range_topics:
+                self.error('argument --range-topics: the name of a topic is expected, not an empty one')
         return options
 
+    def _behind_options(self, options: argparse.Namespace) -> list[str]:
+        """Return what the last words of an option that takes several can only be: bags, of which one may be meant."""
+        for name in self._several:
+            words: list[str] | None = getattr(options, name, None)
+            found: list[str] = []
+            # what names a file and does not name a topic's new name can only be a bag
+            while words and ':=' not in words[-1] and os.path.lexists(words[-1]):
+                found.insert(0, words.pop())
+                if not self._takes_bags:
+                    break
+            if found and not words:
+                self.error(f'argument --{name.replace("_", "-")}: expected one word or more before the bag')
+            if found:
+                return found
+        return []
 
-def add_topic_options(parser: argparse.ArgumentParser) -> None:
-    """Add `--range-topics` and `--odom-topic`."""
+
+def add_topic_options(
+    parser: argparse.ArgumentParser, odometry: str = 'Odometry topic (needed if the bag has several)'
+) -> None:
+    """Add `--range-topics` and `--odom-topic`, with this help."""
     parser.add_argument(
         '--range-topics',
         nargs='+',
@@ -63,12 +101,16 @@ def add_topic_options(parser: argparse.ArgumentParser) -> None:
         metavar='TOPIC',
         help='Range topics, parted by spaces or commas; may be repeated (default: all in the bag)',
     )
-    parser.add_argument('--odom-topic', metavar='TOPIC', help='Odometry topic (needed if the bag has several)')
+    parser.add_argument('--odom-topic', metavar='TOPIC', help=odometry)
 
 
 def add_bag_options(parser: argparse.ArgumentParser) -> None:
     """Add `--range-topics`, `--odom-topic` and `--sensor`."""
-    add_topic_options(parser)
+    add_topic_options(
+        parser,
+        'topic with the poses of the robot: Odometry, PoseStamped, PoseWithCovarianceStamped, or /tf for those of '
+        'base_link (needed if the bag has several)',
+    )
     parser.add_argument(
         '--sensor',
         action='append',
@@ -76,6 +118,35 @@ def add_bag_options(parser: argparse.ArgumentParser) -> None:
         metavar='FRAME=X,Y,YAW',
         help='pose of a sensor on the robot in metres and radians (or 90deg); wins over /tf_static; may be repeated',
     )
+
+
+def add_part_options(parser: argparse.ArgumentParser) -> None:
+    """Add `--start` and `--duration`."""
+    parser.add_argument(
+        '--start',
+        type=float,
+        default=0.0,
+        metavar='S',
+        help='map what was measured from so many seconds after the first message of each drive (default 0)',
+    )
+    parser.add_argument(
+        '--duration', type=float, default=math.inf, metavar='S', help='map so many seconds of each drive (default: all)'
+    )
+
+
+def chosen_part(options: argparse.Namespace) -> Part:
+    """Return which part of the drives `--start` and `--duration` choose.
+
+    Raises
+    ------
+    ParameterError
+        If one of them is no number of seconds that can be.
+    """
+    if not (math.isfinite(options.start) and options.start >= 0):
+        raise ParameterError(f'--start {options.start:g}: give seconds from the beginning, 0 or more')
+    if not options.duration > 0:
+        raise ParameterError(f'--duration {options.duration:g}: give seconds above 0')
+    return Part(options.start, options.duration)
 
 
 def add_mapping_options(parser: argparse.ArgumentParser) -> None:
@@ -120,6 +191,7 @@ INSTEAD = {
     'range_topics': 'give --range-topics',
     'odom_topic': 'give --odom-topic',
     'map_frame': "the maps are in odometry's frame",
+    'refine_poses': 'give --refine-poses',
     'save_directory': 'give --output',
 }
 """What to do offline in place of a parameter of the node."""

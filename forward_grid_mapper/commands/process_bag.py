@@ -1,29 +1,42 @@
-"""`process_bag`: from a recorded drive to three maps, a picture and a report."""
+"""`process_bag`: from one recorded drive or several to three maps, a picture and a report."""
 
 from __future__ import annotations
 
 import argparse
+import math
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
+from typing import Any
 
-from ..core.common.errors import ParameterError
+from ..core.common.errors import InputError, ParameterError
 from ..core.common.parameters import Parameters
 from ..core.joint_learning import map_and_learn
+from ..core.mapping import Mapper
 from ..core.maps.map_set import MapSet
+from ..core.tiled_mapping import TiledMapper
 from ..core.trajectory.refinement import Refinement, Refiner
 from ..core.trajectory.windows import Odometry
 from ..files.map_files import occupancy_values
 from ..files.output_folder import free_name, output_folder, readable
 from ..files.parameter_file import parse_sensor
-from ..files.report_text import report_text
+from ..files.report import json_text, report_text
 from ..files.results import write_results
 from ..files.trajectory_text import trajectory_data, tum_text
-from ..recordings.drive import Drive
-from ..recordings.read_drive import read_drive
+from ..recordings.drives import Drives, read_drives
 from .console import Ticker, run
-from .options import BagParser, add_bag_options, add_mapping_options, chosen_parameters
+from .desktop import show
+from .options import (
+    BagParser,
+    add_bag_options,
+    add_json_option,
+    add_mapping_options,
+    add_part_options,
+    chosen_parameters,
+    chosen_part,
+)
 
 COMMAND = 'process_bag'
 
@@ -32,12 +45,18 @@ def parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
     made = BagParser(
         COMMAND,
-        description='Map a recorded drive: reads sonar Range and Odometry from a ROS 1 or ROS 2 bag and writes the '
-        'live log-odds map, the maximum likelihood map and the uncertainty map.',
+        description='Map recorded drives: reads sonar Range and Odometry from ROS 1 or ROS 2 bags and writes the '
+        'standard map, the maximum likelihood map and the uncertainty map. Several drives make one map; their poses '
+        'must be in one map frame.',
+        epilog='example: process_bag MY_BAG --sensor sonar_left=0.1,0.15,90deg -o maps --show',
     )
-    made.add_bag('ROS 2 bag folder, single .mcap or .db3 file, ROS 1 .bag, or a journal of the node')
+    made.add_bags(
+        'ROS 2 bag folder, single .mcap or .db3 file, ROS 1 .bag, journal of the node, folder of bags, or a pattern '
+        "such as 'monday_*'"
+    )
     made.add_argument('-o', '--output', metavar='DIR', help='new folder for the results (default: BAG_maps)')
     add_bag_options(made)
+    add_part_options(made)
     made.add_argument(
         '--learn',
         type=int,
@@ -51,8 +70,17 @@ def parser() -> argparse.ArgumentParser:
         help="take the drift out of wheel odometry: find the trajectory together with the map; kept as odometry's "
         'where readings that were held out do not speak for it',
     )
+    made.add_argument(
+        '--tiles',
+        type=float,
+        metavar='M',
+        help='map in tiles of that edge in metres, one after the other, which takes less memory; 20 or more for sonars '
+        'that reach 5 m',
+    )
     made.add_argument('--bag', dest='write_bag', action='store_true', help='also write the maps as a bag (mcap)')
     made.add_argument('-q', '--quiet', action='store_true', help='print nothing but errors and the folder')
+    add_json_option(made)
+    made.add_argument('--show', action='store_true', help="open the report with the desktop's browser")
     add_mapping_options(made)
     return made
 
@@ -63,58 +91,94 @@ def process(options: argparse.Namespace) -> int:
     extrinsics |= dict(parse_sensor(text) for text in options.sensor)
     if options.learn < 0:
         raise ParameterError('--learn: the number of rounds must not be negative')
-    bag = Path(options.bag)
-    output = Path(options.output) if options.output else free_name(Path.cwd(), f'{bag.resolve().stem}_maps')
+    part = chosen_part(options)
+    if options.tiles is not None and not (math.isfinite(options.tiles) and options.tiles > 0):
+        raise ParameterError(f'--tiles {options.tiles:g}: give the edge of a tile in metres, above 0')
+    mapper = Mapper if options.tiles is None else partial(TiledMapper, size=options.tiles)
+    output = Path(options.output) if options.output else free_name(Path.cwd(), f'{_stem(options.bags)}_maps')
     begin = time.perf_counter()
     # the folder first: if it cannot be written, that should be known before the work
     with Ticker(options.quiet) as ticker, output_folder(output) as folder:
-        drive = read_drive(
-            bag,
+        drives = read_drives(
+            options.bags,
             parameters,
             extrinsics,
             options.range_topics,
             options.odom_topic,
+            part,
             ticker.reading,
+            ticker.say,
         )
-        drive.source['warnings'] += ignored
+        source = drives.source
+        source['warnings'] += ignored
         read = time.perf_counter() - begin
-        refined = refine(drive, parameters, ticker) if options.refine_poses else None
-        seconds = {'reading the bag': read}
+        refined = refine(drives, parameters, ticker) if options.refine_poses else None
+        seconds = {'reading the bag' if len(drives.drives) == 1 else 'reading the bags': read}
         if refined is not None:
             seconds['trajectory'] = time.perf_counter() - begin - read
         moved = refined is not None and refined.accepted
-        readings = refined.readings if refined is not None else drive.associator.readings
-        maps = map_and_learn(readings, parameters, options.learn, ticker.mapping)
+        readings = refined.readings if refined is not None else drives.readings
+        maps = map_and_learn(readings, parameters, options.learn, ticker.mapping, mapper)
         if not moved:
-            maps = drive.live.on(maps)
+            maps = drives.with_live(maps)
         maps.statistics['seconds'] = {**seconds, **maps.statistics['seconds']}
         ticker.say('writing')
         if options.learn:
-            drive.source['warnings'].append(_learned(maps))
+            source['warnings'].append(_learned(maps))
         if not maps.statistics['converged']:
-            drive.source['warnings'].append(
-                'the search ended at max_iterations before it converged; raise max_iterations'
-            )
-        title = readable(Path(*bag.resolve().parts[-2:]))
-        path, extras, before = drive.path_xy, {}, None
+            source['warnings'].append('the search ended at max_iterations before it converged; raise max_iterations')
+        path, extras, before = drives.path_xy, {}, None
         if refined is not None and moved:
-            path, before = refined.trajectory.pose[:, :2], drive.path_xy
-            odometry = Odometry.of(*drive.associator.odometry)
+            path, before = refined.trajectory.pose[:, :2], drives.path_xy
+            odometry = Odometry.of(*drives.drives[0].associator.odometry)
             extras = {'trajectory.tum': tum_text(refined.trajectory), 'odometry.tum': tum_text(odometry)}
-        report = write_results(folder, maps, drive.source, path, title, extras=extras, odometry_xy=before)
+        report = write_results(folder, maps, source, path, _title(drives), extras=extras, odometry_xy=before)
         if options.write_bag:
-            _write_bag(folder / 'maps.mcap_bag', maps, drive)
+            _write_bag(folder / 'maps.mcap_bag', maps, drives)
+    tell(options, report, output)
+    if options.show:
+        show(output / 'report.html')
+    return 0
+
+
+def tell(options: argparse.Namespace, report: Mapping[str, Any], output: Path) -> None:
+    """Print what came out, as the options want it."""
+    if options.json:
+        print(json_text({'folder': readable(output), **report}), end='')
+        return
     if not options.quiet:
-        print(report_text(report), end='')
+        print(report_text(dict(report)), end='')
     else:
         for warning in report['warnings']:
             print(f'{COMMAND}: warning: {warning}', file=sys.stderr)
     print(f'maps are in {output}')
-    return 0
 
 
-def refine(drive: Drive, parameters: Parameters, ticker: Ticker) -> Refinement:
-    """Return what becomes of the drive's trajectory, and note it in the drive's report."""
+def _stem(words: Sequence[str]) -> str:
+    """Return what the results of these bags are called."""
+    first = Path(words[0]).resolve().stem.replace('*', '').replace('?', '') or 'bags'
+    return first if len(words) == 1 else f'{first}_and_{len(words) - 1}_more'
+
+
+def _title(drives: Drives) -> str:
+    first = readable(Path(*Path(drives.drives[0].source['bag']).resolve().parts[-2:]))
+    return first if len(drives.drives) == 1 else f'{first} and {len(drives.drives) - 1} more'
+
+
+def refine(drives: Drives, parameters: Parameters, ticker: Ticker) -> Refinement:
+    """Return what becomes of the drive's trajectory, and note it in the drive's report.
+
+    Raises
+    ------
+    InputError
+        If there are several drives.
+    """
+    if len(drives.drives) > 1:
+        raise InputError(
+            f'--refine-poses takes one drive, and there are {len(drives.drives)}: trajectories that are found one by '
+            f'one do not fit each other, since nothing ties one drive to the next. Localise them in one map first'
+        )
+    drive = drives.drives[0]
     odometry = Odometry.of(*drive.associator.odometry)
     refined = Refiner(parameters).run(drive.associator.readings, odometry, ticker.refining)
     drive.source['trajectory'] = trajectory_data(refined)
@@ -130,12 +194,12 @@ def _learned(maps: MapSet) -> str:
     )
 
 
-def _write_bag(path: Path, maps: MapSet, drive: Drive) -> None:
+def _write_bag(path: Path, maps: MapSet, drives: Drives) -> None:
     from ..bags.writer import BagWriter
 
-    stamp = drive.source['stamps'][1]
+    stamp = drives.source['stamps'][1]
     # ROS 1 frames may begin with a slash, which tf2 refuses
-    frame = drive.associator.map_frame.lstrip('/')
+    frame = drives.map_frame.lstrip('/')
     with BagWriter(path, 'mcap') as writer:
         for name, values in (('live_map', maps.live), ('ml_map', maps.ml), ('uncertainty_map', maps.uncertainty)):
             topic = f'/forward_grid_mapper/{name}'

@@ -6,7 +6,9 @@ This module imports little, since it is to be ready before anything that takes l
 from __future__ import annotations
 
 import os
+import select
 import signal
+import sys
 import threading
 import time
 from types import FrameType, TracebackType
@@ -61,6 +63,17 @@ def leave_at_once(command: str) -> None:
 def leave_silently() -> None:
     """Let a signal end the process without a word: for the interpreter's own end, when all is done and reported."""
     _install(signal.SIG_DFL)
+
+
+def nobody_reads() -> bool:
+    """Return whether standard output is a pipe, or a socket, whose other end is closed."""
+    try:
+        output = sys.stdout.fileno()
+    except (AttributeError, OSError, ValueError):
+        return False
+    poll = select.poll()
+    poll.register(output, 0)
+    return any(event & (select.POLLERR | select.POLLHUP) for _, event in poll.poll(0))
 
 
 class Interruptible:

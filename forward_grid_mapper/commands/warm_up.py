@@ -19,7 +19,7 @@ user who will run the node, or with NUMBA_CACHE_DIR set to a folder that this us
 
 def parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
-    return argparse.ArgumentParser(COMMAND, description=DESCRIPTION)
+    return argparse.ArgumentParser(COMMAND, description=DESCRIPTION, epilog='example: warm_up')
 
 
 def compile_kernels(options: argparse.Namespace) -> int:

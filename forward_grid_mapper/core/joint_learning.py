@@ -12,7 +12,7 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -78,6 +78,23 @@ class Round:
         return sum(stretch.length for stretch in self.lost)
 
 
+class Foresight(NamedTuple):
+    """Mean log-likelihood of a reading held out, nats: of the map of the first values and of that of the learned ones.
+
+    Each is judged at the first values and at the learned ones.
+    """
+
+    first_at_first: float
+    first_at_learned: float
+    learned_at_first: float
+    learned_at_learned: float
+
+    @property
+    def better(self) -> bool:
+        """Whether the map of the learned values is not the worse one, whichever values judge."""
+        return self.learned_at_first >= self.first_at_first and self.learned_at_learned >= self.first_at_learned
+
+
 @dataclass(frozen=True)
 class Learned:
     """What learning found.
@@ -97,6 +114,8 @@ class Learned:
     maps : MapSet
         Of the accepted round.
     warnings : tuple of str
+    foresight : Foresight, optional
+        What readings that were held out say of the values, where they were asked (`foresight`).
     """
 
     parameters: Parameters
@@ -106,6 +125,7 @@ class Learned:
     converged: bool
     maps: MapSet
     warnings: tuple[str, ...]
+    foresight: Foresight | None = None
 
 
 def settle(forward: ForwardModel, occupied: NDArray[Any]) -> ModelParameters:
@@ -119,26 +139,37 @@ def settle(forward: ForwardModel, occupied: NDArray[Any]) -> ModelParameters:
     return dataclasses.replace(model, p_lost=0.0) if model.p_lost < _NO_LOSS else model
 
 
+class Runs(Protocol):
+    """Makes maps of readings: `Mapper`, or `TiledMapper`."""
+
+    def run(self, readings: Readings, watch: Watch) -> MapSet:
+        """Return the maps of readings."""
+
+
 def map_and_learn(
-    readings: Readings, parameters: Parameters, rounds: int, watch: Watch = lambda stage, progress: None
+    readings: Readings,
+    parameters: Parameters,
+    rounds: int,
+    watch: Watch = lambda stage, progress: None,
+    mapper: Callable[[Parameters], Runs] = Mapper,
 ) -> MapSet:
     """Return the maps after so many rounds of one update of the model each, without any check of what comes out.
 
-    The seconds of a stage are those of all rounds together.
+    The seconds of a stage are those of all rounds together. `mapper` makes what makes the maps.
 
     Raises
     ------
     InputError
         If there are no readings, or they span too large a map.
     """
-    maps = Mapper(parameters).run(readings, watch)
+    maps = mapper(parameters).run(readings, watch)
     seconds = dict(maps.statistics['seconds'])
     for _ in range(rounds):
         watch('learning', None)
         begun = time.perf_counter()
         parameters = dataclasses.replace(parameters, model=learn(maps.forward_model(), maps.ml))
         seconds['learning'] = seconds.get('learning', 0.0) + time.perf_counter() - begun
-        maps = Mapper(parameters).run(readings, watch)
+        maps = mapper(parameters).run(readings, watch)
         for stage, more in maps.statistics['seconds'].items():
             seconds[stage] += more
     maps.statistics['seconds'] = seconds

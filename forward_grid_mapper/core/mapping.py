@@ -89,7 +89,7 @@ class Mapper:
         self._stop[0] = 1
 
     def so_far(self) -> tuple[Grid, NDArray[np.int8]] | None:
-        """Return the grid and a copy of the ML map that the search has reached, or None before it; any thread."""
+        """Return the grid and a copy of the map that the search has reached, or None before it; any thread."""
         evidence = self._evidence
         return None if evidence is None else (evidence.grid, evidence.observed())
 
@@ -146,7 +146,7 @@ class Mapper:
         search = Search(evidence, self._parameters.search, given.traversed.ravel())
         return search.run(lambda progress: self._watch('search', progress))
 
-    @_stage('live map')
+    @_stage('standard map')
     def _standard_map(self, given: _Given) -> NDArray[np.float32]:
         live = LogOddsMap(self._parameters)
         live.add(given.readings)

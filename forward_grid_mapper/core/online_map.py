@@ -70,7 +70,7 @@ class _Traversed(NamedTuple):
 
 
 class OnlineMap:
-    """An ML map and its evidence that follow the readings."""
+    """A maximum likelihood map and its evidence that follow the readings."""
 
     def __init__(self, parameters: Parameters) -> None:
         self._parameters = parameters
@@ -283,7 +283,7 @@ class OnlineMap:
             flip_in_order(evidence.state, prior, LEAST, cells[order], gains[order])
 
     def maps(self) -> tuple[Grid, NDArray[np.int8], NDArray[np.float32]]:
-        """Return the grid, the ML map (1 occupied, 0 free, -1 not observed) and the uncertainty map, as in `MapSet`."""
+        """Return the grid, the maximum likelihood map and the uncertainty map, with values as in `MapSet`."""
         if self._evidence is None:
             return self.grid, np.zeros((0, 0), np.int8), np.zeros((0, 0), np.float32)
         evidence, search = self._evidence, self._parameters.search

@@ -1,6 +1,7 @@
 """Compilation of every kernel before the first reading comes, so that nothing has to wait for it.
 
-What is needed first is compiled first: the kernels of the live map, then those of the online map, then those of EM.
+What is needed first is compiled first: the kernels of the live map, then those of the online map, then those of EM,
+and at last those that find a trajectory.
 """
 
 from __future__ import annotations
@@ -18,6 +19,11 @@ from .mapping import Mapper
 from .maps.log_odds_map import LogOddsMap
 from .maps.map_set import MapSet
 from .online_map import OnlineMap
+from .trajectory.holding_out import held_out
+from .trajectory.likelihood import scores
+from .trajectory.scans import Scans
+from .trajectory.walls import wall_votes
+from .trajectory.windows import Odometry, cut
 
 
 def _square_room() -> Readings:
@@ -49,10 +55,28 @@ def warm_up_em() -> MapSet:
     return maps
 
 
+def warm_up_trajectory() -> None:
+    """Compile the kernels that find a trajectory, those of EM apart: on two metres of a corridor without end."""
+    room, steps = _square_room(), 20
+    at, sensor = np.repeat(np.arange(steps), len(room)), np.tile(np.arange(len(room)), steps)
+    readings = dataclasses.replace(
+        room.select(sensor), x=np.asarray(0.1 * at, np.float64), stamp=at * 10**8, sensor=sensor.astype(np.int32)
+    )
+    path = np.zeros((steps, 3))
+    path[:, 0] = 0.1 * np.arange(steps)
+    windows = cut(readings, Odometry.of(np.arange(steps) * 10**8, path))
+    scans = Scans(windows, Parameters(), np.zeros(1, np.uint8), held_out(len(windows)))
+    wall_votes(windows, scans.held_out)
+    around = scans.map(np.arange(len(windows)), windows.node[0], windows.node)
+    assert around is not None
+    scores(scans.scan[0], around, windows.node)
+
+
 STEPS: dict[str, Callable[[], object]] = {
     'live map': warm_up_live_map,
     'online map': warm_up_online_map,
     'EM': warm_up_em,
+    'trajectory': warm_up_trajectory,
 }
 """What there is to compile, in this order."""
 
@@ -61,4 +85,5 @@ def warm_up() -> MapSet:
     """Map a square room in every way, which calls every kernel with the types that real work has."""
     warm_up_live_map()
     warm_up_online_map()
+    warm_up_trajectory()
     return warm_up_em()

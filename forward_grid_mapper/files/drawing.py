@@ -1,9 +1,8 @@
-"""Drawing of a composed picture; the one module that needs matplotlib, imported only when a picture is wanted."""
+"""Drawing of a composed picture; it needs matplotlib, and is imported only when a picture is wanted."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,26 +19,33 @@ from matplotlib.patches import Patch
 from matplotlib.path import Path as Outline
 from matplotlib.ticker import MaxNLocator
 from matplotlib.transforms import Affine2D
+from numpy.typing import NDArray
 
-from .panels import Picture, Tile
+from .panels import Box, Picture, coarse
 
 # Free is white and unknown a cool tint, so that they differ to every eye; in between runs a warm scale, so that an
 # uncertain cell looks like neither. Path, dots and the path by odometry are blue, vermilion and purple of
 # the Okabe-Ito palette.
-_FREE, _OCCUPIED, _UNKNOWN = '#ffffff', '#14171c', '#cfd9e4'
-_PATH, _DOT, _BEFORE = '#0072b2', '#d55e00', '#cc79a7'
-_INK, _FRAME = '#22262b', '#8b96a3'
+_FREE, _OCCUPIED, UNKNOWN = '#ffffff', '#14171c', '#cfd9e4'
+PATH, DOT, _BEFORE = '#0072b2', '#d55e00', '#cc79a7'
+INK, FRAME = '#22262b', '#8b96a3'
 _PROBABILITY = LinearSegmentedColormap.from_list(
     'occupancy', [(0.0, _FREE), (0.2, '#fdf0d2'), (0.5, '#eeb04d'), (0.78, '#8a4a1c'), (1.0, _OCCUPIED)]
 )
 _DART = Outline([(1.0, 0.0), (-0.8, 0.75), (-0.4, 0.0), (-0.8, -0.75), (1.0, 0.0)])
 
-_DPI = 150
+DPI = 150
 # Lengths of the page in inches.
-_EDGE, _HEAD, _FOOT, _LABELS, _CAPTION, _GAP = 0.3, 0.8, 0.8, 0.55, 0.42, 0.3
+EDGE, HEAD, _FOOT, _LABELS, CAPTION, GAP = 0.3, 0.8, 0.8, 0.55, 0.42, 0.3
 # Below this width the legend would run into the scale of probabilities.
 _MIN_WIDTH = 11.3
-_WIDE = 2.6
+# Drives whose start and end are marked.
+_MOST_MARKED = 12
+WIDE = 2.6
+# Pixels of a cell, at least: below that walls of one cell are hardly seen.
+_CELL = 2.5
+# Longest scale bar, as a part of the panel's width.
+_BAR = 0.2
 
 
 def draw(path: Path, picture: Picture) -> None:
@@ -47,27 +53,19 @@ def draw(path: Path, picture: Picture) -> None:
     left, right, bottom, top = picture.view
     aspect = (right - left) / (top - bottom)
     columns, rows, width, height = _layout(len(picture.panels), aspect)
-    page_width = 2 * _EDGE + _LABELS + columns * width + (columns - 1) * _GAP
-    page_height = _HEAD + _FOOT + _LABELS + rows * (height + _CAPTION)
-    figure = Figure(figsize=(page_width, page_height), dpi=_DPI, facecolor='white')
+    page_width = 2 * EDGE + _LABELS + columns * width + (columns - 1) * GAP
+    page_height = HEAD + _FOOT + _LABELS + rows * (height + CAPTION)
+    figure = Figure(figsize=(page_width, page_height), dpi=DPI, facecolor='white')
     FigureCanvasAgg(figure)
     for k, panel in enumerate(picture.panels):
         row, column = divmod(k, columns)
-        x = _EDGE + _LABELS + column * (width + _GAP)
-        y = page_height - _HEAD - (row + 1) * (height + _CAPTION)
+        x = EDGE + _LABELS + column * (width + GAP)
+        y = page_height - HEAD - (row + 1) * (height + CAPTION)
         axes = figure.add_axes((x / page_width, y / page_height, width / page_width, height / page_height))
-        axes.set_facecolor(_UNKNOWN)
+        axes.set_facecolor(UNKNOWN)
         if panel.values.size:
-            axes.imshow(
-                panel.values,
-                cmap=_PROBABILITY,
-                vmin=0.0,
-                vmax=1.0,
-                extent=panel.extent,
-                origin='lower',
-                interpolation='nearest',
-                aspect='auto',
-            )
+            draw_map(axes, panel.values, panel.extent, (right - left) / (width * DPI))
+        draw_scale(axes, picture.view)
         if k == picture.overlay:
             _draw_overlay(axes, picture)
         _frame(axes, panel.title, picture.view, (column == 0, row == rows - 1))
@@ -76,39 +74,51 @@ def draw(path: Path, picture: Picture) -> None:
     figure.savefig(path)
 
 
-def draw_table(path: Path, title: str, rows: Sequence[Sequence[Tile]], view: tuple[float, float, float, float]) -> None:
-    """Write a table of maps, all in the box `view`, to `path`."""
-    aspect = (view[1] - view[0]) / (view[3] - view[2])
-    width = 3.0 if aspect < _WIDE else 13.0
-    height, columns = width / aspect, max(len(row) for row in rows)
-    page = 2 * _EDGE + columns * width + (columns - 1) * _GAP, _EDGE + _HEAD + len(rows) * (height + _CAPTION)
-    figure = Figure(figsize=page, dpi=_DPI, facecolor='white')
-    FigureCanvasAgg(figure)
-    figure.text(_EDGE / page[0], 1 - 0.45 / page[1], title, fontsize=14, fontweight='bold', color=_INK)
-    for r, row in enumerate(rows):
-        for c, tile in enumerate(row):
-            x, y = _EDGE + c * (width + _GAP), page[1] - _HEAD - (r + 1) * (height + _CAPTION) + 0.1
-            axes = figure.add_axes((x / page[0], y / page[1], width / page[0], height / page[1]))
-            axes.set_facecolor(_UNKNOWN)
-            shown = np.where(np.asarray(tile.values) < 0, np.nan, tile.values)
-            axes.imshow(
-                shown, cmap=_PROBABILITY, vmin=0, vmax=1, extent=tile.grid.extent, origin='lower', interpolation='none'
-            )
-            axes.set(xlim=view[:2], ylim=view[2:], xticks=[], yticks=[])
-            axes.set_title(tile.title, loc='left', fontsize=9.5, color=_INK, pad=4)
-            for spine in axes.spines.values():
-                spine.set(color=_FRAME, linewidth=0.7)
-    figure.savefig(path)
+def draw_map(axes: Axes, values: NDArray[Any], extent: Box, pixel: float) -> None:
+    """Draw a map in cells of at least `_CELL` pixels; `pixel` is the length that a pixel stands for, metres."""
+    left, right, bottom, top = extent
+    cell = (right - left) / values.shape[1]
+    step = max(1, math.ceil(_CELL * pixel / cell - 1e-9))
+    if step > 1:
+        values = coarse(values, step)
+        right, top = left + values.shape[1] * step * cell, bottom + values.shape[0] * step * cell
+    box = (left, right, bottom, top)
+    axes.imshow(
+        values, cmap=_PROBABILITY, vmin=0, vmax=1, extent=box, origin='lower', interpolation='nearest', aspect='auto'
+    )
+
+
+def draw_scale(axes: Axes, view: Box) -> None:
+    """Draw a bar of a round length into the lower left corner."""
+    width, height = view[1] - view[0], view[3] - view[2]
+    longest = max(_BAR * width, 1e-3)
+    power = 10.0 ** math.floor(math.log10(longest))
+    length = next(n * power for n in (5, 2, 1) if n * power <= longest)
+    x, y = view[0] + 0.02 * width, view[2] + min(0.05 * height, 0.02 * width)
+    halo = [patheffects.withStroke(linewidth=4.5, foreground='white', alpha=0.9)]
+    axes.plot([x, x + length], [y, y], color=INK, linewidth=2.0, solid_capstyle='butt', path_effects=halo, zorder=6)
+    text = f'{length:g} m' if length >= 1 else f'{100 * length:g} cm'
+    axes.annotate(
+        text,
+        (x + length, y),
+        (4, 0),
+        textcoords='offset points',
+        va='center',
+        fontsize=8,
+        color=INK,
+        path_effects=[patheffects.withStroke(linewidth=2.5, foreground='white', alpha=0.9)],
+        zorder=6,
+    )
 
 
 def _layout(panels: int, aspect: float) -> tuple[int, int, float, float]:
     """Return columns, rows, and a panel's width and height in inches; wide maps are stacked."""
-    if aspect > _WIDE:
+    if aspect > WIDE:
         columns, width = 1, min(12.0, 3.4 * aspect)
     else:
         columns = panels if panels < 4 or aspect < 0.6 else 2
         width = min(4.8 if aspect < 1.5 else 5.6, 8.0 * aspect)
-    width_at_least = (_MIN_WIDTH - 2 * _EDGE - _LABELS - (columns - 1) * _GAP) / columns
+    width_at_least = (_MIN_WIDTH - 2 * EDGE - _LABELS - (columns - 1) * GAP) / columns
     height = min(max(width, width_at_least) / aspect, 8.0)
     return columns, math.ceil(panels / columns), max(width, width_at_least), max(height, 0.6)
 
@@ -118,37 +128,41 @@ def _frame(axes: Axes, title: str, view: tuple[float, float, float, float], oute
     axes.set_xlim(view[0], view[1])
     axes.set_ylim(view[2], view[3])
     axes.set_aspect('equal', adjustable='datalim')
-    axes.set_title(title, loc='left', fontsize=11.5, color=_INK, pad=5)
+    axes.set_title(title, loc='left', fontsize=11.5, color=INK, pad=5)
     span = max(view[1] - view[0], view[3] - view[2])
     for axis, length in ((axes.xaxis, view[1] - view[0]), (axes.yaxis, view[3] - view[2])):
         ticks = 4 + 6 * length / span if span == length else max(2.0, 10 * length / span)
         axis.set_major_locator(MaxNLocator(nbins=int(ticks), steps=[1, 2, 5, 10]))
-    axes.tick_params(labelsize=8.5, color=_FRAME, labelcolor=_INK, length=3, width=0.7)
+    axes.tick_params(labelsize=8.5, color=FRAME, labelcolor=INK, length=3, width=0.7)
     axes.tick_params(labelleft=outer[0], labelbottom=outer[1])
     for spine in axes.spines.values():
-        spine.set(color=_FRAME, linewidth=0.7)
+        spine.set(color=FRAME, linewidth=0.7)
     if outer[0]:
-        axes.set_ylabel('y in m', fontsize=9, color=_INK)
+        axes.set_ylabel('y in m', fontsize=9, color=INK)
     if outer[1]:
-        axes.set_xlabel('x in m', fontsize=9, color=_INK)
+        axes.set_xlabel('x in m', fontsize=9, color=INK)
 
 
 def _draw_overlay(axes: Axes, picture: Picture) -> None:
-    dots, path = picture.unexplained_xy, picture.path_xy
+    dots, paths = picture.unexplained_xy, picture.paths
     if len(dots):
         # together they cover a hundredth of the panel at most, so that the map stays visible beneath them
         extent, points = axes.get_window_extent(), 72.0 / axes.figure.dpi
         size = float(np.clip(0.01 * extent.width * extent.height * points**2 / len(dots), 0.8, 9.0))
-        axes.scatter(dots[:, 0], dots[:, 1], s=size, color=_DOT, linewidths=0, alpha=0.85, zorder=3)
-    if not len(path):
+        axes.scatter(dots[:, 0], dots[:, 1], s=size, color=DOT, linewidths=0, alpha=0.85, zorder=3)
+    if not paths:
         return
     before = picture.odometry_xy
     if len(before):
         axes.plot(before[:, 0], before[:, 1], color=_BEFORE, linewidth=1.1, linestyle=(0, (4, 2)), zorder=3.5)
     halo = [patheffects.withStroke(linewidth=2.4, foreground='white', alpha=0.9)]
-    axes.plot(path[:, 0], path[:, 1], color=_PATH, linewidth=1.4, path_effects=halo, solid_joinstyle='round', zorder=4)
-    for marker, xy in zip(_path_markers(_heading(path)), (path[0], path[-1]), strict=True):
-        axes.add_line(_marker_line(marker, xy[0], xy[1]))
+    for path in paths:
+        x, y = path.T
+        axes.plot(x, y, color=PATH, linewidth=1.4, path_effects=halo, solid_joinstyle='round', zorder=4)
+    # of many drives the marks would hide the map
+    for path in paths if len(paths) <= _MOST_MARKED else []:
+        for marker, xy in zip(_path_markers(_heading(path)), (path[0], path[-1]), strict=True):
+            axes.add_line(_marker_line(marker, xy[0], xy[1]))
 
 
 def _heading(path: np.ndarray) -> float:
@@ -171,8 +185,8 @@ def _marker_line(marker: MarkerStyle, x: float, y: float, **options: Any) -> Lin
         linestyle='none',
         marker=marker,
         markersize=8 if start else 13,
-        markerfacecolor='white' if start else _PATH,
-        markeredgecolor=_PATH if start else 'white',
+        markerfacecolor='white' if start else PATH,
+        markeredgecolor=PATH if start else 'white',
         markeredgewidth=2.0 if start else 1.0,
         zorder=5,
         **options,
@@ -181,12 +195,12 @@ def _marker_line(marker: MarkerStyle, x: float, y: float, **options: Any) -> Lin
 
 def _head(figure: Figure, picture: Picture) -> None:
     width, height = figure.get_size_inches()
-    most = int((width - 2 * _EDGE) * 9.5)
+    most = int((width - 2 * EDGE) * 9.5)
     title = picture.title if len(picture.title) <= most else picture.title[: most - 1] + '…'
-    x = (_EDGE + 0.05) / width
+    x = (EDGE + 0.05) / width
     # A dollar sign would start a formula.
     figure.text(
-        x, 1 - 0.42 / height, title.replace('$', r'\$'), fontsize=15, fontweight='bold', color=_INK, va='baseline'
+        x, 1 - 0.42 / height, title.replace('$', r'\$'), fontsize=15, fontweight='bold', color=INK, va='baseline'
     )
     figure.text(x, 1 - 0.67 / height, picture.figures, fontsize=9.5, color='#4a525c', va='baseline')
 
@@ -195,39 +209,38 @@ def _foot(figure: Figure, picture: Picture) -> None:
     """Draw the legend and the scale of probabilities below the maps."""
     width, height = figure.get_size_inches()
     start, end = _path_markers(0.0)
-    edge: dict[str, Any] = {'edgecolor': _FRAME, 'linewidth': 0.7}
+    edge: dict[str, Any] = {'edgecolor': FRAME, 'linewidth': 0.7}
     handles: list[Patch | Line2D] = [
         Patch(facecolor=_FREE, label='free', **edge),
         Patch(facecolor=_OCCUPIED, label='occupied', **edge),
-        Patch(facecolor=_UNKNOWN, label='not observed', **edge),
+        Patch(facecolor=UNKNOWN, label='not observed', **edge),
     ]
-    if len(picture.path_xy):
-        handles += [
-            Line2D([], [], color=_PATH, linewidth=1.6, label='path of the robot'),
-            _marker_line(start, 0, 0, label='start'),
-            _marker_line(end, 0, 0, label='end'),
-        ]
+    if count := len(picture.paths):
+        label = 'path of the robot' if count == 1 else f'paths of {count} drives'
+        handles.append(Line2D([], [], color=PATH, linewidth=1.6, label=label))
+        if count <= _MOST_MARKED:
+            handles += [_marker_line(start, 0, 0, label='start'), _marker_line(end, 0, 0, label='end')]
     if len(picture.odometry_xy):
         handles.append(Line2D([], [], color=_BEFORE, linewidth=1.3, linestyle=(0, (4, 2)), label='by odometry'))
     if count := len(picture.unexplained_xy):
         label = f'unexplained reading ({count:,})'
-        handles.append(Line2D([], [], linestyle='none', marker='o', markersize=4, color=_DOT, mew=0, label=label))
+        handles.append(Line2D([], [], linestyle='none', marker='o', markersize=4, color=DOT, mew=0, label=label))
     figure.legend(
         handles=handles,
         loc='center left',
-        bbox_to_anchor=((_EDGE - 0.05) / width, 0.38 / height),
+        bbox_to_anchor=((EDGE - 0.05) / width, 0.38 / height),
         ncol=len(handles),
         frameon=False,
         fontsize=9,
-        labelcolor=_INK,
+        labelcolor=INK,
         handlelength=1.5,
         handletextpad=0.5,
         columnspacing=1.4,
     )
     bar_width = 2.0
-    axes = figure.add_axes(((width - _EDGE - bar_width) / width, 0.36 / height, bar_width / width, 0.12 / height))
+    axes = figure.add_axes(((width - EDGE - bar_width) / width, 0.36 / height, bar_width / width, 0.12 / height))
     bar = figure.colorbar(ScalarMappable(Normalize(0, 1), _PROBABILITY), cax=axes, orientation='horizontal')
     bar.set_ticks([0, 0.5, 1], labels=['0', '0.5', '1'])
-    axes.tick_params(labelsize=8, color=_FRAME, labelcolor=_INK, length=2, width=0.7)
-    axes.set_title('probability of an obstacle', fontsize=8.5, color=_INK, pad=3)
-    bar.outline.set(color=_FRAME, linewidth=0.7)
+    axes.tick_params(labelsize=8, color=FRAME, labelcolor=INK, length=2, width=0.7)
+    axes.set_title('probability of an obstacle', fontsize=8.5, color=INK, pad=3)
+    bar.outline.set(color=FRAME, linewidth=0.7)

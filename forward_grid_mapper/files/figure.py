@@ -1,13 +1,14 @@
-"""A table of small maps, for comparing many at a glance."""
+"""Figures of several maps, for comparing many at a glance, and of a density."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from types import ModuleType
 
 from ..core.common.errors import OutputError
 from .output_folder import output_errors
-from .panels import Box, Tile
+from .panels import Box, Curve, Tile
 
 
 def write_figure(path: Path | str, title: str, rows: Sequence[Sequence[Tile]], view: Box) -> None:
@@ -19,9 +20,26 @@ def write_figure(path: Path | str, title: str, rows: Sequence[Sequence[Tile]], v
         If the file cannot be written, or matplotlib is not installed.
     """
     path = Path(path)
+    with output_errors(path):
+        _drawing().draw_table(path, title, rows, view)
+
+
+def write_density(path: Path | str, title: str, tile: Tile, curve: Curve) -> None:
+    """Draw a map with a cone, and below it the density of what the sonar measures.
+
+    Raises
+    ------
+    OutputError
+        If the file cannot be written, or matplotlib is not installed.
+    """
+    path = Path(path)
+    with output_errors(path):
+        _drawing().draw_density(path, title, tile, curve)
+
+
+def _drawing() -> ModuleType:
     try:
-        from .drawing import draw_table
+        from . import drawing_tables
     except ImportError as error:
         raise OutputError(f'the figure needs matplotlib ({error}); install it with pip install matplotlib') from error
-    with output_errors(path):
-        draw_table(path, title, rows, view)
+    return drawing_tables

@@ -27,7 +27,7 @@ from ..core.common.readings import Readings
 from .journal_database import DRIVE, FULL, Drive, DriveWriter, FolderLock, GoneError, Insert, following, number_of
 from .journal_format import BLOCK, Contents, encoded, points_of, rows_of
 from .journal_reader import is_journal, one_line, read
-from .output_folder import output_errors
+from .output_folder import expanded, output_errors
 from .syncing import Syncer
 
 MOST_PENDING = 32 << 20
@@ -123,7 +123,7 @@ class Journal:
         OutputError
             If another process has it, or the folder cannot be made or written.
         """
-        self.folder = Path(folder).expanduser().absolute()
+        self.folder = expanded(folder).absolute()
         self._warn = warn
         self.trouble = self.notice = ''
         self.noticed = 0.0

@@ -33,6 +33,35 @@ def learned_text(learned: Learned) -> str:
     return '\n\n'.join('\n'.join(lines) for part in parts if (lines := list(part))) + '\n'
 
 
+def learned_data(learned: Learned) -> dict[str, Any]:
+    """Return the same for programs: values with their standard errors, rounds, and warnings."""
+    start, model = learned.rounds[0].model, learned.parameters.model
+    values = {}
+    for name in LEARNED:
+        estimate = learned.estimates.get(name)
+        sure = {} if estimate is None else {k: getattr(estimate, k) for k in ('error', 'low', 'high', 'readings')}
+        values[name] = {'start': getattr(start, name), 'learned': getattr(model, name), **sure}
+    rounds = [
+        {
+            **{name: getattr(r.model, name) for name in LEARNED},
+            'log_likelihood': r.log_likelihood,
+            'occupied': r.occupied,
+            'unexplained': r.unexplained,
+            'lost_m': r.lost_length,
+        }
+        for r in learned.rounds
+    ]
+    return {
+        'warnings': list(learned.warnings),
+        'values': values,
+        'rounds': rounds,
+        'accepted_round': learned.accepted,
+        'converged': learned.converged,
+        'foresight': learned.foresight and learned.foresight._asdict(),
+        'parameters': learned.parameters.flat(),
+    }
+
+
 def _warnings(learned: Learned) -> Iterator[str]:
     if learned.warnings:
         yield f'WARNINGS ({len(learned.warnings)})'
@@ -53,6 +82,12 @@ def _values(learned: Learned) -> Iterator[str]:
         error = f'{estimate.error:.4f}' if known else '–'
         interval = f'{estimate.low:.4f} … {estimate.high:.4f}' if known else '–'
         yield f'{row}{error:>11}{interval:>19}{estimate.readings:>11,.0f} readings'
+    if seen := learned.foresight:
+        yield (
+            f'  Held-out readings, nats each: {seen.learned_at_learned:.3f} with the map of the learned values, '
+            f'{seen.first_at_learned:.3f} with that of the first'
+        )
+        yield f'  ones; judged at the first values {seen.learned_at_first:.3f} and {seen.first_at_first:.3f}'
     yield textwrap.fill(_HOW, _WIDTH, initial_indent='  ', subsequent_indent='  ')
 
 

@@ -25,6 +25,20 @@ def readable(path: Path | str) -> str:
     return os.fsencode(path).decode('utf-8', 'backslashreplace')
 
 
+def expanded(path: Path | str) -> Path:
+    """Return a path with a `~` at its beginning replaced by the home that it stands for.
+
+    Raises
+    ------
+    OutputError
+        If there is no such user.
+    """
+    try:
+        return Path(path).expanduser()
+    except RuntimeError:
+        raise OutputError(f'{readable(path)}: whose home is {Path(path).parts[0]}? There is no such user.') from None
+
+
 @contextmanager
 def output_errors(path: Path) -> Iterator[None]:
     """Turn an `OSError` from writing `path` into an `OutputError`.

@@ -8,17 +8,41 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.common.grid import Grid
+from ..core.common.readings import Readings
 
 Box = tuple[float, float, float, float]
 """Left, right, bottom, top in metres."""
 
 
 class Tile(NamedTuple):
-    """One map of the table: `values` are probabilities, or cells 0 and 1, with NaN or -1 where unknown."""
+    """One map of the table: `values` are probabilities, or cells 0 and 1, with NaN or -1 where unknown.
+
+    The cones of `readings` are drawn over it, and the cells that are True in `marked` in the colour of dots.
+    """
 
     title: str
     grid: Grid
     values: NDArray[Any]
+    readings: Readings | None = None
+    marked: NDArray[np.bool_] | None = None
+
+
+class Curve(NamedTuple):
+    """A density in 1/m over ranges in metres, both float64 of shape (N,)."""
+
+    x: NDArray[np.float64]
+    y: NDArray[np.float64]
+
+
+def coarse(values: NDArray[Any], step: int) -> NDArray[np.float32]:
+    """Return a map in blocks of `step` cells, each with the largest of its values; NaN where all of them are.
+
+    Walls one cell thick stay, and do not fall between the pixels of a picture. Rows and columns are filled up with NaN.
+    """
+    pad = [(0, -n % step) for n in values.shape]
+    part = np.pad(np.asarray(values, np.float32), pad, constant_values=np.nan)
+    part = np.fmax.reduce(part.reshape(part.shape[0] // step, step, -1), axis=1)
+    return np.asarray(np.fmax.reduce(part.reshape(part.shape[0], -1, step), axis=2))
 
 
 class Panel(NamedTuple):
@@ -32,7 +56,8 @@ class Panel(NamedTuple):
 class Picture(NamedTuple):
     """What is drawn. `view` is the box shown; points are in metres; `overlay` is the panel that bears them.
 
-    `odometry_xy` is the path that odometry gives, where it is another one than `path_xy`.
+    `path_xy` is parted by rows of NaN where there are several drives. `odometry_xy` is the path that odometry gives,
+    where it is another one than `path_xy`.
     """
 
     title: str
@@ -43,3 +68,11 @@ class Picture(NamedTuple):
     path_xy: NDArray[np.float64]
     unexplained_xy: NDArray[np.float64]
     odometry_xy: NDArray[np.float64] = np.zeros((0, 2))
+
+    @property
+    def paths(self) -> list[NDArray[np.float64]]:
+        """The path of each drive, none of them empty."""
+        known = np.isfinite(self.path_xy).all(axis=1)
+        parts = np.split(self.path_xy, np.flatnonzero(~known))
+        parts = [part[np.isfinite(part).all(axis=1)] for part in parts]
+        return [part for part in parts if len(part)]

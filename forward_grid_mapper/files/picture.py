@@ -12,7 +12,7 @@ from ..core.common.errors import OutputError
 from ..core.common.grid import UNKNOWN, Grid
 from ..core.maps.map_set import MapSet
 from .output_folder import output_errors
-from .panels import Box, Panel, Picture
+from .panels import Box, Panel, Picture, coarse
 
 # More cells than that along a side cannot be distinguished in the picture.
 _MAX_SIDE = 2400
@@ -36,7 +36,7 @@ def write_picture(
     path : Path or str
     maps : MapSet
     path_xy : float64, shape (P, 2)
-        Where the robot was, in order, metres; may be empty.
+        Where the robot was, in order, metres; may be empty. A row of NaN parts two drives.
     title : str
     reference : (Grid, int8 array), optional
         The true map, −1 unknown, 0 free, 1 occupied, drawn as one more panel.
@@ -69,26 +69,25 @@ def compose(
     odometry_xy: NDArray[np.float64] = NOWHERE,
 ) -> Picture:
     """Choose what the picture shows; the parameters are those of `write_picture`."""
-    path_xy = path_xy[np.isfinite(path_xy).all(axis=1)]
     alpha = maps.parameters.search.alpha
     named: list[tuple[str, Grid, NDArray[Any]]] = [
-        ('Standard log-odds map', maps.grid, maps.live),
+        ('Standard map', maps.grid, maps.live),
         ('Maximum likelihood map', maps.grid, _probability(maps.ml)),
         (f'Uncertainty map (α = {alpha:g})', maps.grid, maps.uncertainty),
     ]
     if reference is not None:
         named.append(('Reference', reference[0], _probability(reference[1])))
-    known = (maps.ml != UNKNOWN) | np.isfinite(maps.live)
-    view = _view(maps.grid, known, np.concatenate([path_xy, odometry_xy]))
+    view = view_of(maps, np.concatenate([path_xy, odometry_xy]))
     panels = [Panel(name, *_crop(grid, values, view)) for name, grid, values in named]
-    return Picture(title, _figures(maps), panels, view, 1, path_xy, _unexplained_ends(maps), odometry_xy)
+    return Picture(title, figures_of(maps), panels, view, 1, path_xy, _unexplained_ends(maps), odometry_xy)
 
 
 def _probability(cells: NDArray[np.int8]) -> NDArray[np.float32]:
     return np.where(cells == UNKNOWN, np.nan, cells).astype(np.float32)
 
 
-def _figures(maps: MapSet) -> str:
+def figures_of(maps: MapSet) -> str:
+    """Return the line of figures below the title."""
     readings = len(maps.readings)
     parts = [f'{readings:,} readings', f'{100 * maps.grid.resolution:g} cm cells']
     if np.isfinite(maps.log_likelihood):
@@ -99,14 +98,16 @@ def _figures(maps: MapSet) -> str:
     return '   ·   '.join(parts)
 
 
-def _view(grid: Grid, known: NDArray[np.bool_], path_xy: NDArray[np.float64]) -> Box:
-    """Return the box around the known cells and the path, with a margin."""
+def view_of(maps: MapSet, path_xy: NDArray[np.float64]) -> Box:
+    """Return the box around the known cells and the path, with a margin: left, right, bottom, top in metres."""
+    grid, known = maps.grid, (maps.ml != UNKNOWN) | np.isfinite(maps.live)
     columns, rows = np.flatnonzero(known.any(axis=0)), np.flatnonzero(known.any(axis=1))
     left, right, bottom, top = grid.extent
     if len(rows):
         x, y = grid.origin
         left, right = x + columns[0] * grid.resolution, x + (columns[-1] + 1) * grid.resolution
         bottom, top = y + rows[0] * grid.resolution, y + (rows[-1] + 1) * grid.resolution
+    path_xy = path_xy[np.isfinite(path_xy).all(axis=1)]
     if len(path_xy):
         left, bottom = np.minimum((left, bottom), path_xy.min(axis=0))
         right, top = np.maximum((right, top), path_xy.max(axis=0))
@@ -123,17 +124,13 @@ def _crop(grid: Grid, values: NDArray[Any], view: Box) -> tuple[NDArray[np.float
     part = np.asarray(values[row0:row1, column0:column1], np.float32)
     step = max(1, -(-max(part.shape) // _MAX_SIDE))
     if step > 1:
-        # The largest value of each block stays: a wall one cell thick must not fall between pixels.
-        pad = [(0, -n % step) for n in part.shape]
-        part = np.pad(part, pad, constant_values=np.nan)
-        part = np.fmax.reduce(part.reshape(part.shape[0] // step, step, -1), axis=1)
-        part = np.fmax.reduce(part.reshape(part.shape[0], -1, step), axis=2)
+        part = coarse(part, step)
     x, y = grid.origin
     x, y, size = x + column0 * grid.resolution, y + row0 * grid.resolution, step * grid.resolution
     return part, (float(x), float(x + part.shape[1] * size), float(y), float(y + part.shape[0] * size))
 
 
 def _unexplained_ends(maps: MapSet) -> NDArray[np.float64]:
-    """Return where the axes of the readings that the ML map leaves unexplained end, shape (U, 2)."""
+    """Return where the axes of the readings that the maximum likelihood map leaves unexplained end, shape (U, 2)."""
     odd = maps.readings.select(maps.unexplained)
     return np.stack([odd.x + odd.z * np.cos(odd.yaw), odd.y + odd.z * np.sin(odd.yaw)], axis=1)

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from typing import Any
 
 import numpy as np
 
+from ..core.common.parameters import Parameters
+from ..core.common.readings import Readings, drives_of
+from ..core.drive_fit import fit_warnings
 from ..core.learning.consistency import consistency_warnings
 from ..core.learning.input_warnings import input_warnings
 from ..core.maps.map_set import MapSet
@@ -18,20 +22,38 @@ ENOUGH = 20
 """Readings below which nothing can be said."""
 
 
-def data_warnings(maps: MapSet, extrinsics: Mapping[str, Pose2]) -> list[str]:
+def data_warnings(maps: MapSet, source: Mapping[str, Any]) -> list[str]:
     """Return all that is wrong with the readings of a map, each with its remedy.
 
     Parameters
     ----------
     maps : MapSet
-    extrinsics : mapping
-        Poses of the sensors that are fixed to the robot, by `frame_id`.
+    source : mapping
+        Of which `extrinsics` counts, the poses of the sensors that are fixed to the robot by `frame_id`, and of several
+        drives `drives`, a list of such mappings with `bag`, the name of the drive.
     """
     return [
-        *input_warnings(maps.readings),
-        *consistency_warnings(maps.readings, extrinsics, maps.parameters),
+        *reading_warnings(maps.readings, source, maps.parameters),
+        *fit_warnings(maps, [str(drive['bag']) for drive in source.get('drives') or ()]),
         *filter(None, [quality_warning(maps)]),
     ]
+
+
+def reading_warnings(readings: Readings, source: Mapping[str, Any], parameters: Parameters) -> list[str]:
+    """Return what is wrong with readings whatever their map; `source` is as in `data_warnings`."""
+    drives = source.get('drives')
+    if not drives:
+        return list(_of_one(readings, source.get('extrinsics') or {}, parameters))
+    told = []
+    for mine in drives_of(readings):
+        drive = drives[int(mine.drive[0])]
+        told += [f'{drive["bag"]}: {text}' for text in _of_one(mine, drive.get('extrinsics') or {}, parameters)]
+    return told
+
+
+def _of_one(readings: Readings, extrinsics: Mapping[str, Pose2], parameters: Parameters) -> Iterator[str]:
+    yield from input_warnings(readings)
+    yield from consistency_warnings(readings, extrinsics, parameters)
 
 
 def quality_warning(maps: MapSet) -> str:

@@ -67,10 +67,11 @@ def read_readings(path: Path | str, maps: MapArchive) -> ReadingArchive:
     try:
         with path.open('rb') as file, np.load(file, allow_pickle=False) as data:
             names = tuple(str(name) for name in data['sensor_names'])
-            readings = Readings.from_columns(names, **{name: data[name] for name in COLUMNS})
+            columns = {name: data[name] for name in COLUMNS if name != 'drive' or name in data}
+            readings = Readings.from_columns(names, **columns)
             x, y = data['normals']
             same = float(data['log_likelihood']) == maps.log_likelihood
-            sound = all(np.isfinite(data[name]).all() for name in COLUMNS)
+            sound = all(np.isfinite(column).all() for column in columns.values())
     except FileNotFoundError as error:
         raise InputError(f'{path} does not exist; make the maps anew') from error
     except Exception as error:  # zipfile, zlib and numpy have many kinds for damaged bytes

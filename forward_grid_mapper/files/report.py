@@ -5,21 +5,22 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .. import __version__
 from ..core.common.grid import UNKNOWN
 from ..core.common.parameters import TABLE
-from ..core.learning.sensor_health import SensorHealth, health_warning, sensor_health
+from ..core.learning.sensor_health import health_warning, sensor_health
 from ..core.maps.map_set import MapSet
 from .output_folder import output_errors
 from .report_text import report_text
 
-__all__ = ['report_data', 'report_text', 'write_report']
+__all__ = ['json_text', 'report_data', 'report_text', 'write_report']
 
 
 def report_data(maps: MapSet, source: Mapping[str, Any]) -> dict[str, Any]:
@@ -32,7 +33,8 @@ def report_data(maps: MapSet, source: Mapping[str, Any]) -> dict[str, Any]:
         Where the readings came from. All keys are optional: `bag`, `range_topics`, `odom_topic`, `odom_frame`,
         `map_frame`, `mounts_from`, `extrinsics` (poses of the sensors on the robot, by frame), `stamps` (first and
         last, nanoseconds), `duration_s`, `path_m`, `counts` (`received`, `accepted`, `rejected` by reason), `sensors`
-        (by frame: `accepted`, `no_echo`, `unexplained`), `warnings`. Others are kept as they are under `input`.
+        (by frame: `accepted`, `no_echo`, `unexplained`), `warnings`; of several drives `drives`, a list of such
+        mappings. Others are kept as they are under `input`.
 
     Returns
     -------
@@ -42,8 +44,9 @@ def report_data(maps: MapSet, source: Mapping[str, Any]) -> dict[str, Any]:
     rest = dict(source)
     counts = dict(rest.pop('counts', None) or {})
     counts.setdefault('accepted', len(maps.readings))
+    drives = rest.pop('drives', None)
     health = sensor_health(maps)
-    sensors = _sensors(maps, health)
+    sensors = {name: {**row, 'health': dataclasses.asdict(health[name])} for name, row in _sensors(maps).items()}
     for name, row in (rest.pop('sensors', None) or {}).items():
         sensors[name] = {**sensors.get(name, {}), **row}
     statistics = dict(maps.statistics)
@@ -53,6 +56,7 @@ def report_data(maps: MapSet, source: Mapping[str, Any]) -> dict[str, Any]:
         'input': rest,
         'counts': counts,
         'sensors': sensors,
+        **({'drives': _drives(maps, drives)} if drives else {}),
         'map': _map(maps),
         'result': {
             'readings': len(maps.readings),
@@ -69,8 +73,8 @@ def report_data(maps: MapSet, source: Mapping[str, Any]) -> dict[str, Any]:
             if (value := maps.parameters.flat()[row.name]) != row.default
         },
     }
-    plain: dict[str, Any] = _plain(data)
-    return plain
+    made: dict[str, Any] = plain(data)
+    return made
 
 
 def write_report(folder: Path | str, data: dict[str, Any]) -> None:
@@ -82,7 +86,7 @@ def write_report(folder: Path | str, data: dict[str, Any]) -> None:
         If they cannot be written.
     """
     texts = {
-        'report.json': json.dumps(data, indent=2, ensure_ascii=False, allow_nan=False) + '\n',
+        'report.json': json_text(data),
         'report.txt': report_text(data),
     }
     for name, text in texts.items():
@@ -91,18 +95,23 @@ def write_report(folder: Path | str, data: dict[str, Any]) -> None:
             path.write_text(text, encoding='utf-8')
 
 
-def _sensors(maps: MapSet, health: Mapping[str, SensorHealth]) -> dict[str, dict[str, Any]]:
-    readings = maps.readings
-    table = {}
-    for index, name in enumerate(readings.sensor_names):
-        mine = readings.sensor == index
-        table[name] = {
-            'accepted': int(np.count_nonzero(mine)),
-            'no_echo': int(np.count_nonzero(mine & ~readings.echo)),
-            'unexplained': int(np.count_nonzero(mine & maps.unexplained)),
-            'health': dataclasses.asdict(health[name]),
-        }
-    return table
+def _sensors(maps: MapSet, which: NDArray[np.bool_] | None = None) -> dict[str, dict[str, Any]]:
+    """Return the counts of each sensor, of all readings or of those that `which` marks."""
+    readings, size = maps.readings, len(maps.readings.sensor_names)
+    marked = np.ones(len(readings), np.bool_) if which is None else which
+    masks = {'accepted': marked, 'no_echo': marked & ~readings.echo, 'unexplained': marked & maps.unexplained}
+    counts = {kind: np.bincount(readings.sensor[mask], minlength=size).tolist() for kind, mask in masks.items()}
+    return {name: {kind: counts[kind][k] for kind in masks} for k, name in enumerate(readings.sensor_names)}
+
+
+def _drives(maps: MapSet, drives: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Return what is known of each drive, with the counts of its sensors."""
+    rows = []
+    for number, drive in enumerate(drives):
+        sensors = _sensors(maps, maps.readings.drive == number)
+        mine = {name: row for name, row in sensors.items() if row['accepted']}
+        rows.append({**drive, 'unexplained': sum(row['unexplained'] for row in mine.values()), 'sensors': mine})
+    return rows
 
 
 def _map(maps: MapSet) -> dict[str, Any]:
@@ -118,14 +127,19 @@ def _map(maps: MapSet) -> dict[str, Any]:
     }
 
 
-def _plain(value: Any) -> Any:
+def json_text(data: Mapping[str, Any]) -> str:
+    """Return data as lines of JSON, whatever numpy types are in it; a number that is not finite is null."""
+    return json.dumps(plain(data), indent=2, ensure_ascii=False, allow_nan=False) + '\n'
+
+
+def plain(value: Any) -> Any:
     """Return `value` of Python's own types, as JSON knows them."""
     if isinstance(value, Mapping):
-        return {str(key): _plain(item) for key, item in value.items()}
+        return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, (np.ndarray, np.generic)):
-        return _plain(value.tolist())
+        return plain(value.tolist())
     if isinstance(value, (list, tuple, set, frozenset)):
-        return [_plain(item) for item in value]
+        return [plain(item) for item in value]
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     return value if value is None or isinstance(value, (str, int)) else str(value)

@@ -14,7 +14,7 @@ _SHOWN = 6
 
 def report_text(data: dict[str, Any]) -> str:
     """Return the text of a report made by `report_data`; what is absent is left out."""
-    sections = (_warnings, _input, _trajectory, _counts, _sensors, _map, _result, _seconds, _parameters)
+    sections = (_warnings, _input, _trajectory, _counts, _drives, _sensors, _map, _result, _seconds, _parameters)
     title = f'Sonar maps by forward_grid_mapper {data.get("version") or ""}'.rstrip()
     parts = [f'{title}\n{"=" * len(title)}']
     for section in sections:
@@ -101,6 +101,30 @@ def _frames(counts: dict[str, int]) -> str:
     return f' ({", ".join(f"{name} {counts[name]:,}" for name in order[:_SHOWN])}{more})'
 
 
+def _drives(data: dict[str, Any]) -> Iterator[str]:
+    drives = data.get('drives') or []
+    if not drives:
+        return
+    yield f'{"Drives":<12}{"received":>12}{"accepted":>12}{"used":>12}{"random":>9}{"path":>10}{"time":>10}'
+    for drive in drives:
+        counts, sensors = drive.get('counts') or {}, drive.get('sensors') or {}
+        used = sum(row['accepted'] for row in sensors.values())
+        yield from textwrap.wrap(f'  {drive.get("bag")}', _WIDTH, subsequent_indent='    ', break_on_hyphens=False)
+        cells = f'{_number(counts.get("received")):>12}{_number(counts.get("accepted")):>12}{used:>12,}'
+        length, duration = drive.get('path_m') or 0.0, drive.get('duration_s') or 0.0
+        yield f'{"":<12}{cells}{_share(drive.get("unexplained"), used):>9}{length:>8.1f} m{duration:>8.1f} s'
+        yield from textwrap.wrap(_each(sensors), _WIDTH, initial_indent='    ', subsequent_indent='    ')
+
+
+def _each(sensors: dict[str, Any]) -> str:
+    """Return how many readings of each sensor are used."""
+    counts = {name: row['accepted'] for name, row in sorted(sensors.items())}
+    least, most = min(counts.values(), default=0), max(counts.values(), default=0)
+    if least == most and len(counts) > 1:
+        return f'{len(counts)} sensors, {most:,} of each'
+    return ', '.join(f'{name} {count:,}' for name, count in counts.items())
+
+
 def _sensors(data: dict[str, Any]) -> Iterator[str]:
     sensors = data.get('sensors') or {}
     if not sensors:
@@ -127,7 +151,7 @@ def _map(data: dict[str, Any]) -> Iterator[str]:
         'Map', f'{size}: {grid["width"]} x {grid["height"]} cells of {cell:g} m, corner ({x:.2f}, {y:.2f})'
     )
     cells = (f'{_number(grid.get(f"{kind}_cells"))} {word}' for kind, word in _KINDS)
-    yield from _line('ML map', ', '.join(cells))
+    yield from _line('Cells', f'{", ".join(cells)} in the maximum likelihood map')
 
 
 _KINDS = (('occupied', 'occupied'), ('free', 'free'), ('unknown', 'not observed'))
@@ -151,6 +175,12 @@ def _result(data: dict[str, Any]) -> Iterator[str]:
         work.append('converged' if converged else 'NOT converged: max_iterations was reached')
     if work:
         yield from _line('Search', ', '.join(work))
+    if tiles := statistics.get('tiles'):
+        yield from _line(
+            'Tiles',
+            f'{tiles:,}, searched {statistics["searches_of_tiles"]:,} times; a reading belongs to '
+            f'{statistics["evaluations_of_a_reading"]:.2f} of them',
+        )
 
 
 def _seconds(data: dict[str, Any]) -> Iterator[str]:

@@ -15,9 +15,11 @@ from ..core.maps.map_set import MapSet
 from .map_archive import write_npz
 from .map_files import write_raw, write_trinary
 from .output_folder import output_errors, output_folder
+from .picture import NOWHERE, write_picture
 from .quality_warning import data_warnings
 from .reading_archive import write_readings
 from .report import report_data, write_report
+from .web_page import write_page
 
 
 def write_results(
@@ -31,7 +33,7 @@ def write_results(
     odometry_xy: NDArray[np.float64] | None = None,
     judged: Sequence[str] | None = None,
 ) -> dict[str, Any]:
-    """Write maps, archive, picture and report into a new folder; nothing is left if any of them fails.
+    """Write maps, archive, picture, page and report into a new folder; nothing is left if any of them fails.
 
     Parameters
     ----------
@@ -41,7 +43,7 @@ def write_results(
     source : mapping
         What `report_data` asks for.
     path_xy : float64, shape (P, 2)
-        Where the robot drove, metres.
+        Where the robot drove, metres; a row of NaN parts two drives.
     title : str
         Of the picture.
     reference : (Grid, int8 array), optional
@@ -71,16 +73,18 @@ def write_results(
         write_readings(folder / 'readings.npz', maps)
         warnings = [
             *(source.get('warnings') or []),
-            *(data_warnings(maps, source.get('extrinsics') or {}) if judged is None else judged),
+            *(data_warnings(maps, source) if judged is None else judged),
         ]
+        before = NOWHERE if odometry_xy is None else odometry_xy
         try:
-            from .picture import NOWHERE, write_picture
-
-            before = NOWHERE if odometry_xy is None else odometry_xy
             write_picture(folder / 'maps.png', maps, path_xy, title, reference, before)
         except OutputError as error:
             warnings.append(f'no picture was drawn: {error}')
         report = report_data(maps, {**source, 'warnings': warnings})
+        try:
+            write_page(folder / 'report.html', maps, report, title, path_xy, before, reference)
+        except OutputError as error:
+            report['warnings'].append(f'report.html was not written: {error}')
         write_report(folder, report)
         for name, text in (extras or {}).items():
             with output_errors(folder / name):

@@ -50,9 +50,10 @@ class Health:
         last_run: str,
         grid: Grid,
         extra: dict[str, Any],
+        map_frame: str = '',
     ) -> list[DiagnosticStatus]:
-        """Return the statuses of input and of EM."""
-        level, message = self._judge(associator, intake)
+        """Return the statuses of input and of EM; `map_frame` says what is wrong with its transform."""
+        level, message = self._judge(associator, intake, map_frame)
         bound = associator.parameters.max_readings
         held = min(associator.buffer.held, bound or associator.buffer.held)
         values = {
@@ -68,7 +69,7 @@ class Health:
             'odometry lost in the middleware (estimated)': intake.odometry_lost,
             **{f'odometry rejected: {reason}': count for reason, count in sorted(associator.odometry_rejected.items())},
             'clock jumps back': associator.time_jumps,
-            'frames without a pose': _listed(associator.unknown_frames),
+            'frames without a pose': listed(associator.unknown_frames),
             'map frame': associator.map_frame,
             'map size': f'{grid.width} x {grid.height} cells of {grid.resolution} m',
             **extra,
@@ -80,7 +81,7 @@ class Health:
             status(f'{name}: EM', DiagnosticStatus.OK, em['state'], name, em),
         ]
 
-    def _judge(self, associator: PoseAssociator, intake: Intake) -> tuple[bytes, str]:
+    def _judge(self, associator: PoseAssociator, intake: Intake, map_frame: str) -> tuple[bytes, str]:
         received, rejected = intake.received, sum(associator.rejected.values())
         new, new_rejected = received - self._received, rejected - self._rejected
         self._received, self._rejected = received, rejected
@@ -88,17 +89,21 @@ class Health:
         silent_odometry = self._silence('odometry', associator.odometry_received - refused)
         refused_now, self._refused = refused - self._refused, refused
         silent_ranges = self._silence('range', received)
+        if not intake.listening:
+            return DiagnosticStatus.OK, 'inactive: nothing is received'
         if intake.paused:
             return DiagnosticStatus.OK, 'paused'
         if silent_odometry > SILENCE and refused_now > 0:
             reason = max(associator.odometry_rejected, key=lambda key: associator.odometry_rejected[key])
             return DiagnosticStatus.WARN, f'odometry is rejected as {reason}: {ODOMETRY_REASONS[reason]}'
+        if map_frame:
+            return DiagnosticStatus.WARN, map_frame
         if silent_odometry > SILENCE:
             return DiagnosticStatus.WARN, f'no odometry for {silent_odometry:.0f} s'
         if silent_ranges > SILENCE:
             return DiagnosticStatus.WARN, f'no Range for {silent_ranges:.0f} s'
         if associator.unknown_frames and new_rejected:
-            return DiagnosticStatus.WARN, f'no pose on the robot for {_listed(associator.unknown_frames)}'
+            return DiagnosticStatus.WARN, f'no pose on the robot for {listed(associator.unknown_frames)}'
         if new and new_rejected > 0.2 * new:
             return DiagnosticStatus.WARN, (
                 f'{new_rejected} of {new} readings were rejected in the last second{self._main_reason(associator)}'
@@ -134,7 +139,8 @@ def add_faults(made: DiagnosticStatus, faults: list[str]) -> None:
         made.message = '; '.join(faults if well else [made.message, *faults])
 
 
-def _listed(frames: Collection[str]) -> str:
+def listed(frames: Collection[str]) -> str:
+    """Return names in words, `SHOWN` of them at the most."""
     more = f' and {len(frames) - SHOWN} more' if len(frames) > SHOWN else ''
     return ', '.join(sorted(frames)[:SHOWN]) + more
 

@@ -24,17 +24,19 @@ from ..core.runtime.threads import cores
 from ..core.search.search import Progress
 from ..files.quality_warning import quality_warning
 from .background import Worker
+from .refining import RefiningMapper
 
 
 @dataclass
 class Outcome:
     """How a run ended: `maps`, or None and the reason in `message`.
 
-    `warnings` say what is wrong with the readings, `health` how each sensor does.
+    `warnings` say what is wrong with the readings, `health` how each sensor does, `trajectory` what became of it.
     """
 
     maps: MapSet | None
     message: str
+    trajectory: str = ''
     warnings: list[str] = field(default_factory=list)
     health: dict[str, SensorHealth] = field(default_factory=dict)
 
@@ -44,10 +46,11 @@ class Run:
     """One run of EM on what `readings` returns, from map `start` or from the empty one.
 
     `stage` and `progress` say where it stands; `ended` is set when its thread has done all that it does for it. `found`
-    is called with the maps as soon as they are there, in the thread.
+    is called with the maps as soon as they are there, in the thread. `shown` says whether the map so far was published,
+    `asked` whether somebody asked for its end alone.
     """
 
-    mapper: Mapper
+    mapper: Mapper | RefiningMapper
     parameters: Parameters
     readings: Callable[[], Readings]
     found: Callable[[MapSet], object] = lambda maps: None
@@ -57,6 +60,8 @@ class Run:
     count: int = 0
     progress: Progress | None = None
     cancelled: bool = False
+    shown: bool = False
+    asked: bool = False
     ended: threading.Event = field(default_factory=threading.Event)
     waiting: list[Callable[[Outcome], object]] = field(default_factory=list)
 

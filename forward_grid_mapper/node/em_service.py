@@ -12,11 +12,12 @@ from ..core.common.errors import Cancelled
 from ..core.common.parameters import Parameters
 from ..core.common.readings import Readings
 from ..core.learning.consistency import consistency_warnings
-from ..core.mapping import Mapper
 from ..core.maps.map_set import MapSet
 from ..core.messages.message_types import Pose2
 from ..core.messages.pose_association import PoseAssociator
 from ..core.messages.reading_buffer import bounded
+from ..core.trajectory.recovering import recovered
+from ..core.trajectory.windows import Odometry
 from ..files.quality_warning import quality_warning
 from .background import Inbox
 from .deferred import Reply
@@ -24,10 +25,18 @@ from .em import EmWorker, Outcome, Run, summary
 from .kernels import Kernels
 from .map_publishers import MapPublishers
 from .online import OnlineWorker
+from .refining import Drive, Found, RefiningMapper
 from .sensor_status import SensorWatch
+from .trajectory import Trajectory
+
+TELLING = 10.0
+"""Seconds between two lines in the log while a trajectory is looked for."""
+
+Taken = tuple[int, Readings, Any]
+"""Number of readings accepted, those that are held, and stamps and poses of odometry."""
 
 
-def _waited_for(taken: queue.SimpleQueue[tuple[int, Any]], run: Run) -> tuple[int, Any]:
+def _waited_for(taken: queue.SimpleQueue[Taken], run: Run) -> Taken:
     """Return what the executor takes for a run, unless this is cancelled."""
     while True:
         if run.cancelled:
@@ -43,6 +52,8 @@ class EmService:
     ----------
     maps : MapSet or None
         Of the latest run since the last reset.
+    found : Found or None
+        What became of their trajectory; None where none was looked for.
     explained : int
         Readings that had been accepted when it began.
     last_run : str
@@ -54,29 +65,35 @@ class EmService:
         Gives the map to start from, and takes what was found.
     extrinsics : callable
         Returns the poses of the sensors that are fixed to the robot, by frame.
+    mounts : callable
+        The same, with those of sensors that were not heard of yet.
     """
 
     def __init__(
         self,
         parameters: Callable[[], Parameters],
         associator: PoseAssociator,
+        trajectory: Trajectory,
         publishers: MapPublishers,
         inbox: Inbox,
         kernels: Kernels,
         logger: Any,
     ) -> None:
         self.maps: MapSet | None = None
+        self.found: Found | None = None
         self.explained = 0
         self.last_run = 'none yet'
         self.wrong_input: list[str] = []
         self.sensors = SensorWatch()
         self.online: OnlineWorker | None = None
         self.extrinsics: Callable[[], Mapping[str, Pose2]] = dict
+        self.mounts: Callable[[], Mapping[str, Pose2]] = dict
         self._parameters, self._associator, self._publishers = parameters, associator, publishers
+        self._trajectory = trajectory
         self._inbox, self._kernels, self._logger = inbox, kernels, logger
-        self._watched = 0.0
+        self._watched = self._told = 0.0
         self._generation = 0
-        self.worker = EmWorker(self._watch, logger.error, inbox.put, lambda stop: kernels.wait('EM', stop))
+        self.worker = EmWorker(self._watch, logger.error, inbox.put, self._wait_for_kernels)
 
     @property
     def current(self) -> Run | None:
@@ -91,13 +108,31 @@ class EmService:
             if outcome.maps is None:
                 reply.send(False, outcome.message)
             else:
-                reply.send(True, summary(outcome.maps, time.monotonic() - begin))
+                said = filter(None, [summary(outcome.maps, time.monotonic() - begin), outcome.trajectory])
+                reply.send(True, '; '.join(said))
 
         run = self.current
         if run is not None:
             reply.send(False, f'EM runs already ({run}); call again when it has ended')
         else:
             self._start(done)
+
+    def cancel(self, reply: Reply) -> None:
+        """Cancel the run that goes on, forget nothing, and answer when it has ended."""
+        run = self.current
+        if run is None:
+            reply.send(False, 'EM does not run: there is nothing to cancel')
+            return
+
+        def ended(outcome: Outcome) -> None:
+            if outcome.maps is not None:
+                reply.send(False, 'EM had found its maps before it could be cancelled; they are published')
+            else:
+                reply.send(True, f'{outcome.message} (after {run.seconds:.1f} s); readings and earlier maps are kept')
+
+        run.asked = True
+        run.waiting.append(ended)
+        self.worker.cancel()
 
     def when_there_are_maps(self, done: Callable[[Outcome], object]) -> None:
         """Have `done` called with the latest maps: at once, when the run that goes on has ended, or after a new one."""
@@ -115,7 +150,7 @@ class EmService:
         """Forget the maps, and cancel the run that goes on."""
         self.worker.cancel()
         self._generation = self._publishers.generation
-        self.maps, self.wrong_input, self.last_run = None, [], 'none since the reset'
+        self.maps, self.found, self.wrong_input, self.last_run = None, None, [], 'none since the reset'
         self.sensors.clear()
 
     def close(self, seconds: float) -> None:
@@ -123,48 +158,90 @@ class EmService:
         self.worker.close(seconds)
 
     def _start(self, done: Callable[[Outcome], object]) -> None:
-        generation, buffer, bound = self._publishers.generation, self._associator.buffer, self._associator.buffer.bound
+        generation, bound = self._publishers.generation, self._associator.buffer.bound
         # what comes while kernels are compiled is mapped as well
-        early = None if self._kernels.has('EM') else queue.SimpleQueue[tuple[int, Any]]()
-        taken = [(len(buffer), buffer.snapshot())]
+        early = None if self._kernels.has('EM') else queue.SimpleQueue[Taken]()
+        taken = [self._take()]
 
         def readings() -> Readings:
             if early is not None:
-                self._inbox.put(lambda: early.put((len(buffer), buffer.snapshot())))
+                self._inbox.put(lambda: early.put(self._take()))
                 taken[0] = _waited_for(early, run)
             return bounded(taken[0][1], bound)
 
         def found(maps: MapSet) -> None:
-            self._publishers.publish('ml_map', generation, maps.grid, maps.ml)
-            self._publishers.publish('uncertainty_map', generation, maps.grid, maps.uncertainty)
+            if isinstance(mapper, RefiningMapper) or moved:
+                # the transform to the map changes together with the maps
+                self._inbox.put(lambda: self._show_moved(maps, mapper, taken[0][0], generation))
+            else:
+                self._show(maps, generation)
 
         def finish(outcome: Outcome) -> None:
+            # whoever waits is told the same
             if generation != self._publishers.generation:
-                # whoever waits is told the same
                 outcome.maps, outcome.message = None, 'EM was cancelled by reset'
+            elif outcome.maps is None and run.asked:
+                outcome.message = 'EM was cancelled by cancel_em'
             self._finish(outcome, taken[0][0])
+            if outcome.maps is None and run.shown:
+                self._publishers.publish('ml_map', generation, *before)
 
         parameters = self._parameters()
-        start = self.online.so_far() if self.online else None
-        run = Run(Mapper(parameters), parameters, readings, found, start)
+        mounts = dict(self.mounts())
+
+        def drive() -> Drive:
+            _, held, odometry = taken[0]
+            # after a restart the journal's readings are all there is of the odometry before
+            return Drive(recovered(Odometry.of(*odometry), held, mounts), held)
+
+        mapper, moved = self._trajectory.mapper(parameters, drive), self._trajectory.on
+        start = self.online.so_far() if self.online and self._trajectory.correction is None else None
+        # it comes back if the run ends without a map, since the map so far is shown meanwhile
+        before = self._publishers.ml_map
+        run = Run(mapper, parameters, readings, found, start)
         self._generation = generation
         self.worker.start(run, finish)
         run.waiting.append(done)
+
+    def _take(self) -> Taken:
+        buffer = self._associator.buffer
+        return len(buffer), buffer.snapshot(), self._associator.odometry
+
+    def _show(self, maps: MapSet, generation: int) -> None:
+        """Publish the maps of a run; any thread."""
+        self._publishers.publish('ml_map', generation, maps.grid, maps.ml)
+        self._publishers.publish('uncertainty_map', generation, maps.grid, maps.uncertainty)
+
+    def _show_moved(self, maps: MapSet, mapper: Any, count: int, generation: int) -> None:
+        """Go on with the trajectory of a run, and publish its maps."""
+        if generation == self._publishers.generation:
+            self._trajectory.adopt(mapper.found if isinstance(mapper, RefiningMapper) else None, count)
+            self._show(maps, generation)
+
+    def _wait_for_kernels(self, stop: Callable[[], bool]) -> None:
+        self._kernels.wait('EM', stop)
+        if self._parameters().node.refine_poses:
+            self._kernels.wait('trajectory', stop)
 
     def _finish(self, outcome: Outcome, count: int) -> None:
         maps = outcome.maps
         if maps is None:
             self.last_run = outcome.message
             self._logger.warning(f'EM: {outcome.message}')
+            if self.online:
+                # what it showed while EM ran was not published
+                self.online.show()
             return
-        self.maps, self.explained = maps, count
+        self.maps, self.found, self.explained = maps, self._trajectory.found, count
         self.wrong_input = outcome.warnings
         self.sensors.take(outcome.health)
         if self.online:
             self.online.adopt(maps)
         for warning in filter(None, [*outcome.warnings, quality_warning(maps)]):
             self._logger.warning(f'EM: {warning}')
-        self.last_run = summary(maps, sum(maps.statistics['seconds'].values()))
+        outcome.trajectory = self._trajectory.outcome()
+        said = filter(None, [summary(maps, sum(maps.statistics['seconds'].values())), outcome.trajectory])
+        self.last_run = '; '.join(said)
         self._logger.info(f'EM: {self.last_run}')
         # whoever called EM has his answer before this
         fixed, generation = dict(self.extrinsics()), self._publishers.generation
@@ -187,11 +264,17 @@ class EmService:
         """Show the map found so far, and the progress, at most `publish_rate` times a second; in the run's thread."""
         now = time.monotonic()
         rate = self._parameters().node.publish_rate
-        if run.progress is None or now - max(self._watched, run.begin) < 1.0 / rate:
+        if run.progress is None:
+            if now - max(self._told, run.begin) > TELLING:
+                self._told = now
+                self._logger.info(f'EM: {run}')
+            return
+        if now - max(self._watched, run.begin) < 1.0 / rate:
             return
         self._watched = now
         generation = self._generation
         found = run.mapper.so_far()
         if found is not None and not run.cancelled:
             self._logger.info(f'EM: {run}')
+            run.shown = True
             self._publishers.publish('ml_map', generation, *found)

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections import deque
 from collections.abc import Mapping
 from typing import Any
 
+from ..core.messages.extrinsics import LATE, LATER, Later, mount_of
 from ..core.messages.message_types import NANOSECONDS, OdometryMessage, Pose2, planar_pose
-from ..core.messages.pose_association import JUMP, LATER, Later
+from ..core.messages.pose_association import JUMP
+from ..core.messages.quaternions import rotation_of
+
+TF, TF_STATIC = '/tf', '/tf_static'
 
 PATIENCE = 0.2
 """Seconds before a frame that TF did not know is asked for again, so that a missing one costs next to nothing."""
@@ -27,12 +32,23 @@ MOST_MISSING = 1000
 """Frames whose absence, or pose, is remembered, so that names that strangers make up cost no memory."""
 
 
-class Transforms:
-    """Transforms at a stamp, from a tf2 buffer and without waiting for it; knows none without tf2_ros."""
+LASTING = 3.0
+"""Seconds without a transform to the map frame from which on there is a warning."""
 
-    def __init__(self, buffer: Any = None, error: type[Exception] = Exception) -> None:
+
+class Transforms:
+    """Transforms at a stamp, from a tf2 buffer and without waiting for it; knows none without tf2_ros.
+
+    Attributes
+    ----------
+    topics : list of str
+        That transforms come from, as the node resolves their names.
+    """
+
+    def __init__(self, buffer: Any = None, error: type[Exception] = Exception, topics: tuple[str, ...] = ()) -> None:
         """`buffer` is a `tf2_ros.Buffer`, `error` the base of its exceptions."""
         self._buffer, self._error = buffer, error
+        self.topics = topics
         self._missing: dict[tuple[str, str], float] = {}
         self._newest: int | None = None
 
@@ -46,7 +62,8 @@ class Transforms:
         buffer = tf2_ros.Buffer()
         # the listener lives as long as the buffer that it fills
         buffer.listener = tf2_ros.TransformListener(buffer, node, spin_thread=False)
-        return cls(buffer, tf2_ros.TransformException)
+        _listen_to_volatile(buffer, node)
+        return cls(buffer, tf2_ros.TransformException, tuple(map(node.resolve_topic_name, (TF, TF_STATIC))))
 
     @property
     def available(self) -> bool:
@@ -66,12 +83,12 @@ class Transforms:
                 self._buffer.clear()
         self._newest = stamp if self._newest is None else max(stamp, self._newest)
 
-    def lookup(self, target: str, source: str, stamp: int) -> Any | None:
-        """Return the `geometry_msgs/Transform` of `source` in `target` at `stamp` in nanoseconds, or None."""
+    def lookup(self, target: str, source: str, stamp: int) -> Any | Later:
+        """Return the `geometry_msgs/Transform` of `source` in `target` at `stamp` in nanoseconds, or a `Later`."""
         key = (target, source)
         # rclpy's Time raises for what is before 1970, and TF has nothing then
         if self._buffer is None or stamp < 0 or time.monotonic() < self._missing.get(key, 0.0):
-            return None
+            return LATER
         if len(self._missing) > MOST_MISSING:
             self._missing.clear()
         from rclpy.time import Time
@@ -79,9 +96,10 @@ class Transforms:
         try:
             found = self._buffer.lookup_transform(target.lstrip('/'), source.lstrip('/'), Time(nanoseconds=stamp))
         except self._error as error:
-            if 'xtrapolation' not in type(error).__name__:
-                self._missing[key] = time.monotonic() + PATIENCE
-            return None
+            if 'xtrapolation' in type(error).__name__:
+                return LATE
+            self._missing[key] = time.monotonic() + PATIENCE
+            return LATER
         self._missing.pop(key, None)
         return found.transform
 
@@ -101,8 +119,13 @@ class Extrinsics:
         """The poses of the sensors that were asked for and did not move on the robot, by frame."""
         return {frame: pose for frame, pose in self._used.items() if frame not in self._moved}
 
-    def __call__(self, base_frame: str, frame: str, stamp: int) -> Pose2 | Later | None:
-        """Return the pose of a sensor at a stamp, `LATER` if TF may still know it, None if nothing will."""
+    @property
+    def known(self) -> dict[str, Pose2]:
+        """Those, and the ones that parameters give."""
+        return {**self._given, **{frame.lstrip('/'): pose for frame, pose in self.fixed.items()}}
+
+    def __call__(self, base_frame: str, frame: str, stamp: int) -> Pose2 | Later | str | None:
+        """Return the pose of a sensor at a stamp, as `ExtrinsicsLookup` has it."""
         pose = self._look_up(base_frame, frame, stamp)
         if isinstance(pose, Pose2) and (frame in self._used or len(self._used) < MOST_MISSING):
             first = self._used.setdefault(frame, pose)
@@ -110,19 +133,21 @@ class Extrinsics:
                 self._moved.add(frame)
         return pose
 
-    def _look_up(self, base_frame: str, frame: str, stamp: int) -> Pose2 | Later | None:
+    def _look_up(self, base_frame: str, frame: str, stamp: int) -> Pose2 | Later | str | None:
         given = self._given.get(frame.lstrip('/'))
         if given is not None:
             return given
         if not self._transforms.available:
             return None
         transform = self._transforms.lookup(base_frame, frame, stamp)
-        if transform is None:
-            return LATER
-        pose = planar_pose(transform.translation, transform.rotation)
-        if pose is None:
+        if isinstance(transform, Later):
+            return transform
+        t, q = transform.translation, transform.rotation
+        rotation = rotation_of(float(q.x), float(q.y), float(q.z), float(q.w))
+        if rotation is None or not (math.isfinite(t.x) and math.isfinite(t.y)):
             self.unusable.add(frame)
-        return pose
+            return None
+        return mount_of(float(t.x), float(t.y), [row[0] for row in rotation])
 
 
 class MapFrame:
@@ -141,6 +166,25 @@ class MapFrame:
         self.timeout = timeout
         self._held: deque[OdometryMessage] = deque()
         self.dropped = 0
+        self._lack: Later | None = None
+        self._frame = ''
+        self._lacking = self._newest = 0.0
+
+    @property
+    def found(self) -> bool:
+        """Whether TF had the transform that was asked for last."""
+        return self._lack is None
+
+    def fault(self) -> str:
+        """Return what keeps odometry that comes out of the map frame for `LASTING` seconds now, in words, or ''."""
+        now = time.monotonic()
+        if self._lack is None or now - self._lacking < LASTING or now - self._newest > LASTING:
+            return ''
+        way = f'from {self._map_frame} (map_frame) to {self._frame}'
+        waiting = f'{len(self._held)} odometry messages wait for it, {self.dropped} were dropped'
+        if self._lack is LATE:
+            return f"TF's transform {way} comes later than pose_timeout, or has stopped: {waiting}"
+        return f'TF has no transform {way}: {waiting}; is a localiser running?'
 
     def convert(self, message: OdometryMessage) -> list[OdometryMessage]:
         """Take an odometry message; return those whose pose in the map frame is known now, `LOOKUPS` of them, in order.
@@ -155,6 +199,7 @@ class MapFrame:
             self.dropped += len(self._held)
             self._held.clear()
         self._held.append(message)
+        self._newest, self._frame = time.monotonic(), message.frame_id
         if len(self._held) > MOST_HELD:
             # stamps that stand still never time out
             self._held.popleft()
@@ -163,7 +208,8 @@ class MapFrame:
         for _ in range(min(len(self._held), LOOKUPS)):
             first = self._held[0]
             transform = self._transforms.lookup(self._map_frame, first.frame_id, first.stamp)
-            pose = planar_pose(transform.translation, transform.rotation) if transform is not None else None
+            pose = None if isinstance(transform, Later) else planar_pose(transform.translation, transform.rotation)
+            self._note(transform)
             if pose is not None and first.pose is not None:
                 ready.append(first._replace(frame_id=self._map_frame, pose=pose.compose(first.pose)))
             elif first.pose is None:
@@ -174,3 +220,29 @@ class MapFrame:
                 self.dropped += 1
             self._held.popleft()
         return ready
+
+    def _note(self, transform: Any | Later) -> None:
+        """Remember since when there is no transform."""
+        if not isinstance(transform, Later):
+            self._lack = None
+        else:
+            if self._lack is None:
+                self._lacking = time.monotonic()
+            self._lack = transform
+
+
+def _listen_to_volatile(buffer: Any, node: Any) -> None:
+    """Take static transforms from publishers, too, that keep none for late subscribers.
+
+    tf2's own listener asks for those that do (transient local), and gets nothing from others, such as a bag recorded
+    without its quality of service. Whoever fits both is heard twice, which changes nothing.
+    """
+    from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+    from tf2_msgs.msg import TFMessage
+
+    def take(message: Any) -> None:
+        for transform in message.transforms:
+            buffer.set_transform_static(transform, 'default_authority')
+
+    quality = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.VOLATILE)
+    node.create_subscription(TFMessage, TF_STATIC, take, quality)

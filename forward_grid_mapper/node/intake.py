@@ -17,6 +17,7 @@ from ..core.common.parameters import Parameters
 from ..core.messages.message_types import OdometryMessage, RangeMessage, odometry_message, range_message
 from ..core.messages.pose_association import MOST_WAITING, PoseAssociator
 from .frames import MapFrame
+from .heard import Heard
 from .losses import LASTING, Losses
 
 QUEUE = 2000
@@ -36,6 +37,8 @@ class Intake:
         Whether lost messages are a fault, or to be expected.
     range_losses : list of Losses
         Of each Range topic.
+    heard : Heard
+        When each sensor sent last.
     """
 
     def __init__(
@@ -46,7 +49,7 @@ class Intake:
         map_frame: MapFrame,
         on_taken: Callable[[int], object],
     ) -> None:
-        """Subscribe; messages are held back until `begin`.
+        """Prepare to `subscribe`; messages are held back until `begin`.
 
         Parameters
         ----------
@@ -61,19 +64,40 @@ class Intake:
         self._node, self._associator, self._map_frame, self._on_taken = node, associator, map_frame, on_taken
         self.paused = self._ready = False
         self.reliable = own.range_reliability == 'reliable'
+        self.heard = Heard()
         self._held: deque[tuple[RangeMessage | OdometryMessage, int, bool]] = deque()
         self._ranges_held = self._refused = self._told_of = 0
         self._last_refused: RangeMessage | None = None
         self._next_warning = 0.0
         self._more = node.create_guard_condition(self.work)
+        self._own = own
+        self._topics = list(dict.fromkeys(own.range_topics))
+        self._subscribed: list[Any] = []
         self.subscriptions: dict[str, QoSProfile] = {}
-        self.range_losses: list[Losses] = []
-        for topic in dict.fromkeys(own.range_topics):
-            losses = self._losses(topic)
-            self.range_losses.append(losses)
-            self._subscribe(Range, topic, own.range_reliability, partial(self.on_range, losses), losses)
+        self.range_losses = [self._losses(topic) for topic in self._topics]
         self._odometry_losses = self._losses(own.odom_topic)
+
+    @property
+    def listening(self) -> bool:
+        """Whether messages are taken."""
+        return bool(self._subscribed)
+
+    def subscribe(self) -> None:
+        """Take messages from here on."""
+        own = self._own
+        for topic, losses in zip(self._topics, self.range_losses, strict=True):
+            self._subscribe(Range, topic, own.range_reliability, partial(self.on_range, losses), losses)
         self._subscribe(Odometry, own.odom_topic, own.odom_reliability, self.on_odometry, self._odometry_losses)
+
+    def unsubscribe(self) -> None:
+        """Take no messages any more; what is missing when they are taken again was not lost."""
+        for subscription in self._subscribed:
+            self._node.destroy_subscription(subscription)
+        self._subscribed.clear()
+        self.subscriptions.clear()
+        self.heard.clear()
+        for losses in (*self.range_losses, self._odometry_losses):
+            losses.begin_anew()
 
     def _losses(self, topic: str) -> Losses:
         return Losses(lambda: int(self._node.count_publishers(self._node.resolve_topic_name(topic))))
@@ -81,7 +105,8 @@ class Intake:
     def _subscribe(self, kind: Any, topic: str, reliability: str, callback: Any, losses: Losses) -> None:
         quality = QoSProfile(depth=QUEUE, reliability=ReliabilityPolicy[reliability.upper()])
         events = SubscriptionEventCallbacks(message_lost=losses.told)
-        self._node.create_subscription(kind, topic, callback, quality, event_callbacks=events)
+        made = self._node.create_subscription(kind, topic, callback, quality, event_callbacks=events)
+        self._subscribed.append(made)
         self.subscriptions[self._node.resolve_topic_name(topic)] = quality
 
     # the account
@@ -142,6 +167,7 @@ class Intake:
         """Take a Range."""
         made, sent = range_message(message), info['source_timestamp']
         losses.taken(info, made.frame_id, made.stamp)
+        self.heard.note(made.frame_id)
         self._on_taken(sent)
         if self._ready and not self._held and not self._associator.behind:
             self._take(made, sent, self.paused)
@@ -195,6 +221,7 @@ class Intake:
         for losses in (*self.range_losses, self._odometry_losses):
             losses.clear()
         self._told_of = 0
+        self.heard.clear()
 
     @property
     def busy(self) -> bool:

@@ -22,18 +22,28 @@ class Kernels:
     ----------
     stage : str
         What is being compiled; empty when all is there.
+    working : bool
+        Whether its thread still compiles or imports, during which the interpreter must not be taken down.
     """
 
-    def __init__(self, log: Callable[[str], object], error: Callable[[str], object], online: bool) -> None:
-        """`log` takes notes, `error` what went wrong; without `online`, the kernels of the online map are left out."""
+    def __init__(
+        self, log: Callable[[str], object], error: Callable[[str], object], online: bool, refine: bool = False
+    ) -> None:
+        """`log` takes notes, `error` what went wrong.
+
+        The kernels of the online map are left out without `online`, those that find a trajectory without `refine`.
+        """
         self._log = log
         self.worker = Worker('kernels', error, lasting=True)
-        self._steps = {name: step for name, step in warm_up.STEPS.items() if online or name != 'online map'}
+        wanted = {'online map': online, 'trajectory': refine}
+        self._steps = {name: step for name, step in warm_up.STEPS.items() if wanted.get(name, True)}
         self._done = {name: threading.Event() for name in self._steps}
         self.stage = next(iter(self._steps))
+        self.working = False
 
     def begin(self, ready: Callable[[], None]) -> None:
         """Begin to compile; `ready` is called, in another thread, when the live map has its kernels."""
+        self.working = True
         self._log('preparing kernels; the first start compiles them, which takes half a minute and more')
         begin = time.monotonic()
         # the collector would go through all that the compiler made again and again, and keep the executor waiting
@@ -42,14 +52,14 @@ class Kernels:
             self.worker.put(partial(self._compile, name, ready, begin), lambda why: self._give_up(ready))
 
     def wait(self, name: str, stop: Callable[[], bool] = lambda: False) -> None:
-        """Wait for the kernels of a step.
+        """Wait for the kernels of a step; those of a step that was left out are compiled by who needs them.
 
         Raises
         ------
         Cancelled
             When `stop` returns true.
         """
-        while not self._done[name].wait(0.1):
+        while name in self._done and not self._done[name].wait(0.1):
             if stop():
                 raise Cancelled('cancelled while kernels were compiled')
 
@@ -84,3 +94,4 @@ class Kernels:
         # what is there by now stays; the collector need not look at it again
         gc.freeze()
         gc.enable()
+        self.working = False

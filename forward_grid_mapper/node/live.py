@@ -20,6 +20,10 @@ BATCH = 20_000
 """Readings that are added at once, so that a reset need not wait for half a million."""
 
 
+Place = Callable[[Readings], Readings]
+"""Moves readings to where they belong on the map."""
+
+
 class LiveSnapshot(NamedTuple):
     """The live map at a moment: float32 probabilities, NaN where not observed, shape `grid.shape`."""
 
@@ -68,12 +72,21 @@ class LiveMap:
         self._publishing = False
         self.worker.put(prepare)
 
-    def offer(self, readings: Readings) -> None:
-        """Have readings added soon."""
+    def offer(self, readings: Readings, place: Place | None = None) -> None:
+        """Have readings added soon, where `place` puts them."""
         self._offered += len(readings)
         for first in range(0, len(readings), BATCH):
             part = readings.select(slice(first, first + BATCH))
-            self.worker.put(partial(self._add, part, self.generation))
+            self.worker.put(partial(self._add, part, place, self.generation))
+
+    def replace(self, made: LogOddsMap) -> None:
+        """Go on from another map, in place of all that was offered so far."""
+        self.worker.put(partial(self._replace, made, self.generation))
+        self.touch()
+
+    def touch(self) -> None:
+        """Have the map published again."""
+        self._published = -1
 
     def change(self, parameters: Parameters) -> None:
         """Use other parameters for the readings that come."""
@@ -109,15 +122,21 @@ class LiveMap:
         """
         return self.worker.ask(partial(self._snapshot, self.generation))
 
-    def _add(self, readings: Readings, generation: int) -> None:
+    def _add(self, readings: Readings, place: Place | None, generation: int) -> None:
         if generation != self.generation:
             return
         try:
-            self._map.add(readings)
+            self._map.add(readings if place is None else place(readings))
         except (MapperError, MemoryError) as error:
             why = str(error) or 'there is not enough memory'
             raise MapperError(f'{len(readings)} readings are not in the live map: {why}') from None
         self.grid = self._map.grid
+
+    def _replace(self, made: LogOddsMap, generation: int) -> None:
+        if generation == self.generation:
+            made.change(self._parameters)
+            self._map = made
+            self.grid = made.grid
 
     def _clear(self) -> None:
         self._map = LogOddsMap(self._parameters)

@@ -39,6 +39,10 @@ class Losses:
         """Begin with nothing lost; `publishers` returns how many publish the topic now."""
         self._publishers = publishers
         self.clear()
+        self.begin_anew()
+
+    def begin_anew(self) -> None:
+        """Forget which message came last, since nobody listened for a while."""
         self._newest: list[int] = []
         self._stamps: dict[str, tuple[int, float, int]] = {}
 

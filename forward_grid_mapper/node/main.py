@@ -23,7 +23,9 @@ USAGE = """usage: mapper [--ros-args ...]
 
 Maps sonar Range and Odometry: publishes a live map, and on ~/run_em the maximum likelihood and uncertainty maps.
 Parameters: --ros-args -p NAME:=VALUE, or --params-file FILE (config/mapper.yaml lists all). Remap the topics sonar
-and odom with -r sonar:=/my/sonar -r odom:=/my/odom."""
+and odom with -r sonar:=/my/sonar -r odom:=/my/odom.
+
+example: mapper --ros-args --params-file my_robot.yaml -r sonar:=/ultrasonic"""
 
 
 LOG_EVERY = 10.0
@@ -68,6 +70,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         import rclpy
         from rclpy.exceptions import NameValidationException
         from rclpy.executors import SingleThreadedExecutor
+        from rclpy.impl.implementation_singleton import rclpy_implementation
         from rclpy.signals import SignalHandlerOptions
         from rclpy.utilities import remove_ros_args
     except ImportError as error:
@@ -78,19 +81,24 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 1
     # callbacks get their turn soon where EM is between two kernels
     sys.setswitchinterval(0.0005)
+    # numpy starts threads when it is imported, which must have the signals blocked
+    from . import complaints
     from .mapper_node import MapperNode
 
+    if wrong := complaints.of_domain(os.environ):
+        print(f'mapper: error: {wrong}', file=sys.stderr)
+        return 1
     try:
         rclpy.init(args=['mapper', *arguments], signal_handler_options=SignalHandlerOptions.NO)
+        left = remove_ros_args(['mapper', *arguments])[1:]
+    except rclpy_implementation.UnknownROSArgsError as error:
+        print(f'mapper: error: {complaints.of_ros_arguments(str(error))}', file=sys.stderr)
+        return 2
     except Exception as error:  # rclpy raises classes of its C extension, for a parameter file with a fault for one
-        print(f'mapper: error: {error}', file=sys.stderr)
+        print(f'mapper: error: {complaints.of_ros(error)}', file=sys.stderr)
         return 1
-    left = remove_ros_args(['mapper', *arguments])[1:]
     if left:
-        print(
-            f'mapper: error: {" ".join(left)} means nothing; ROS options come after --ros-args\n{USAGE}',
-            file=sys.stderr,
-        )
+        print(f'mapper: error: {complaints.of_arguments(left)}\n{USAGE}', file=sys.stderr)
         return 2
     node = None
     try:
@@ -98,13 +106,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
         executor = SingleThreadedExecutor()
         executor.add_node(node)
         node.when_failed = lambda: executor.create_task(_raise_stop)
-        node.start()
+        if node.parameters.node.autostart:
+            node.start()
+        else:
+            node.wait_for_manager()
         stopper.call(lambda: executor.create_task(_raise_stop))
         _spin(executor, node)
     except _Stop:
         pass
-    except (MapperError, NameValidationException, ValueError) as error:
-        print(f'mapper: error: {error}', file=sys.stderr)
+    except (MapperError, NameValidationException, ValueError, rclpy_implementation.RCLError) as error:
+        wrong = str(error) if isinstance(error, MapperError) else complaints.of_ros(error)
+        print(f'mapper: error: {wrong}', file=sys.stderr)
         return 1
     finally:
         if node is not None:
@@ -115,7 +127,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if node is not None and node.failure:
         print(f'mapper: error: {node.failure}', file=sys.stderr)
         code = 1
-    if node is not None and node.kernels.stage:
+    if node is not None and node.kernels is not None and node.kernels.working:
         # the compiler must not be at work when its libraries are unloaded
         sys.stdout.flush()
         sys.stderr.flush()

@@ -13,10 +13,12 @@ from nav_msgs.srv import GetMap
 from numpy.typing import NDArray
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
+from ..core.common.errors import MapperError
 from ..core.common.grid import Grid
 from .background import Worker
 from .deferred import DeferredService, Reply
 from .grid_message import grid_message
+from .map_updates import MapUpdates
 
 MAPS = ('live_map', 'ml_map', 'uncertainty_map')
 LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -52,13 +54,24 @@ class MapPublishers:
         before : callable
             Given the name of a map that is asked for, what to call when it is up to date, and what to call with the
             reason if it cannot be.
+
+        Raises
+        ------
+        MapperError
+            If two maps were given the same topic.
         """
         self.worker = Worker('maps', node.get_logger().error)
         self.generation = 0
         self._node, self._resolution, self._frame, self._before = node, resolution, frame, before
         self._out = {name: node.create_publisher(OccupancyGrid, f'~/{name}', LATCHED) for name in MAPS}
+        topics = [self._out[name].topic_name for name in MAPS]
+        if twice := sorted(topic for topic in set(topics) if topics.count(topic) > 1):
+            raise MapperError(f'{twice[0]} can have one map only: give the others another topic, or leave them theirs')
+        self._updates = MapUpdates.of(node, self._out['live_map'])
         self._lock = threading.Lock()
         self._pending: dict[str, tuple[Grid, NDArray[Any]]] = {}
+        self._nothing = Grid(resolution, 0, 0, 1, 1), np.full((1, 1), -1, np.int8)
+        self._ml_map = self._nothing
         nothing = Grid(resolution, 0, 0, 0, 0)
         self.latest = {name: self._message(nothing, np.zeros(nothing.shape, np.int8)) for name in MAPS}
         for name in MAPS:
@@ -82,24 +95,39 @@ class MapPublishers:
                 return
             waits = name in self._pending
             self._pending[name] = grid, values
+            if name == 'ml_map':
+                self._ml_map = grid, values
         if not waits:
             self.worker.put(partial(self._publish, name))
 
+    @property
+    def ml_map(self) -> tuple[Grid, NDArray[np.int8]]:
+        """Grid and cells of the ML map that was given last; a single cell not observed if none was."""
+        with self._lock:
+            return self._ml_map
+
+    def refresh(self) -> None:
+        """Have the whole live map published where somebody needs it, after only parts of it were."""
+        if self._updates and self._updates.stale:
+            self.worker.put(self._updates.refresh)
+
     def clear(self) -> None:
         """Have empty maps published, after which none of those that were there before comes."""
-        nothing = Grid(self._resolution, 0, 0, 1, 1)
         with self._lock:
             self.generation += 1
             generation = self.generation
         for name in MAPS:
-            self.publish(name, generation, nothing, np.full(nothing.shape, -1, np.int8))
+            self.publish(name, generation, *self._nothing)
 
     def _publish(self, name: str) -> None:
         with self._lock:
             grid, values = self._pending.pop(name)
         message = self._message(grid, values)
         self.latest[name] = message
-        self._out[name].publish(message)
+        if name == 'live_map' and self._updates:
+            self._updates.publish(message)
+        else:
+            self._out[name].publish(message)
 
     def _message(self, grid: Grid, values: NDArray[Any]) -> OccupancyGrid:
         # tf2 refuses the leading slash that ROS 1 had

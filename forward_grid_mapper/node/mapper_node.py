@@ -11,16 +11,17 @@ from functools import partial
 from typing import Any
 
 from rclpy.clock import Clock, ClockType
-from rclpy.node import Node
 from std_srvs.srv import SetBool, Trigger
 
-from ..core.common.errors import MapperError
+from ..core.common.errors import MapperError, ParameterError
 from ..core.common.parameters import Parameters
+from ..core.maps.log_odds_map import LogOddsMap
 from ..core.messages.message_types import NANOSECONDS
 from ..core.messages.pose_association import PoseAssociator
 from ..core.messages.reading_buffer import bounded
 from . import ros_parameters
 from .background import Inbox, Worker
+from .complaints import of_ros
 from .deferred import DeferredService, Reply
 from .diagnostics import Health
 from .em_service import EmService
@@ -29,17 +30,19 @@ from .intake import AT_ONCE, Intake
 from .journal_keeper import JournalKeeper
 from .kernels import Kernels
 from .live import LiveMap, LiveSnapshot
+from .managed import ManagedNode
 from .map_publishers import MapPublishers
 from .online import OnlineSnapshot, OnlineWorker
 from .reporter import Reporter
 from .saver import Account, Saver
+from .trajectory import Trajectory
 
 NAME = 'forward_grid_mapper'
 FEED_PERIOD = 0.02
 """Seconds between hand-overs of readings to the maps."""
 
 
-class MapperNode(Node):
+class MapperNode(ManagedNode):
     """Maps what it receives. All callbacks run in one thread, and none of them does long work.
 
     Attributes
@@ -57,7 +60,7 @@ class MapperNode(Node):
     """
 
     def __init__(self, **options: Any) -> None:
-        """Declare the parameters; `start` begins to listen.
+        """Declare the parameters; `start`, or a lifecycle manager, has it begin to listen.
 
         Raises
         ------
@@ -73,44 +76,55 @@ class MapperNode(Node):
         self.failure = ''
         self.when_failed: Callable[[], object] = lambda: None
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self.kernels: Kernels | None = None
+        self._begin_anew()
+
+    def _begin_anew(self) -> None:
         self._started = self.mapping = False
         self._when_ready: list[Callable[[], None]] = []
         self._lacks = {'journal', 'kernels'}
         self._fed = {'live': 0, 'online': 0}
         self.workers: list[Worker] = []
 
-    def start(self) -> None:
-        """Create topics and services; from here on messages are taken, and mapped as soon as it can be.
+    def configure(self) -> None:
+        """Create topics and services, read the journal, and compile; messages are taken once it is active.
 
         Raises
         ------
         MapperError
             If the journal or the map frame cannot be had.
         """
+        self._begin_anew()
         node, log = self.parameters.node, self.get_logger()
-        odometry = self.resolve_topic_name(node.odom_topic)
-        if odometry in map(self.resolve_topic_name, node.range_topics):
+        odometry = self._resolved('odom_topic', node.odom_topic)
+        if not node.range_topics:
+            raise MapperError('range_topics is empty; give it the name of a topic of sensor_msgs/Range, or several')
+        if odometry in [self._resolved('range_topics', topic) for topic in node.range_topics]:
             raise MapperError(f'{odometry} cannot be a topic of Range and of odometry: set range_topics or odom_topic')
         transforms = Transforms.of(self)
         extrinsics = Extrinsics(self._given_extrinsics, transforms)
-        self._map_frame = MapFrame(node.map_frame, transforms, self.parameters.association.pose_timeout)
-        if node.map_frame and not transforms.available:
+        # with refine_poses it is this node that gives the transform
+        looked_up = '' if node.refine_poses else node.map_frame
+        self._map_frame = MapFrame(looked_up, transforms, self.parameters.association.pose_timeout)
+        if looked_up and not transforms.available:
             raise MapperError(f'map_frame is {node.map_frame}, but tf2_ros is not installed to look it up')
         self.associator = PoseAssociator(extrinsics, self.parameters, at_once=AT_ONCE)
         self.journal = JournalKeeper(self, node.journal, self.associator)
-        self.inbox = Inbox(self)
-        self.kernels = Kernels(log.info, log.error, node.online)
-        self.maps = MapPublishers(self, self.parameters.grid.resolution, self._frame, self._up_to_date)
-        self.live = LiveMap(self.parameters, self._show_live, log.error, lambda: self.kernels.wait('live map'))
-        self.em = EmService(lambda: self.parameters, self.associator, self.maps, self.inbox, self.kernels, log)
+        inbox = self.inbox = Inbox(self)
+        kernels = self.kernels = Kernels(log.info, log.error, node.online, node.refine_poses)
+        self.trajectory = trajectory = Trajectory(self, self.associator, self._steady)
+        self.maps = MapPublishers(self, self.parameters.grid.resolution, lambda: trajectory.frame, self._up_to_date)
+        trajectory.publishing, trajectory.changed = self.maps.worker, self._map_anew
+        trajectory.begin()
+        self.live = LiveMap(self.parameters, self._show_live, log.error, lambda: kernels.wait('live map'))
+        self.em = EmService(lambda: self.parameters, self.associator, trajectory, self.maps, inbox, kernels, log)
         self._extrinsics = extrinsics
-        self.em.extrinsics = lambda: extrinsics.fixed
-        self.online = self.em.online = self._online_worker() if node.online else None
+        self.em.extrinsics, self.em.mounts = lambda: extrinsics.fixed, lambda: extrinsics.known
+        self.online = self.em.online = self._online_worker(kernels) if node.online else None
         self.saver = Saver(self.em, self.live, self._account, log)
         self._aside = Worker('readings', log.error)
         self.workers = [self._aside, self.live.worker, self.maps.worker, self.em.worker.worker]
-        self.workers += [self.saver.worker, self.kernels.worker]
-        self.workers += [self.online.worker] if self.online else []
+        self.workers += [self.saver.worker, *([self.online.worker] if self.online else []), kernels.worker]
         health = Health()
         self.intake = Intake(self, self.parameters, self.associator, self._map_frame, health.taken)
         self.reporter = Reporter(
@@ -118,15 +132,17 @@ class MapperNode(Node):
             health,
             self.intake,
             self.associator,
-            (extrinsics, self._map_frame),
+            (extrinsics, self._map_frame, transforms),
             self.live,
             self.em,
             self.journal,
-            self.kernels,
+            self.trajectory,
+            kernels,
             self.workers,
         )
         for name, handler in (
             ('~/run_em', self.em.run_em),
+            ('~/cancel_em', self.em.cancel),
             ('~/save_maps', self.saver.save_maps),
             ('~/reset', self.reset),
         ):
@@ -135,32 +151,52 @@ class MapperNode(Node):
         self.create_timer(1.0, self.reporter.report, clock=self._steady)
         self._live_timer = self.create_timer(1.0 / node.publish_rate, self.publish_live, clock=self._steady)
         self._started = True
-        topics = ', '.join(self.resolve_topic_name(topic) for topic in node.range_topics)
-        log.info(
-            f'listening: Range from {topics} ({node.range_reliability}), odometry from '
-            f'{self.resolve_topic_name(node.odom_topic)}, sensor poses from '
-            f'{"parameters and TF" if transforms.available else "parameters (tf2_ros is not installed)"}'
-        )
+        self._poses_from = 'parameters and TF' if transforms.available else 'parameters (tf2_ros is not installed)'
         # the live map has every reading, also those that max_readings drops
         self.associator.buffer.before_thinning.append(self._feed)
-        self.kernels.begin(lambda: self.inbox.put(lambda: self._has('kernels')))
-        self._aside.put(self._restore, lambda why: self.inbox.put(lambda: self._fail(why)))
+        kernels.begin(lambda: inbox.put(lambda: self._has('kernels')))
+        self._aside.put(partial(self._restore, self.journal, inbox), lambda why: inbox.put(lambda: self._fail(why)))
+
+    def _resolved(self, parameter: str, topic: str) -> str:
+        """Return the full name of a topic that a parameter gives."""
+        try:
+            return str(self.resolve_topic_name(topic))
+        except Exception as error:  # a class of rclpy's C extension
+            raise MapperError(f'{parameter}: {topic!r} is no name of a topic: {of_ros(error)}') from None
+
+    def activate(self) -> None:
+        """Take messages from here on; they are mapped as soon as it can be."""
+        self.intake.subscribe()
+        node = self.parameters.node
+        topics = ', '.join(self.resolve_topic_name(topic) for topic in node.range_topics)
+        self.get_logger().info(
+            f'listening: Range from {topics} ({node.range_reliability}), odometry from '
+            f'{self.resolve_topic_name(node.odom_topic)}, sensor poses from {self._poses_from}'
+        )
+
+    def deactivate(self) -> None:
+        """Take no messages any more; maps and services stay."""
+        self.intake.unsubscribe()
+        self.get_logger().info('inactive: nothing is received; maps and services stay')
 
     def close(self) -> None:
-        """Cancel what goes on in the background."""
-        if not self._started:
-            return
-        self.em.close(2.0)
-        if self.online:
-            self.online.close(2.0)
-        self.live.worker.close(0.5)
-        self.journal.close()
+        """End what goes on in the background."""
+        if self._started:
+            self._started = self.mapping = False
+            self.em.close(2.0)
+            if self.online:
+                self.online.close(2.0)
+            self.live.worker.close(0.5)
+            self.journal.close()
+        # kernels are compiled to the end, whoever needs them next
+        for worker in self.workers[:-1]:
+            worker.close(0.5)
 
     # the start
 
-    def _restore(self) -> None:
-        self.journal.restore()
-        self.inbox.put(lambda: self._has('journal'))
+    def _restore(self, journal: JournalKeeper, inbox: Inbox) -> None:
+        journal.restore()
+        inbox.put(lambda: self._has('journal'))
 
     def _fail(self, why: str) -> None:
         self.failure = why
@@ -205,6 +241,11 @@ class MapperNode(Node):
     # parameters
 
     def _accept(self, parameters: Parameters) -> None:
+        refine = self.parameters.node.refine_poses, parameters.node.refine_poses
+        if self._started and parameters.node.map_frame and refine[0] != refine[1]:
+            raise ParameterError(
+                'refine_poses says who gives the transform from map_frame, which is set: restart the node to change it'
+            )
         before, self.parameters = self.parameters, parameters
         if not self._started:
             return
@@ -226,14 +267,24 @@ class MapperNode(Node):
 
     # maps
 
-    def _frame(self) -> str:
-        return self.associator.map_frame or self.parameters.node.map_frame
+    def _map_anew(self, live: LogOddsMap | None, count: int) -> None:
+        """Go on along another trajectory: from the live map of the first `count` readings, and without the online map.
+
+        Without a live map only the frame has another name.
+        """
+        if live is None:
+            self.live.touch()
+            return
+        self.live.replace(live)
+        self._fed['live'] = count
+        self._restart_online()
+        self._feed()
 
     def _feed(self) -> None:
         """Hand the readings that came to the maps; their threads add them."""
         buffer = self.associator.buffer
         if len(buffer) > self._fed['live']:
-            self.live.offer(buffer.snapshot(self._fed['live']))
+            self.live.offer(buffer.snapshot(self._fed['live']), self.trajectory.place)
             self._fed['live'] = len(buffer)
         if self.online is None:
             return
@@ -241,7 +292,7 @@ class MapperNode(Node):
             if buffer.bound and self.online.kept > buffer.bound + buffer.bound // 4:
                 self._restart_online()
             else:
-                self.online.offer(buffer.snapshot(self._fed['online']))
+                self.online.offer(buffer.snapshot(self._fed['online']), self.trajectory.place)
                 self._fed['online'] = len(buffer)
         self.online.tick()
 
@@ -250,6 +301,7 @@ class MapperNode(Node):
         if self.mapping:
             self._feed()
             self.live.publish()
+            self.maps.refresh()
 
     def _show_live(self, snapshot: LiveSnapshot) -> None:
         self.maps.publish('live_map', snapshot.generation, snapshot.grid, snapshot.probability)
@@ -263,12 +315,12 @@ class MapperNode(Node):
         else:
             answer()
 
-    def _online_worker(self) -> OnlineWorker:
+    def _online_worker(self, kernels: Kernels) -> OnlineWorker:
         def publish(snapshot: OnlineSnapshot) -> None:
             generation = self.maps.generation
             self.inbox.put(lambda: self._show_online(snapshot, generation))
 
-        return OnlineWorker(self.parameters, publish, self.get_logger().error, lambda: self.kernels.wait('online map'))
+        return OnlineWorker(self.parameters, publish, self.get_logger().error, lambda: kernels.wait('online map'))
 
     def _show_online(self, snapshot: OnlineSnapshot, generation: int) -> None:
         # EM shows its own map while it runs
@@ -281,8 +333,8 @@ class MapperNode(Node):
         if self.online:
             buffer = self.associator.buffer
             self._fed['online'] = len(buffer)
-            held, bound = buffer.snapshot(), buffer.bound
-            self.online.restart(self.parameters, (lambda: bounded(held, bound)) if len(held) else None)
+            held, bound, place = buffer.snapshot(), buffer.bound, self.trajectory.place or (lambda readings: readings)
+            self.online.restart(self.parameters, (lambda: place(bounded(held, bound))) if len(held) else None)
 
     # services
 
@@ -295,6 +347,7 @@ class MapperNode(Node):
         self.intake.forget()
         kept = self.journal.reset()
         # late subscribers must not get the maps that were forgotten
+        self.trajectory.begin()
         self.maps.clear()
         self.em.reset()
         self.live.restart(self.parameters, self.maps.generation)
@@ -316,7 +369,7 @@ class MapperNode(Node):
             'range_topics': [self.resolve_topic_name(topic) for topic in node.range_topics],
             'odom_topic': self.resolve_topic_name(node.odom_topic),
             'odom_frame': associator.map_frame,
-            'map_frame': associator.map_frame,
+            'map_frame': self.trajectory.frame,
             'base_frame': associator.base_frame,
             'extrinsics': self._extrinsics.fixed,
             'counts': {
@@ -328,5 +381,5 @@ class MapperNode(Node):
             },
             'warnings': [*associator.limits.warnings(), *self.intake.loss_note()],
         }
-        path = list(associator.path)
-        return Account(source, len(associator.buffer), path, node.save_directory, f'Maps of {name}')
+        path, odometry = list(associator.path), associator.odometry
+        return Account(source, len(associator.buffer), path, odometry, node.save_directory, f'Maps of {name}')

@@ -74,10 +74,10 @@ class OnlineWorker:
         self._next = 0.0
         self.worker.put(prepare)
 
-    def offer(self, readings: Readings) -> None:
-        """Have readings added soon."""
+    def offer(self, readings: Readings, place: Callable[[Readings], Readings] | None = None) -> None:
+        """Have readings added soon, where `place` puts them."""
         wanted = self._map
-        self.worker.put(lambda: self._add(wanted, lambda: readings))
+        self.worker.put(lambda: self._add(wanted, lambda: place(readings) if place else readings))
 
     def restart(self, parameters: Parameters, readings: Callable[[], Readings] | None = None) -> None:
         """Forget the map; begin anew with other parameters and, if given, the readings that `readings` returns.
@@ -104,6 +104,10 @@ class OnlineWorker:
         self.epoch += 1
         wanted, self._start = self._map, (maps.grid, maps.searched)
         self.worker.put(lambda: self._adopt(wanted, maps))
+
+    def show(self) -> None:
+        """Have the map published again, even if it does not change."""
+        self._changed = True
 
     def so_far(self) -> tuple[Grid, NDArray[np.int8]] | None:
         """Return the grid and the map to start EM from, as of the last snapshot, or None if there is none yet."""

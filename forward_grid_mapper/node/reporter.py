@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 
+from ..core.messages.extrinsics import STEEP
 from ..core.messages.pose_association import MOST_FRAMES, PoseAssociator
+from ..core.messages.rep117 import REASONS
 from . import diagnostics
 from .background import Worker
 from .em_service import EmService
-from .frames import Extrinsics, MapFrame
+from .frames import Extrinsics, MapFrame, Transforms
 from .intake import Intake
 from .journal_keeper import JournalKeeper
 from .kernels import Kernels
 from .live import LiveMap
 from .surroundings import Surroundings
+from .trajectory import Trajectory
 
 
 class Reporter:
@@ -28,20 +31,26 @@ class Reporter:
         health: diagnostics.Health,
         intake: Intake,
         associator: PoseAssociator,
-        frames: tuple[Extrinsics, MapFrame],
+        frames: tuple[Extrinsics, MapFrame, Transforms],
         live: LiveMap,
         em: EmService,
         journal: JournalKeeper,
+        trajectory: Trajectory,
         kernels: Kernels,
         workers: Iterable[Worker],
     ) -> None:
         """Prepare; `workers` are all that work in the background."""
         self._node, self._health, self._intake, self._associator = node, health, intake, associator
-        self._extrinsics, self._map_frame = frames
-        self._live, self._em, self._journal = live, em, journal
+        self._extrinsics, self._map_frame, transforms = frames
+        self._live, self._em, self._journal, self._trajectory = live, em, journal, trajectory
         self._kernels, self._workers = kernels, list(workers)
-        self._surroundings = Surroundings(node, intake.subscriptions)
+        self._surroundings = Surroundings(
+            node, intake.subscriptions, transforms.topics, lambda: bool(associator.unknown_frames)
+        )
         self._reported: set[str] = set()
+        self._lost: set[str] = set()
+        self._quiet: set[str] = set()
+        self._no_map_frame = False
         self._out = node.create_publisher(DiagnosticArray, '/diagnostics', 10)
 
     def report(self) -> None:
@@ -52,12 +61,20 @@ class Reporter:
             {'odometry without a transform to map_frame': self._map_frame.dropped} if self._map_frame.dropped else {}
         )
         statuses = self._health.statuses(
-            name, self._intake, self._associator, self._em.current, self._em.last_run, self._live.grid, extra
+            name,
+            self._intake,
+            self._associator,
+            self._em.current,
+            self._em.last_run,
+            self._live.grid,
+            extra,
+            self._map_frame_fault(),
         )
         faults = [*self._intake.faults(), *self._surroundings.faults()]
         diagnostics.add_faults(statuses[0], [*faults, *self._associator.limits.warnings(), *self._em.wrong_input])
-        statuses += self._journal.statuses(name)
-        statuses.append(self._em.sensors.status(name, self._associator.buffer.counts()))
+        statuses += [*self._journal.statuses(name), *self._trajectory.statuses(name)]
+        counts = self._associator.buffer.counts()
+        statuses.append(self._em.sensors.status(name, counts, self._silent(counts)))
         statuses.append(self._background(name))
         self._out.publish(diagnostics.array(statuses, self._node.get_clock().now().to_msg()))
 
@@ -75,14 +92,41 @@ class Reporter:
         level = DiagnosticStatus.WARN if failed else DiagnosticStatus.OK
         return diagnostics.status(f'{name}: background', level, message, name, values)
 
+    def _silent(self, counts: Mapping[str, Any]) -> dict[str, float]:
+        """Return the sensors that stopped sending and for how long; the log is told of them and of their return."""
+        found = {frame: seconds for frame, seconds in self._intake.heard.silent().items() if frame in counts}
+        log = self._node.get_logger()
+        if new := found.keys() - self._quiet:
+            log.warning(f'sensors that send nothing any more, while others do: {diagnostics.listed(new)}')
+        # a reset forgets who was silent, too
+        if back := [frame for frame in self._quiet - found.keys() if frame in self._intake.heard]:
+            log.info(f'sensors that send again: {diagnostics.listed(back)}')
+        self._quiet = set(found)
+        return found
+
+    def _map_frame_fault(self) -> str:
+        """Return what is wrong with the transform to the map frame; the log is told when it begins and when it ends."""
+        fault = self._map_frame.fault()
+        if fault and not self._no_map_frame:
+            self._no_map_frame = True
+            self._node.get_logger().warning(f'no reading gets a pose: {fault}')
+        elif self._no_map_frame and self._map_frame.found:
+            self._no_map_frame = False
+            self._node.get_logger().info('the transform to map_frame is there')
+        return fault
+
     def _name_frames(self) -> None:
-        """Name sensors without a pose in the log, each once."""
-        for frame in sorted(self._associator.unknown_frames - self._reported)[: diagnostics.SHOWN]:
+        """Name sensors without a pose in the log, each once, and those that have one after all."""
+        unknown = self._associator.unknown_frames
+        # a reset forgets which are unknown, too
+        for frame in sorted((self._lost - unknown).intersection(self._associator.buffer.counts())):
+            self._node.get_logger().info(f'sensor {frame} has a pose on the robot now')
+        for frame in sorted(unknown - self._reported)[: diagnostics.SHOWN]:
             if len(self._reported) >= MOST_FRAMES:
                 break
             self._reported.add(frame)
             why = (
-                'its transform is not normalised, or its axis leaves the plane by more than 60°'
+                'its transform is not normalised, or not finite'
                 if frame in self._extrinsics.unusable
                 else 'neither is known'
             )
@@ -90,3 +134,8 @@ class Reporter:
                 f'no pose on the robot for sensor {frame}: set sensors.{frame}.pose: [x, y, yaw], or publish the '
                 f'transform from {self._associator.base_frame or "the base frame"}; {why}; its readings are rejected'
             )
+        self._lost = unknown & self._reported
+        for frame, counts in list(self._associator.rejected_by_frame.items()):
+            if STEEP in counts and frame not in self._reported and len(self._reported) < MOST_FRAMES:
+                self._reported.add(frame)
+                self._node.get_logger().warning(f'readings of {frame} are rejected: {REASONS[STEEP]}')

@@ -4,32 +4,36 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..core.common.errors import MapperError
 from ..core.maps.map_set import MapSet
-from ..files.output_folder import free_name
+from ..files.output_folder import expanded, free_name
 from ..files.quality_warning import thinned
 from ..files.results import write_results
+from ..files.trajectory_text import trajectory_data, tum_text
 from .background import Worker
 from .deferred import Reply
 from .em import Outcome
 from .em_service import EmService
 from .live import LiveMap
+from .refining import Found
 
 
 class Account(NamedTuple):
     """What a report says of the node and its readings, as they were when the maps were asked for.
 
-    `source` is as `write_results` takes it, `accepted` counts readings, `path` is the robot's.
+    `source` is as `write_results` takes it, `accepted` counts readings, `path` is the robot's as odometry gives it,
+    `odometry` stamps and poses of it.
     """
 
     source: dict[str, Any]
     accepted: int
     path: list[tuple[float, float]]
+    odometry: tuple[NDArray[np.int64], NDArray[np.float64]]
     folder: str
     title: str
 
@@ -52,6 +56,7 @@ class Saver:
             reply.send(False, f'there is no map to save: {outcome.message}')
             return
         account, explained, generation = self._account(), self._em.explained, self._live.generation
+        found = self._em.found
 
         def work() -> None:
             try:
@@ -59,23 +64,30 @@ class Saver:
                 if live.generation != generation:
                     raise MapperError('there is no map to save: they were forgotten by reset')
                 both = maps.with_live(live.grid, live.probability)
-                reply.send(True, self._write(both, account, explained))
+                reply.send(True, self._write(both, account, explained, found))
             except MapperError as error:
                 reply.send(False, str(error))
 
         self.worker.put(work, lambda why: reply.send(False, f'save_maps failed: {why}'))
 
-    def _write(self, maps: MapSet, account: Account, explained: int) -> str:
+    def _write(self, maps: MapSet, account: Account, explained: int, found: Found | None) -> str:
         newer = account.accepted - explained
         warnings = account.source['warnings']
         if newer > 0:
             warnings.append(f'{newer} readings came after EM: only the live map has them; call run_em before save_maps')
         if note := thinned(len(maps.readings), explained):
             warnings.append(note)
-        parent = Path(account.folder).expanduser().resolve()
+        parent = expanded(account.folder).resolve()
         folder = free_name(parent, f'maps_{time.strftime("%Y-%m-%d_%H-%M-%S")}')
         path_xy = np.array(account.path, np.float64).reshape(-1, 2)
-        report = write_results(folder, maps, account.source, path_xy, account.title)
+        options: dict[str, Any] = {}
+        if found is not None and found.refinement is not None:
+            account.source['trajectory'] = trajectory_data(found.refinement)
+        if found is not None and found.correction is not None:
+            both = {'trajectory.tum': found.correction.trajectory, 'odometry.tum': found.correction.odometry}
+            options = {'extras': {name: tum_text(path) for name, path in both.items()}, 'odometry_xy': path_xy}
+            path_xy = found.correction.path_of(*account.odometry)
+        report = write_results(folder, maps, account.source, path_xy, account.title, **options)
         for warning in report['warnings']:
             self._logger.warning(f'save_maps: {warning}')
         return ', '.join(str(folder / name) for name in sorted(path.name for path in folder.iterdir()))

@@ -1,4 +1,4 @@
-"""The health of each sensor, as a status of `/diagnostics`."""
+"""The health of each sensor, as a status of `/diagnostics`, and which of them sends nothing any more."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from diagnostic_msgs.msg import DiagnosticStatus
 
 from ..core.learning.sensor_health import SensorHealth, health_warning
-from .diagnostics import status
+from .diagnostics import listed, status
 
 
 class SensorWatch:
@@ -24,7 +24,9 @@ class SensorWatch:
         """Take the table of a run."""
         self._table = table
 
-    def status(self, name: str, counts: Mapping[str, tuple[int, int]]) -> DiagnosticStatus:
+    def status(
+        self, name: str, counts: Mapping[str, tuple[int, int]], quiet: Mapping[str, float] | None = None
+    ) -> DiagnosticStatus:
         """Return the status of all sensors, with a key for each.
 
         Parameters
@@ -33,14 +35,20 @@ class SensorWatch:
             Of the node.
         counts : dict of name → (int, int)
             Readings accepted so far, and those without echo; for sensors that the last run of EM did not judge.
+        quiet : dict of name → float, optional
+            Seconds for which sensors that stopped sending have sent nothing.
         """
+        quiet = quiet or {}
         table = self._table
         values = {
             sensor: f'{count} readings, {silent / max(count, 1):.0%} max range'
             for sensor, (count, silent) in counts.items()
         }
         values |= {sensor: str(row) for sensor, row in table.items()}
-        warning = health_warning(table)
+        for sensor, seconds in quiet.items():
+            values[sensor] = f'SILENT for {seconds:.0f} s; {values.get(sensor, "")}'
+        silence = f'{listed(quiet)}: nothing comes any more' if quiet else ''
+        warning = '; '.join(filter(None, [silence, health_warning(table)]))
         message = warning or ('none stands out' if table else 'judged when EM has run')
         level = DiagnosticStatus.WARN if warning else DiagnosticStatus.OK
         return status(f'{name}: sensors', level, message, name, values)

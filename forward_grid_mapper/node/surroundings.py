@@ -1,11 +1,12 @@
-"""Faults around the node, which it can only see by asking: publishers it cannot receive from, and namesakes."""
+"""Faults around the node, which it can only see by asking: publishers it cannot receive from, no clock, namesakes."""
 
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from typing import Any
 
-from rclpy.qos import QoSCompatibility, QoSProfile, qos_check_compatible
+from rclpy.qos import DurabilityPolicy, QoSCompatibility, QoSProfile, ReliabilityPolicy, qos_check_compatible
 
 PERIOD = 3.0
 """Seconds between two looks."""
@@ -14,11 +15,30 @@ PERIOD = 3.0
 class Surroundings:
     """Looks around now and then, and reports each fault once in the log and as long as it lasts in diagnostics."""
 
-    def __init__(self, node: Any, subscriptions: dict[str, QoSProfile]) -> None:
-        """`subscriptions` are the topics that the node listens to."""
+    def __init__(
+        self,
+        node: Any,
+        subscriptions: dict[str, QoSProfile],
+        transforms: tuple[str, ...] = (),
+        frames_missing: Callable[[], bool] = lambda: False,
+    ) -> None:
+        """Prepare to look.
+
+        Parameters
+        ----------
+        node : Node
+        subscriptions : dict of topic → QoSProfile
+            What the node listens to, other than TF.
+        transforms : tuple of str
+            The topics of TF, and of static TF; none where it does not listen to TF.
+        frames_missing : callable
+            Returns whether a sensor has no pose.
+        """
         self._node, self._subscriptions = node, subscriptions
+        self._transforms, self._frames_missing = transforms, frames_missing
         self._reported: set[str] = set()
         self._next = 0.0
+        self._begin = time.monotonic()
         self._faults: list[str] = []
 
     def faults(self) -> list[str]:
@@ -26,7 +46,7 @@ class Surroundings:
         now = time.monotonic()
         if now >= self._next:
             self._next = now + PERIOD
-            self._faults = [*self._deaf(), *self._namesakes()]
+            self._faults = [*self._deaf(), *self._transforms_lost(), *self._timeless(), *self._namesakes()]
             for fault in self._faults:
                 if fault not in self._reported and len(self._reported) < 100:
                     self._reported.add(fault)
@@ -35,17 +55,47 @@ class Surroundings:
 
     def _deaf(self) -> list[str]:
         faults = []
-        for topic, wanted in self._subscriptions.items():
+        of_transforms = dict.fromkeys(self._transforms, QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE))
+        for topic, wanted in (self._subscriptions | of_transforms).items():
             for publisher in self._node.get_publishers_info_by_topic(topic):
                 fit, _ = qos_check_compatible(publisher.qos_profile, wanted)
                 if fit == QoSCompatibility.ERROR:
                     offered = publisher.qos_profile.reliability.name.lower()
+                    remedy = (
+                        'have it publish as reliable'
+                        if topic in of_transforms
+                        else f'set range_reliability or odom_reliability to {offered}'
+                    )
                     faults.append(
                         f'{publisher.node_name} publishes {topic} as {offered}, and this node asks for '
-                        f'{wanted.reliability.name.lower()}: nothing of it is received; set range_reliability or '
-                        f'odom_reliability to {offered}'
+                        f'{wanted.reliability.name.lower()}: nothing of it is received; {remedy}'
                     )
         return list(dict.fromkeys(faults))
+
+    def _transforms_lost(self) -> list[str]:
+        """Name publishers whose static transforms may have come before this node listened."""
+        if not self._frames_missing():
+            return []
+        names = {
+            f'{publisher.node_name} publishes {topic} as volatile: what it sent before this node listened is lost; '
+            'have it publish as transient_local (ros2 bag play: --qos-profile-overrides-path), or set sensors.*.pose'
+            for topic in self._transforms[1:]
+            for publisher in self._node.get_publishers_info_by_topic(topic)
+            if publisher.qos_profile.durability == DurabilityPolicy.VOLATILE
+        }
+        return sorted(names)
+
+    def _timeless(self) -> list[str]:
+        """Say that there is no simulated time, once publishers had the time to be found."""
+        clock = self._node.get_clock()
+        if not clock.ros_time_is_active or clock.now().nanoseconds or time.monotonic() < self._begin + PERIOD:
+            return []
+        topic = self._node.resolve_topic_name('/clock')
+        who = 'publishes' if not self._node.count_publishers(topic) else 'has said a time on'
+        return [
+            f'use_sim_time is true, and nobody {who} {topic}: maps have the stamp 0; start the simulation, play the '
+            'bag with --clock, or leave use_sim_time out'
+        ]
 
     def _namesakes(self) -> list[str]:
         own = self._node.get_name(), self._node.get_namespace()

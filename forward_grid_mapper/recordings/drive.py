@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,8 +12,34 @@ from numpy.typing import NDArray
 from ..core.common.parameters import Parameters
 from ..core.maps.log_odds_map import LogOddsMap
 from ..core.maps.map_set import MapSet
+from ..core.messages.message_types import NANOSECONDS
 from ..core.messages.pose_association import PoseAssociator
 from ..files.quality_warning import thinned
+
+
+@dataclass(frozen=True)
+class Part:
+    """Which part of a drive to map: seconds after its first message, and seconds from there on."""
+
+    start: float = 0.0
+    duration: float = math.inf
+
+    @property
+    def whole(self) -> bool:
+        """Whether that is all of the drive."""
+        return self.start <= 0 and math.isinf(self.duration)
+
+    def __str__(self) -> str:
+        end = '' if math.isinf(self.duration) else f' --duration {self.duration:g}'
+        return f'--start {self.start:g}{end}'
+
+    def bounds(self, first: int) -> tuple[float, float]:
+        """Return the stamps, nanoseconds, that it lies between, the last one excluded; `first` is the drive's."""
+        begin = first + self.start * NANOSECONDS
+        return begin, begin + self.duration * NANOSECONDS
+
+
+WHOLE = Part()
 
 
 class LogOddsMapOfAll:
@@ -34,8 +61,13 @@ class LogOddsMapOfAll:
         """Return the maps with the live map of all readings."""
         if len(maps.readings) == len(self._associator.buffer):
             return maps
+        live = self.complete()
+        return maps.with_live(live.grid, live.probability())
+
+    def complete(self) -> LogOddsMap:
+        """Return the map of all readings."""
         self._look()
-        return maps.with_live(self._live.grid, self._live.probability())
+        return self._live
 
 
 @dataclass(frozen=True)

@@ -8,13 +8,14 @@ from pathlib import Path
 
 from ..core.common.errors import InputError, ParameterError
 from ..core.common.parameters import TABLE, Parameters
+from ..core.common.readings import Readings
 from ..core.messages.message_types import NANOSECONDS, Pose2
 from ..core.messages.pose_association import PoseAssociator
 from ..core.messages.rep117 import REASONS
 from ..files.journal_format import Contents
 from ..files.journal_reader import read
 from ..files.output_folder import readable
-from .drive import Drive, LogOddsMapOfAll, thinning_note
+from .drive import WHOLE, Drive, LogOddsMapOfAll, Part, thinning_note
 
 MOST_NAMED = 10
 """Parameters that a warning names."""
@@ -26,6 +27,7 @@ def read_journal(
     extrinsics: Mapping[str, Pose2],
     range_topics: Sequence[str] | None = None,
     odom_topic: str | None = None,
+    part: Part = WHOLE,
 ) -> Drive:
     """Read a journal file; its readings are in the map frame already.
 
@@ -44,7 +46,10 @@ def read_journal(
     live = LogOddsMapOfAll(associator, parameters)
     contents = Contents()
     first, last, names = math.inf, -math.inf, set()
-    for readings in read(path, contents):
+    held = read(path, contents)
+    if not part.whole:
+        held = iter(_cut(list(held), path, part))
+    for readings in held:
         associator.restore(readings)
         first, last = min(first, int(readings.stamp.min())), max(last, int(readings.stamp.max()))
         names |= set(readings.sensor_names)
@@ -77,6 +82,18 @@ def read_journal(
         'warnings': warnings + thinning_note(associator),
     }
     return Drive(associator, source, live)
+
+
+def _cut(held: Sequence[Readings], path: Path, part: Part) -> list[Readings]:
+    """Return the readings of a part of the drive."""
+    first = min((int(readings.stamp.min()) for readings in held if len(readings)), default=0)
+    last = max((int(readings.stamp.max()) for readings in held if len(readings)), default=0)
+    begin, end = part.bounds(first)
+    chosen = [readings.select((begin <= readings.stamp) & (readings.stamp < end)) for readings in held]
+    chosen = [readings for readings in chosen if len(readings)]
+    if held and not chosen:
+        raise InputError(f'{path} has no reading in the part {part}; it spans {(last - first) / NANOSECONDS:.1f} s')
+    return chosen
 
 
 def _warnings(path: Path, contents: Contents, associator: PoseAssociator, parameters: Parameters) -> list[str]:

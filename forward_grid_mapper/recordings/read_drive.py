@@ -7,15 +7,16 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from ..bags.reader import Bag
-from ..bags.static_transforms import StaticTransforms
+from ..bags.static_transforms import StaticTransforms, SteepSensorError
 from ..core.common.errors import BagError, InputError
 from ..core.common.parameters import Parameters
+from ..core.messages.extrinsics import STEEP
 from ..core.messages.message_types import NANOSECONDS, Pose2, RangeMessage
 from ..core.messages.pose_association import PoseAssociator
 from ..core.messages.rep117 import ODOMETRY_REASONS, REASONS
 from ..files.journal import drive_file
 from ..files.output_folder import readable
-from .drive import Drive, LogOddsMapOfAll, thinning_note
+from .drive import WHOLE, Drive, LogOddsMapOfAll, Part, thinning_note
 from .journal_drive import read_journal
 
 __all__ = ['Drive', 'Extrinsics', 'read_drive']
@@ -27,24 +28,28 @@ class Extrinsics:
     def __init__(self, given: Mapping[str, Pose2], transforms: StaticTransforms) -> None:
         self._given = {frame.lstrip('/'): pose for frame, pose in given.items()}
         self._transforms = transforms
-        self._found: dict[tuple[str, str], Pose2 | None] = {}
+        self._found: dict[tuple[str, str], Pose2 | str | None] = {}
+        self.steep: dict[str, str] = {}
         self.used: dict[str, str] = {}
         self.unusable: dict[str, str] = {}
 
-    def __call__(self, base_frame: str, frame: str, stamp: int) -> Pose2 | None:
-        """Return the pose of a sensor in the base frame; transforms are static, so the stamp does not matter."""
+    def __call__(self, base_frame: str, frame: str, stamp: int) -> Pose2 | str | None:
+        """Return the pose of a sensor, as `ExtrinsicsLookup` has it; static transforms are so at any stamp."""
         key = (base_frame, frame)
         if key not in self._found:
             self._found[key] = self._look_up(base_frame, frame)
         return self._found[key]
 
-    def _look_up(self, base_frame: str, frame: str) -> Pose2 | None:
+    def _look_up(self, base_frame: str, frame: str) -> Pose2 | str | None:
         pose = self._given.get(frame.lstrip('/'))
         if pose is not None:
             self.used[frame] = 'parameters'
             return pose
         try:
             pose = self._transforms.lookup(base_frame, frame)
+        except SteepSensorError as error:
+            self.steep[frame] = str(error)
+            return STEEP
         except InputError as error:
             self.unusable[frame] = str(error)
             return None
@@ -55,7 +60,7 @@ class Extrinsics:
     @property
     def poses(self) -> dict[str, Pose2]:
         """Poses of the sensors that readings asked for, by frame."""
-        return {frame: pose for (_, frame), pose in self._found.items() if pose is not None}
+        return {frame: pose for (_, frame), pose in self._found.items() if isinstance(pose, Pose2)}
 
     @property
     def unused(self) -> list[str]:
@@ -80,6 +85,7 @@ def read_drive(
     range_topics: Sequence[str] | None = None,
     odom_topic: str | None = None,
     progress: Callable[[int, int], None] | None = None,
+    part: Part = WHOLE,
 ) -> Drive:
     """Read a bag and bring its readings into the map frame, or take those of a journal.
 
@@ -93,27 +99,38 @@ def read_drive(
         Topics to use; by default those found by type.
     progress : callable, optional
         Called with (done, total) messages.
+    part : Part
+        What to take, by stamps; the drive begins with its first message on these topics.
 
     Raises
     ------
     BagError
         If the bag cannot be read, or the topics are not there or ambiguous.
     InputError
-        If not a single reading got a pose; says why.
+        If not a single reading got a pose, or none is of that part; says why.
     """
     # a pipe would be waited for, a device may have no end
     plain = Path(path).is_dir() or Path(path).is_file()
     journal = drive_file(Path(path)) if plain else None
     if journal is not None:
-        return read_journal(journal, parameters, extrinsics, range_topics, odom_topic)
+        return read_journal(journal, parameters, extrinsics, range_topics, odom_topic, part)
     with Bag(path) as bag:
-        topics = bag.choose_topics(range_topics, odom_topic)
+        topics = bag.choose_topics(range_topics, odom_topic, any_poses=True)
         lookup = Extrinsics(extrinsics, bag.static_transforms())
         associator = PoseAssociator(lookup, parameters, patient=True)
         live = LogOddsMapOfAll(associator, parameters)
+        left_out = [math.inf, -math.inf]
         spans: dict[str, list[int]] = {'ranges': [], 'odometry': []}
+        bounds: tuple[float, float] | None = None
+        # the poses before and after a reading place it
+        margin = parameters.association.max_pose_gap * NANOSECONDS
         for message in bag.messages(topics, progress):
             ranged = isinstance(message, RangeMessage)
+            bounds = bounds or part.bounds(message.stamp)
+            beyond = 0 if ranged else margin
+            if not part.whole and not bounds[0] - beyond <= message.stamp < bounds[1] + beyond:
+                left_out[0], left_out[1] = min(left_out[0], message.stamp), max(left_out[1], message.stamp)
+                continue
             span = spans['ranges' if ranged else 'odometry']
             if not span:
                 span += [message.stamp, message.stamp]
@@ -126,6 +143,10 @@ def read_drive(
         undecodable = dict(bag.undecodable)
         warnings = _warnings(bag, associator, lookup)
     if not len(associator.buffer):
+        if not associator.received and left_out[0] <= left_out[1]:
+            raise InputError(
+                f'{path} has no reading in the part {part}; its messages span {(left_out[1] - left_out[0]) / 1e9:.1f} s'
+            )
         raise _nothing_associated(associator, lookup, spans, undecodable)
     stamps = associator.readings.stamp
     source = {
@@ -162,6 +183,7 @@ def _warnings(bag: Bag, associator: PoseAssociator, lookup: Extrinsics) -> list[
         warnings.append(f'{count} messages on {topic} do not fit their type and were skipped')
     if associator.unknown_frames:
         warnings.append(lookup.advice(associator.base_frame, sorted(associator.unknown_frames)))
+    warnings += lookup.steep.values()
     if unused := lookup.unused:
         warnings.append(
             f'poses were given for {", ".join(unused)}, but no reading has such a frame; is the name right?'
@@ -176,7 +198,8 @@ def _warnings(bag: Bag, associator: PoseAssociator, lookup: Extrinsics) -> list[
             f'{count} of {associator.odometry_received} odometry messages were rejected: {ODOMETRY_REASONS[reason]}'
         )
     for reason, count in associator.rejected.items():
-        if count > 0.2 * associator.received and reason != 'unknown_extrinsics':
+        told = reason == 'unknown_extrinsics' or (reason == STEEP and lookup.steep)
+        if count > 0.2 * associator.received and not told:
             warnings.append(f'{count} of {associator.received} readings were rejected as {reason}: {REASONS[reason]}')
     return warnings
 
@@ -201,7 +224,7 @@ def _nothing_associated(
     reasons = '; '.join(f'{count} {reason} ({REASONS[reason]})' for reason, count in associator.rejected.most_common())
     for reason, count in associator.odometry_rejected.most_common():
         reasons += f'; {count} odometry messages were rejected too: {ODOMETRY_REASONS[reason]}'
-    hints = ''.join(f'; {warning}' for warning in associator.limits.warnings())
+    hints = ''.join(f'; {warning}' for warning in (*lookup.steep.values(), *associator.limits.warnings()))
     if associator.unknown_frames:
         hints += f'; {lookup.advice(associator.base_frame, sorted(associator.unknown_frames))}'
     return InputError(f'all {associator.received} readings were rejected: {reasons}{hints}')

@@ -13,7 +13,7 @@ from ..core.messages.message_types import NANOSECONDS, OdometryMessage, Pose2, R
 from .rays import blocked, cast
 from .sonar import NOISE_FREE, NOISY, PERSON_RADIUS, NoiseModel, SonarArray, measure, sonar_ring
 from .trajectory import Trajectory
-from .world import World, building_tour, building_world, corridor_world, door_world
+from .world import World, building_tour, building_world, corridor_world, door_world, doors_world
 
 Floats = NDArray[np.float64]
 
@@ -88,8 +88,12 @@ def drive_sweeps(
     noise: NoiseModel = NOISE_FREE,
     seed: int = 0,
     person: bool = False,
+    walker: Floats | None = None,
 ) -> Recording:
-    """Drive as `drive` does, with a sweep at each of the increasing distances `sweeps` along the path, in metres."""
+    """Drive as `drive` does, with a sweep at each of the increasing distances `sweeps` along the path, in metres.
+
+    `walker`, shape (T, 2), is where somebody else walks at each sweep, metres; NaN for nowhere.
+    """
     waypoints = np.asarray(waypoints, np.float64)
     if blocked(waypoints, world.segments):
         raise ValueError(f'the path leads through a wall of world {world.name}')
@@ -98,7 +102,7 @@ def drive_sweeps(
     trajectory = Trajectory.through(waypoints)
     ticks = np.round(trajectory.time_at(np.asarray(sweeps, np.float64)) * NANOSECONDS).astype(np.int64)
     robot = trajectory.pose_at(ticks / NANOSECONDS)
-    people = _people(world, robot, rng) if person else None
+    people = _people(world, robot, rng) if person else walker
     ranges = measure(world, sonars, robot, noise, rng, people)
     stamps = START + ticks
     return Recording(
@@ -126,6 +130,19 @@ def door_drive(
     front = passing + (np.linspace(-0.1, 0.1, n) if n > 1 else np.zeros(n))
     sweeps = np.sort(np.concatenate([regular[np.abs(regular - passing) >= 1.0], front]))
     return drive_sweeps(world, np.array([[start, y], [end, y]]), sweeps, sonars, noise, seed)
+
+
+def passing_drive(seed: int = 0, noise: NoiseModel = NOISY, sonars: SonarArray | None = None) -> Recording:
+    """Drive along `doors_world` while a person comes the other way and walks by, as in the paper's Fig. 5.
+
+    The person walks twice as fast as the robot, along the other side of the corridor, and leaves at the robot's start.
+    """
+    world = doors_world()
+    start, end, y = 1.05, 10.35, 5.85
+    sweeps = np.arange(0.0, end - start, 0.1)
+    x = end - 2.0 * sweeps
+    walker = np.stack([np.where(x > start, x, np.nan), np.full_like(x, y + 0.65)], axis=1)
+    return drive_sweeps(world, np.array([[start, y], [end, y]]), sweeps, sonars, noise, seed, walker=walker)
 
 
 def corridor_drive(

@@ -191,6 +191,18 @@ def door_world() -> World:
     return plan.world(inside=(60, 37))
 
 
+def doors_world() -> World:
+    """Return a world like the paper's Fig. 5: a corridor, 2.1 m wide, with two doors of 0.6 m on either side."""
+    plan = Floorplan('doors', 114, 120)
+    plan.wall('x', 48, (4, 109), doors=((28, 33), (79, 84)))
+    plan.wall('x', 70, (4, 109), doors=((33, 38), (74, 79)))
+    plan.wall('y', 4, (48, 70))
+    plan.wall('y', 109, (48, 70))
+    for columns, row, end in (((10, 52), 48, 12), ((60, 104), 48, 16), ((14, 54), 70, 108), ((58, 100), 70, 104)):
+        plan.alcove(columns, row, end)
+    return plan.world(inside=(56, 59))
+
+
 def corridor_world() -> World:
     """Return a world like the paper's Fig. 6: a corridor of 62 m with six doors and 18 m of smooth wall."""
     plan = Floorplan('corridor', 641, 131)
@@ -270,6 +282,7 @@ def building_tour() -> NDArray[np.float64]:
 
 WORLDS: dict[str, Callable[[], World]] = {
     'door': door_world,
+    'doors': doors_world,
     'corridor': corridor_world,
     'rooms': rooms_world,
     'building': building_world,

@@ -25,8 +25,10 @@ from drive_samples import (
 )
 from rosbags.highlevel import AnyReader
 
+from forward_grid_mapper.bags.reader import Bag
 from forward_grid_mapper.bags.writer import BagWriter
 from forward_grid_mapper.commands import process_bag
+from forward_grid_mapper.core.common.errors import BagError
 from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.common.readings import in_canonical_order
 from forward_grid_mapper.core.messages.message_types import Pose2
@@ -66,11 +68,10 @@ def refused_drive(capsys: pytest.CaptureFixture[str], folder: Path, drive: Tape,
 # ---- bags
 
 
-def test_a_folder_that_holds_a_bag_is_told_apart_from_one(
-    tmp_path: Path, plain: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    said = refusal(capsys, tmp_path, plain, '-o', tmp_path / 'maps')
-    assert 'is not a bag' in said and f'There is one in it: {plain / "bag"}' in said
+def test_a_folder_that_holds_a_bag_is_told_apart_from_one(plain: Path) -> None:
+    with pytest.raises(BagError, match=r'is not a bag.* There is one in it: ') as told, Bag(plain):
+        pass
+    assert str(plain / 'bag') in str(told.value)
 
 
 def test_no_such_bag(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -420,6 +421,8 @@ def test_options_that_cannot_be(
         (['--learn', 'much'], '--learn'),
         (['--sett', 'p_hit=0.5', '--unknown'], 'unrecognized arguments'),
         (['--params'], '--params'),
+        (['--range-topics', ''], 'argument --range-topics: the name of a topic is expected'),
+        (['--range-topics', ','], 'argument --range-topics: the name of a topic is expected'),
     ],
 )
 def test_command_lines_that_cannot_be(

@@ -36,7 +36,7 @@ def no_work(monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(*arguments: object, **options: object) -> None:
         raise AssertionError('the bag was read first')
 
-    monkeypatch.setattr(process_bag, 'read_drive', refuse)
+    monkeypatch.setattr(process_bag, 'read_drives', refuse)
 
 
 @pytest.mark.usefixtures('no_work')
@@ -129,7 +129,8 @@ def test_a_picture_that_cannot_be_written_costs_only_itself(tmp_path: Path, bag:
     done = with_limit(60_000, bag, '-q', '-o', tmp_path / 'maps')
     assert done.returncode == 0
     assert 'warning: no picture was drawn: ' in done.stderr and 'File too large' in done.stderr
-    assert {path.name for path in (tmp_path / 'maps').iterdir()} == FILES - {'maps.png'}
+    assert 'warning: report.html was not written: ' in done.stderr
+    assert {path.name for path in (tmp_path / 'maps').iterdir()} == FILES - {'maps.png', 'report.html'}
 
 
 def interrupt(*arguments: object, **options: object) -> None:

@@ -16,7 +16,7 @@ from drive_samples import FILES, tape, write_tape
 from numba.core import event
 
 from forward_grid_mapper import __version__
-from forward_grid_mapper.__main__ import COMMANDS
+from forward_grid_mapper.__main__ import COMMANDS, _to_a_pipe
 from forward_grid_mapper.commands import console, process_bag
 from forward_grid_mapper.commands.console import Ticker
 from forward_grid_mapper.core.search.search import Progress
@@ -52,6 +52,36 @@ def test_usage() -> None:
     assert "no command 'procces_bag'; did you mean process_bag?" in refused.stderr
     assert refused.stderr.endswith(helped.stdout)
     assert shell('--version').stdout == f'{__version__}\n'
+
+
+@pytest.mark.parametrize('unbuffered', ['', '1'])
+@pytest.mark.parametrize('arguments', [('--help',), ('--version',), ('mapper', '--help'), ('process_bag', '--help')])
+def test_whoever_reads_the_output_may_go_before_its_end(arguments: tuple[str, ...], unbuffered: str) -> None:
+    """As `head` does."""
+    reader, writer = os.pipe()
+    os.close(reader)
+    command = [*MODULE, *arguments]
+    with os.fdopen(writer, 'w') as output:
+        done = subprocess.run(
+            command,
+            stdout=output,
+            stderr=subprocess.PIPE,
+            text=True,
+            check=False,
+            env={**os.environ, 'PYTHONUNBUFFERED': unbuffered},
+        )
+    assert done.stderr == ''
+    # argparse takes it for nothing at all where nothing is buffered
+    assert done.returncode in (0, 1)
+
+
+def test_a_pipe_that_broke_elsewhere_is_no_reader_who_went() -> None:
+    def fail() -> int:
+        raise BrokenPipeError('somewhere else')
+
+    with pytest.raises(BrokenPipeError, match='somewhere else'):
+        _to_a_pipe(fail)
+    assert _to_a_pipe(lambda: 3) == 3
 
 
 @pytest.mark.parametrize('command', ['process_bag', 'learn', 'replay_bag', 'simulate', 'demo'])
@@ -232,6 +262,19 @@ def test_says_that_it_compiles_only_while_it_does(monkeypatch: pytest.MonkeyPatc
         ticker.mapping('uncertainty', None)
         wait_until_shown(stream, 'uncertainty')
         assert 'uncertainty (compil' not in stream.getvalue()
+
+
+def test_quiet_says_once_that_it_compiles(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(console, 'PATIENCE', 0.0)
+    stream = io.StringIO()
+    with Ticker(quiet=True, stream=stream) as ticker:
+        ticker.say('one')
+        with compiling_begun():
+            wait_until_shown(stream, 'compiling kernels, which takes half a minute once\n')
+            ticker.say('two')
+        with compiling_begun():
+            ticker.say('three')
+    assert stream.getvalue().count('\n') == 1
 
 
 def compiling_begun() -> AbstractContextManager[None]:

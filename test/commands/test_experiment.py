@@ -2,20 +2,25 @@
 
 from __future__ import annotations
 
+import math
 import re
 from pathlib import Path
 
 import pytest
 from drive_samples import code_of, everything_in
 
-from forward_grid_mapper.commands import demo, experiment
+from forward_grid_mapper.commands import demo, experiment, experiment_density, experiment_maps
+from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.files.parameter_file import load_parameters
+
+PAPER_FILE = Path(__file__).parents[2] / 'config' / 'paper.yaml'
 
 
 @pytest.fixture(autouse=True)
 def few_gains(monkeypatch: pytest.MonkeyPatch) -> None:
     """The standard map has three settings instead of hundreds."""
-    monkeypatch.setattr(experiment, 'GAINS', experiment.GAINS[:: len(experiment.GAINS) // 3][:3])
+    gains = experiment_maps.GAINS
+    monkeypatch.setattr(experiment_maps, 'GAINS', gains[:: len(gains) // 3][:3])
 
 
 def test_door(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
@@ -29,6 +34,8 @@ def test_door(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Ca
         assert len(scores) == 4
         assert all(0.0 <= float(f1) <= 1.0 and float(low) <= float(high) for f1, low, high in scores)
         assert float(scores[0][0]) > 0.5, 'the forward map has lost the walls'
+        if row[0] == 'noise-free':
+            assert row[2].split()[5] == '0', 'in print, no reading is attributed to chance'
     assert 'best gains of 3' in out
     folder = tmp_path / 'experiment_door'
     assert str(folder) in out
@@ -48,6 +55,45 @@ def test_corridor(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert {path.name for path in output.iterdir()} == {'figure.png', 'table.txt'}
 
 
+def test_passer_by(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    output = tmp_path / 'passer'
+    assert code_of(experiment.main, 'passer-by', '--seeds', 1, '-o', output) == 0
+    out = capsys.readouterr().out
+    rows = re.findall(r'^(forward|standard).* (\d\.\d{3}) +(\d)/4  ((?:\d\.\d ){4}) +\d+ +(\d+|-)$', out, re.MULTILINE)
+    assert [row[0] for row in rows] == ['forward'] * 2 + ['standard'] * 2
+    assert rows[0][2] == '4', 'our map must show all doors'
+    assert int(rows[0][4]) > 0, 'echoes of the person are on no map'
+    assert (output / 'figure.png').read_bytes().startswith(b'\x89PNG')
+
+
+def test_density(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    output = tmp_path / 'density'
+    assert code_of(experiment.main, 'density', '--params', PAPER_FILE, '-o', output) == 0
+    out = capsys.readouterr().out
+    peaks = re.findall(r'^(first|second|nothing).* (\d\.\d\d) +(\d+\.\d{3}) +(0\.\d{3})$', out, re.MULTILINE)
+    near, far = (math.hypot(*(0.1 * math.floor(v / 0.1) + 0.05 for v in xy)) for xy in ((1.5, 0.05), (2.6, -0.1)))
+    assert [float(at) for _, at, _, _ in peaks] == pytest.approx([near, far, 4.0], abs=0.011)
+    shares = [0.95 * 0.9, 0.95 * 0.09, 0.95 * 0.01]
+    assert [float(share) for *_, share in peaks] == pytest.approx(shares, abs=6e-4)
+    # a normal of 5 cm, and the floor
+    tops = [0.05 / 4 + share / (0.05 * math.sqrt(2 * math.pi)) for share in shares]
+    assert [float(top) for _, _, top, _ in peaks] == pytest.approx(tops, rel=0.02)
+    assert re.search(r'^chance, everywhere +0\.01[23] +0\.050$', out, re.MULTILINE)
+    assert (output / 'figure.png').read_bytes().startswith(b'\x89PNG')
+
+
+def test_the_obstacle_beside_the_cone_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    parameters = Parameters.from_flat(experiment_maps.PAPER)
+    with_it, _ = experiment_density.density_of_ranges(parameters)
+    monkeypatch.setattr(experiment_density, 'BESIDE', experiment_density.NEAR)
+    without, _ = experiment_density.density_of_ranges(parameters)
+    assert (with_it.y == without.y).all()
+    monkeypatch.setattr(experiment_density, 'NEAR', experiment_density.FAR)
+    monkeypatch.setattr(experiment_density, 'BESIDE', experiment_density.FAR)
+    moved, _ = experiment_density.density_of_ranges(parameters)
+    assert (moved.y != without.y).any()
+
+
 def test_parameters_count(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     tables = []
     for name, options in (('a', ()), ('b', ('--set', 'p_hit=0.3', '--set', 'sigma=0.3'))):
@@ -60,10 +106,10 @@ def test_parameters_count(tmp_path: Path, capsys: pytest.CaptureFixture[str]) ->
 
 
 def test_as_in_the_paper_is_what_the_parameter_file_says() -> None:
-    values = load_parameters(Path(__file__).parents[2] / 'config' / 'paper.yaml').values
+    values = load_parameters(PAPER_FILE).values
     uncertainty = {'alpha', 'uncertainty_prior', 'neighbour_weight'}
     given = {name: value for name, value in values.items() if name not in uncertainty}
-    assert {name: pytest.approx(value, abs=1e-4) for name, value in experiment.PAPER.items()} == given
+    assert {name: pytest.approx(value, abs=1e-4) for name, value in experiment_maps.PAPER.items()} == given
 
 
 @pytest.mark.parametrize(
@@ -98,7 +144,7 @@ def test_demo(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Ca
     }
     out = capsys.readouterr().out
     assert (folder / 'scores.txt').read_text().strip() in out
-    assert re.search(r'^ML map +0\.\d{3}', out, re.MULTILINE)
+    assert re.search(r'^maximum likelihood map +0\.\d{3}', out, re.MULTILINE)
     assert code_of(demo.main, '--seen', 1, '--offline') == 0
     assert (tmp_path / 'demo_output_2' / 'maps' / 'maps.png').is_file()
 
@@ -108,7 +154,7 @@ def test_demo_through_the_node(tmp_path: Path, capsys: pytest.CaptureFixture[str
     assert code_of(demo.main, '--seen', 1, '--rate', 20, '-o', tmp_path / 'out') == 0
     out = capsys.readouterr().out
     assert 'EM in the node' in out
-    assert re.search(r'^ML map +0\.\d{3}', out, re.MULTILINE)
+    assert re.search(r'^maximum likelihood map +0\.\d{3}', out, re.MULTILINE)
     assert (tmp_path / 'out' / 'demo.png').is_file()
     assert (tmp_path / 'out' / 'maps' / 'report.txt').is_file()
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import os
 import re
@@ -79,9 +80,29 @@ def test_a_place_that_is_none_is_named(
     assert said in capsys.readouterr().err
 
 
-def test_a_negative_place_is_no_option(maps: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    code_of(explain.main, maps, '-0.4', '-0.2')
-    assert 'unrecognized' not in capsys.readouterr().err
+@pytest.mark.parametrize('place', [('-0.4', '-0.2'), ('-4e-1', '-2E-1'), ('-.4', '-.2'), ('-inf', '-1e+2')])
+def test_a_negative_place_is_no_option(maps: Path, place: tuple[str, str], capsys: pytest.CaptureFixture[str]) -> None:
+    code_of(explain.main, maps, *place, '-n', 2)
+    said = capsys.readouterr().err
+    assert said == '' or f'({float(place[0]):g}, {float(place[1]):g}) is not on the map' in said
+
+
+@pytest.mark.parametrize('state', [1, 0, -1])
+def test_json_says_the_same(maps: Path, state: int, capsys: pytest.CaptureFixture[str]) -> None:
+    archive = read_npz(maps / 'maps.npz')
+    x, y = place(archive, state)
+    assert code_of(explain.main, maps, x, y, '--json') == 0
+    said = json.loads(capsys.readouterr().out)
+    readings, normals = read_readings(maps / 'readings.npz', archive)
+    found = cell_evidence(readings, archive.grid, archive.ml, archive.parameters, normals, (x, y))
+    assert (said['row'], said['column'], said['state']) == (found.row, found.column, explain.STATES[state])
+    assert said['nats_of_readings'] == pytest.approx(found.data)
+    assert [row['nats'] for row in said['readings']] == pytest.approx(found.nats.tolist())
+    assert [row['stamp'] for row in said['readings']] == readings.stamp[found.readings].tolist()
+    assert said['number_of_readings'] == len(found.readings)
+    assert code_of(explain.main, maps, x, y, '--json', '-n', 1) == 0
+    fewer = json.loads(capsys.readouterr().out)
+    assert fewer == {**said, 'readings': said['readings'][:1]}
 
 
 def test_folders_without_maps_or_readings_are_named(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from pathlib import Path
 
@@ -32,7 +33,7 @@ def said(capsys: pytest.CaptureFixture[str], *arguments: object, code: int = 0) 
 
 
 def test_values_errors_and_rounds_are_told(bag: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    text = said(capsys, bag, '--rounds', 2)
+    text = said(capsys, bag, '--rounds', 2, '--keep-going')
     start = Parameters().model
     for name in LEARNED:
         (row,) = re.findall(rf'^  {name} +([\d.]+) +([\d.]+) .*readings$', text, re.MULTILINE)
@@ -41,6 +42,19 @@ def test_values_errors_and_rounds_are_told(bag: Path, capsys: pytest.CaptureFixt
     assert 'conditional on the map' in text and '95 %' in text
     assert re.search(r'^  0 .* 0\.0 m$', text, re.MULTILINE) and re.search(r'^  2 .* kept$', text, re.MULTILINE)
     assert all(len(line) <= 110 for line in text.splitlines())
+
+
+def test_json_has_the_values_and_nothing_else_is_printed(
+    tmp_path: Path, bag: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / 'learned.yaml'
+    found = json.loads(said(capsys, bag, '--rounds', 2, '--json', '--keep-going', '-o', file))
+    assert found['file'] == str(file)
+    values = load_parameters(file).values
+    for name in LEARNED:
+        assert found['values'][name]['start'] == getattr(Parameters().model, name)
+        assert found['values'][name]['learned'] == found['parameters'][name] == pytest.approx(values[name], rel=1e-6)
+    assert len(found['rounds']) > found['accepted_round'] >= 0
 
 
 def test_the_file_is_what_process_bag_takes(
@@ -64,7 +78,7 @@ def test_the_file_is_what_process_bag_takes(
         )
     )
     output = tmp_path / 'learned.yaml'
-    options = ('--rounds', 1, '--params', given, '--set', 'p_rand=0.3', '--sensor', 'other=1,2,90deg')
+    options = ('--rounds', 1, '--keep-going', '--params', given, '--set', 'p_rand=0.3', '--sensor', 'other=1,2,90deg')
     text = said(capsys, bag, '-o', output, *options)
     assert str(output) in text
     values, extrinsics, node = load_parameters(output)
@@ -76,6 +90,20 @@ def test_the_file_is_what_process_bag_takes(
     assert output.read_text().startswith('# Learned from')
     report = mapped(bag, tmp_path / 'maps', '--params', output)
     assert {name: report['parameters'][name] for name in LEARNED} == {name: values[name] for name in LEARNED}
+
+
+def test_values_that_held_out_readings_speak_against_are_not_handed_out(
+    tmp_path: Path, bag: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / 'learned.yaml'
+    found = json.loads(said(capsys, bag, '--rounds', 2, '--json', '-o', file))
+    seen = found['foresight']
+    better = all(seen[f'learned_at_{values}'] >= seen[f'first_at_{values}'] for values in ('first', 'learned'))
+    assert not better and found['accepted_round'] == 0
+    start, written = Parameters().flat(), load_parameters(file).values
+    for name in LEARNED:
+        assert found['parameters'][name] == start[name] == written[name]
+    assert any('the learned values are refused: readings that had no part' in text for text in found['warnings'])
 
 
 def test_files_are_never_overwritten(tmp_path: Path, bag: Path, capsys: pytest.CaptureFixture[str]) -> None:

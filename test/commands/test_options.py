@@ -14,7 +14,7 @@ from drive_samples import code_of, mapped, tape, write_tape
 from forward_grid_mapper import __version__
 from forward_grid_mapper.__main__ import COMMANDS
 from forward_grid_mapper.commands import demo, experiment, learn, process_bag, replay_bag
-from forward_grid_mapper.commands.options import chosen_parameters
+from forward_grid_mapper.commands.options import chosen_parameters, chosen_part
 from forward_grid_mapper.core.common.errors import ParameterError
 from forward_grid_mapper.core.common.parameters import TABLE
 from forward_grid_mapper.files import drawing
@@ -29,6 +29,11 @@ def bag(tmp_path: Path) -> str:
     """Something that exists."""
     (tmp_path / 'bag').mkdir()
     return str(tmp_path / 'bag')
+
+
+def bags_of(options: argparse.Namespace) -> list[str]:
+    """The bags that were found, of commands that take one or several."""
+    return options.bags if hasattr(options, 'bags') else [options.bag]
 
 
 @pytest.mark.parametrize('parser', PARSERS)
@@ -53,7 +58,45 @@ def test_the_bag_is_found_before_and_behind_the_topics(
     parser: Callable[[], argparse.ArgumentParser], form: str, bag: str
 ) -> None:
     options = parser().parse_args([bag if word == 'BAG' else word for word in form.split()])
-    assert (options.bag, options.range_topics) == (bag, ['A', 'B'])
+    assert (bags_of(options), options.range_topics) == ([bag], ['A', 'B'])
+
+
+@pytest.mark.parametrize('parser', [process_bag.parser, learn.parser])
+@pytest.mark.parametrize(
+    'form',
+    [
+        'BAG BAG other --range-topics A B',
+        'BAG -q BAG other --range-topics A,B',
+        'BAG --range-topics=A,B BAG -q other',
+        '-q --range-topics A B BAG BAG other',
+        '--range-topics A B -- BAG BAG other',
+    ],
+)
+def test_several_bags_are_found(
+    parser: Callable[[], argparse.ArgumentParser],
+    form: str,
+    bag: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / 'other').mkdir()
+    options = parser().parse_args([bag if word == 'BAG' else word for word in form.split()])
+    assert (options.bags, options.range_topics) == ([bag, bag, 'other'], ['A', 'B'])
+
+
+@pytest.mark.parametrize(
+    ('words', 'told'),
+    [
+        (['--start', '-1'], '--start -1: give seconds from the beginning'),
+        (['--start', 'nan'], '--start nan'),
+        (['--duration', '0'], '--duration 0: give seconds above 0'),
+        (['--duration', 'nan'], '--duration nan'),
+    ],
+)
+def test_parts_that_cannot_be(words: list[str], told: str, bag: str) -> None:
+    with pytest.raises(ParameterError, match=told):
+        chosen_part(process_bag.parser().parse_args([bag, *words]))
 
 
 def test_the_bag_is_found_behind_renamings(bag: str) -> None:

@@ -56,7 +56,8 @@ def test_simulate_prints_how_to_map(
     assert code_of(simulate.main, 'door', '--seen', 1, '--sonars', 'front', f'--output={name}') == 0
     ((command, *words),) = commands_in(capsys.readouterr().out)
     options = PARSERS[command]().parse_args(words)
-    assert Path(options.bag).samefile(tmp_path / name / 'bag')
+    (bag,) = options.bags
+    assert Path(bag).samefile(tmp_path / name / 'bag')
 
 
 @pytest.mark.parametrize('name', ['with space', "-it's, $HOME"])

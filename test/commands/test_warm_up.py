@@ -17,11 +17,47 @@ def test_after_it_there_is_nothing_to_compile() -> None:
     for _ in range(2):
         done = subprocess.run(COMMAND, capture_output=True, text=True, check=True, env=dict(os.environ), timeout=600)
     assert 'nothing to compile' in done.stdout
-    assert [line.split(' …')[0] for line in done.stdout.splitlines()[:3]] == [
+    assert [line.split(' …')[0] for line in done.stdout.splitlines()[:4]] == [
         'kernels of the live map',
         'kernels of the online map',
         'kernels of the EM',
+        'kernels of the trajectory',
     ]
+
+
+SIGNATURES = """
+import sys
+from forward_grid_mapper.core.warm_up import warm_up
+def signatures():
+    return {
+        (name, kernel, str(types))
+        for name, module in list(sys.modules.items())
+        if name.startswith('forward_grid_mapper.core.trajectory')
+        for kernel, value in vars(module).items()
+        for types in getattr(value, 'signatures', None) or []
+    }
+"""
+
+
+def test_a_trajectory_needs_no_more_kernels() -> None:
+    program = f"""{SIGNATURES}
+warm_up()
+before = signatures()
+import numpy as np
+from forward_grid_mapper.core.common.parameters import Parameters
+from forward_grid_mapper.core.trajectory.refinement import Refiner
+from forward_grid_mapper.core.trajectory.windows import Odometry
+from forward_grid_mapper.simulation.drift import LEVELS, with_drift
+from forward_grid_mapper.simulation.drive import drive
+from forward_grid_mapper.simulation.sonar import NOISY, sonar_ring
+from forward_grid_mapper.simulation.world import building_tour, building_world
+made = with_drift(drive(building_world(), building_tour()[:10], 0.15, sonar_ring(16), NOISY, seed=3), LEVELS['high'], 6)
+poses = np.array([m.pose for m in made.odometry], float)
+found = Refiner(Parameters()).run(made.readings, Odometry.of(np.array([m.stamp for m in made.odometry]), poses))
+print(found.accepted, len(before) > 2, signatures() - before)
+"""
+    done = subprocess.run([sys.executable, '-c', program], capture_output=True, text=True, check=True, timeout=600)
+    assert done.stdout.split() == ['True', 'True', 'set()'], done.stdout
 
 
 def test_the_live_map_needs_no_kernel_of_the_others(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -244,7 +244,7 @@ def test_no_readings_is_an_error_that_says_so() -> None:
 
 
 def test_a_run_can_be_cancelled_at_any_stage() -> None:
-    for stage in ('index', 'search', 'live map', 'post-processing', 'uncertainty'):
+    for stage in ('index', 'search', 'standard map', 'post-processing', 'uncertainty'):
         mapper = Mapper(Parameters())
         with pytest.raises(Cancelled):
             mapper.run(

@@ -12,7 +12,7 @@ import pytest
 
 import naive
 from conftest import PLAIN, FlipsAlone, plain_model, plain_search, random_readings
-from forward_grid_mapper.commands.experiment import ONE_SUM
+from forward_grid_mapper.commands.experiment_maps import ONE_SUM
 from forward_grid_mapper.core.common.errors import ParameterError
 from forward_grid_mapper.core.common.grid import Grid
 from forward_grid_mapper.core.common.parameters import ModelParameters, Parameters, find

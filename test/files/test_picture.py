@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import sys
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from made_maps import made_maps
 from forward_grid_mapper import files
 from forward_grid_mapper.core.common.errors import OutputError
 from forward_grid_mapper.core.common.grid import Grid
+from forward_grid_mapper.files.panels import coarse
 from forward_grid_mapper.files.picture import compose, write_picture
 
 PATH = np.stack([np.linspace(-1, 1, 50), np.zeros(50)], axis=1)
@@ -61,6 +63,34 @@ def test_walls_survive_in_coarse_pictures() -> None:
     values = picture.panels[1].values
     assert max(values.shape) <= 2400
     assert (np.fmax.reduce(values, axis=0)[3:-3] == 1).all()
+
+
+def test_walls_of_fine_maps_are_seen_in_the_picture(tmp_path: Path) -> None:
+    """Walls of one cell of 2 cm in a map of 20 m: each stays black, wherever it falls between the pixels."""
+    image = pytest.importorskip('PIL.Image')
+    maps = made_maps(1000, 1000, readings=0)
+    maps.ml[3:-3, 3:-3] = 0
+    maps.ml[100:-100, 101::131] = 1
+    fine = dataclasses.replace(maps, grid=Grid(0.02, 0, 0, 1000, 1000))
+    write_picture(tmp_path / 'maps.png', fine, np.empty((0, 2)), 'fine')
+    pixels = np.asarray(image.open(tmp_path / 'maps.png').convert('L'))
+    height, width = pixels.shape
+    # the middle panel, off its edges and its scale
+    row = pixels[height // 2, round(0.38 * width) : round(0.63 * width)]
+    dark = np.flatnonzero(np.diff((row < 60).astype(int)) == 1)
+    assert len(dark) == len(range(101, 1000, 131))
+
+
+@pytest.mark.parametrize(('shape', 'step'), [((7, 9), 2), ((5, 5), 5), ((4, 6), 3), ((3, 3), 7)])
+def test_coarse_blocks_keep_the_largest_value(shape: tuple[int, int], step: int) -> None:
+    random = np.random.default_rng(2)
+    values = random.uniform(0, 1, shape)
+    values[random.uniform(0, 1, shape) < 0.4] = np.nan
+    found = coarse(values, step)
+    for row, column in np.ndindex(found.shape):
+        block = values[row * step : (row + 1) * step, column * step : (column + 1) * step]
+        known = block[~np.isnan(block)]
+        assert np.isnan(found[row, column]) if not len(known) else found[row, column] == np.float32(known.max())
 
 
 def test_unexplained_readings_end_on_their_axis() -> None:

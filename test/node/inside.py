@@ -65,6 +65,12 @@ class Inside:
             self.executor.spin_once(timeout_sec=0.01)
         return value
 
+    def spin(self, seconds: float) -> None:
+        """Turn the executor for a while."""
+        end = time.monotonic() + seconds
+        while time.monotonic() < end:
+            self.executor.spin_once(timeout_sec=0.01)
+
     def odometry(self, seconds: float, x: float = 0.0) -> None:
         """Hand the node an odometry message."""
         made = Odometry(child_frame_id='base_link')
@@ -73,10 +79,10 @@ class Inside:
         self._stamp(made.header, seconds)
         self.node.intake.on_odometry(made, {'source_timestamp': time.time_ns()})
 
-    def range(self, seconds: float, value: float = 2.0, number: int | None = None) -> None:
+    def range(self, seconds: float, value: float = 2.0, number: int | None = None, frame: str = 'sonar') -> None:
         """Hand the node a Range."""
         made = Range(min_range=0.1, max_range=5.0, field_of_view=0.3, range=value)
-        made.header.frame_id = 'sonar'
+        made.header.frame_id = frame
         self._stamp(made.header, seconds)
         intake = self.node.intake
         self.sent += 1
@@ -122,10 +128,15 @@ class Inside:
             reporter._out.publish = publish
         return dict(found[part])
 
-    def call(self, handler: Callable[[Any], None], request: Any = None) -> tuple[Any, ...]:
-        """Call a service, and turn the executor until it answers."""
+    def begin(self, handler: Callable[[Any], None], request: Any = None) -> Answer:
+        """Call a service, and return what it will answer with."""
         answer = Answer(request)
         handler(answer)
+        return answer
+
+    def call(self, handler: Callable[[Any], None], request: Any = None) -> tuple[Any, ...]:
+        """Call a service, and turn the executor until it answers."""
+        answer = self.begin(handler, request)
         self.until(lambda: answer.sent)
         assert len(answer.sent) == 1
         return answer.sent[0]

@@ -10,8 +10,9 @@ import pytest
 
 pytest.importorskip('rclpy', reason='stamps are asked for with rclpy')
 
+from forward_grid_mapper.core.messages.extrinsics import LATE, LATER, STEEP
 from forward_grid_mapper.core.messages.message_types import NANOSECONDS, OdometryMessage, Pose2, RangeMessage
-from forward_grid_mapper.core.messages.pose_association import LATER, PoseAssociator
+from forward_grid_mapper.core.messages.pose_association import PoseAssociator
 from forward_grid_mapper.node import frames
 from forward_grid_mapper.node.frames import Extrinsics, MapFrame, Transforms
 
@@ -91,8 +92,8 @@ def test_poses_are_projected_and_steep_sensors_refused(buffer: Buffer, transform
     buffer.known['base', 'down'] = transform(0.0, 0.0, pitch=1.5)
     extrinsics = Extrinsics({}, transforms)
     assert extrinsics('base', 'ahead', 0) == pytest.approx((1.0, 2.0, 2.5))
-    assert extrinsics('base', 'down', 0) is None
-    assert extrinsics.unusable == {'down'}
+    assert extrinsics('base', 'down', 0) == STEEP
+    assert extrinsics.unusable == set()
 
 
 def test_a_frame_that_is_not_there_is_asked_for_only_now_and_then(
@@ -156,13 +157,13 @@ def test_without_another_map_frame_odometry_passes(transforms: Transforms, name:
 
 def test_a_stamp_before_1970_is_no_error(buffer: Buffer, transforms: Transforms) -> None:
     buffer.known['base_link', 'sonar'] = transform(0.1, 0.2)
-    assert transforms.lookup('base_link', 'sonar', 5) is not None
-    assert transforms.lookup('base_link', 'sonar', -5) is None
+    assert transforms.lookup('base_link', 'sonar', 5) is buffer.known['base_link', 'sonar']
+    assert transforms.lookup('base_link', 'sonar', -5) is LATER
 
 
 def test_names_that_nobody_knows_are_not_remembered_for_ever(transforms: Transforms) -> None:
     for k in range(2 * frames.MOST_MISSING):
-        assert transforms.lookup('base_link', f'frame {k}', 5) is None
+        assert transforms.lookup('base_link', f'frame {k}', 5) is LATER
     assert len(transforms._missing) <= frames.MOST_MISSING + 1
 
 
@@ -228,3 +229,89 @@ def test_sensors_that_turn_on_the_robot_are_not_fixed(buffer: Buffer, transforms
         for frame in ('given', 'fixed', 'servo', 'absent'):
             extrinsics('base', frame, round(seconds * NANOSECONDS))
     assert extrinsics.fixed == {'given': Pose2(1.0, 2.0, 3.0), 'fixed': Pose2(0.1, 0.0, 0.0)}
+
+
+def test_a_transform_that_is_late_is_no_unknown_frame(buffer: Buffer, transforms: Transforms) -> None:
+    buffer.known['base', 'servo'] = transform(0.1, 0.0)
+    buffer.until = 0
+    now = [0.0]
+    associator = PoseAssociator(Extrinsics({}, transforms), clock=lambda: now[0])
+
+    def second(stamp: int, frame: str) -> None:
+        associator.add_odometry(OdometryMessage(stamp * NANOSECONDS, 'odom', 'base', Pose2(0, 0, 0)))
+        associator.add_range(RangeMessage(stamp * NANOSECONDS, frame, 1.0, 0.1, 3.0, 0.3))
+        now[0] += 1.0
+
+    for stamp in range(10):
+        second(stamp, 'servo')
+        second(stamp, 'ghost')
+    assert set(associator.rejected) == {'late_transform', 'unknown_extrinsics'}
+    assert set(associator.rejected_by_frame['servo']) == {'late_transform'}
+    assert set(associator.rejected_by_frame['ghost']) == {'unknown_extrinsics'}
+    assert associator.unknown_frames == {'ghost'}
+
+
+def test_a_frame_whose_transform_came_after_all_is_not_unknown_any_more(
+    buffer: Buffer, transforms: Transforms, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(frames, 'PATIENCE', 0.0)
+    now = [0.0]
+    associator = PoseAssociator(Extrinsics({}, transforms), clock=lambda: now[0])
+    for stamp in range(10):
+        associator.add_odometry(OdometryMessage(stamp * NANOSECONDS, 'odom', 'base', Pose2(0, 0, 0)))
+        associator.add_range(RangeMessage(stamp * NANOSECONDS, 'sonar', 1.0, 0.1, 3.0, 0.3))
+        now[0] += 1.0
+        if stamp == 5:
+            assert associator.unknown_frames == {'sonar'}
+            buffer.known['base', 'sonar'] = transform(0.1, 0.0)
+            buffer.until = 0
+        if stamp == 7:
+            # it is known, though not at these stamps
+            assert associator.unknown_frames == set()
+            buffer.until = 1 << 62
+    assert associator.unknown_frames == set()
+    assert len(associator.buffer) >= 3
+
+
+def test_a_map_frame_without_its_transform_is_named(
+    buffer: Buffer, transforms: Transforms, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now = 100.0
+    monkeypatch.setattr(frames.time, 'monotonic', lambda: now)
+    frame = MapFrame('map', transforms, timeout=1.0)
+
+    def drive(seconds: int) -> None:
+        nonlocal now
+        for _ in range(10 * seconds):
+            now += 0.1
+            frame.convert(OdometryMessage(round(now * NANOSECONDS), 'odom', 'base', Pose2(0, 0, 0)))
+
+    drive(2)
+    assert frame.fault() == ''
+    drive(2)
+    assert 'TF has no transform from map (map_frame) to odom' in frame.fault()
+    assert f'{frame.dropped} were dropped' in frame.fault() and frame.dropped
+    # nobody drives: no odometry is what is wrong now
+    now += 10.0
+    assert frame.fault() == ''
+    drive(1)
+    assert frame.fault() and not frame.found
+    buffer.known['map', 'odom'] = transform(1.0, 0.0)
+    drive(1)
+    assert frame.fault() == '' and frame.found
+    buffer.until = round(now * NANOSECONDS)
+    drive(4)
+    assert "TF's transform from map (map_frame) to odom comes later than pose_timeout" in frame.fault()
+    # late as TF is, by a tenth of a second
+    for _ in range(50):
+        buffer.until = round(now * NANOSECONDS)
+        now += 0.1
+        frame.convert(OdometryMessage(round(now * NANOSECONDS), 'odom', 'base', Pose2(0, 0, 0)))
+    assert frame.fault() == ''
+
+
+def test_the_lookup_says_whether_a_frame_or_a_time_is_missing(buffer: Buffer, transforms: Transforms) -> None:
+    buffer.known['base', 'servo'] = transform(0.1, 0.0)
+    buffer.until = 4
+    assert transforms.lookup('base', 'ghost', 5) is LATER
+    assert transforms.lookup('base', 'servo', 5) is LATE

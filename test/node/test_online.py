@@ -30,7 +30,7 @@ def test_maps_follow_the_readings_and_em_polishes_them(start: Any, robot: Robot,
     robot.listen()
     messages = merged(door)
     robot.play(messages[: len(messages) // 2])
-    robot.until(lambda: robot.maps['ml_map'], what='an ML map without any call')
+    robot.until(lambda: robot.maps['ml_map'], what='a maximum likelihood map without any call')
     robot.play(messages[len(messages) // 2 :])
     batch = Mapper(Parameters()).run(door.readings)
 
@@ -73,7 +73,7 @@ def test_parameters_may_change_while_it_runs(start: Any, robot: Robot) -> None:
     robot.meet()
     robot.listen()
     robot.play(merged(door))
-    robot.until(lambda: robot.maps['ml_map'], what='an ML map')
+    robot.until(lambda: robot.maps['ml_map'], what='a maximum likelihood map')
     robot.spin(1.0)
     seen = len(robot.maps['ml_map'])
     assert robot.set_parameter('p_hit', 0.5).successful

@@ -17,6 +17,7 @@ from test_mapper_node import RELIABLE
 POLICY = Path(__file__).resolve().parents[2] / 'config' / 'sros2_policy.xml'
 NAME = 'forward_grid_mapper'
 WITH_TF = {'/tf', '/tf_static'}
+WITH_MAP_MSGS = {f'/{NAME}/live_map_updates'}
 
 
 def allowed(tag: str, access: str) -> set[str]:
@@ -29,7 +30,7 @@ def allowed(tag: str, access: str) -> set[str]:
 
 
 def test_the_policy_names_what_the_node_has(start: Any, robot: Robot) -> None:
-    start(*RELIABLE, '-p', 'use_sim_time:=true')
+    start(*RELIABLE, '-p', 'use_sim_time:=true', '-p', 'refine_poses:=true')
     robot.meet()
     robot.until(lambda: 'readings' in robot.diagnostics)
     node = robot.node
@@ -39,9 +40,10 @@ def test_the_policy_names_what_the_node_has(start: Any, robot: Robot) -> None:
 
     robot.until(lambda: '/clock' in names(node.get_subscriber_names_and_types_by_node(NAME, '/')))
     received = names(node.get_subscriber_names_and_types_by_node(NAME, '/'))
-    # tf2_ros may not be installed
+    # tf2_ros and map_msgs may not be installed
     assert received | WITH_TF == allowed('topics', 'subscribe')
-    assert names(node.get_publisher_names_and_types_by_node(NAME, '/')) == allowed('topics', 'publish')
+    published = names(node.get_publisher_names_and_types_by_node(NAME, '/'))
+    assert published | WITH_MAP_MSGS | {'/tf'} == allowed('topics', 'publish')
     assert names(node.get_service_names_and_types_by_node(NAME, '/')) == allowed('services', 'reply')
 
 

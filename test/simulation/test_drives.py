@@ -7,7 +7,15 @@ import math
 import numpy as np
 import pytest
 
-from forward_grid_mapper.simulation.drive import START, building_drive, corridor_drive, door_drive, drive, drive_sweeps
+from forward_grid_mapper.simulation.drive import (
+    START,
+    building_drive,
+    corridor_drive,
+    door_drive,
+    drive,
+    drive_sweeps,
+    passing_drive,
+)
 from forward_grid_mapper.simulation.rays import blocked
 from forward_grid_mapper.simulation.sonar import NOISE_FREE, NOISY, front_array
 from forward_grid_mapper.simulation.world import door_world, rooms_world
@@ -124,3 +132,17 @@ def test_same_seed_same_recording():
 def test_standing_waypoints_are_refused():
     with pytest.raises(ValueError, match='waypoints'):
         drive_sweeps(door_world(), np.array([[3.0, 3.75], [3.0, 3.75]]), np.zeros(1))
+
+
+def test_a_person_passes_the_robot_in_the_world_of_two_doors_on_either_side() -> None:
+    recording = passing_drive(noise=NOISE_FREE)
+    assert recording.world.grid.shape == (120, 114)
+    sides = [door.y > recording.robot[0, 1] for door in recording.world.doors]
+    assert sorted(sides) == [False, False, True, True]
+    empty = drive_sweeps(
+        recording.world, recording.robot[[0, -1], :2], np.arange(len(recording.robot)) * 0.1, noise=NOISE_FREE
+    )
+    met = recording.readings.z < empty.readings.z - 1e-9
+    assert met.any(), 'nobody was met'
+    ends = recording.readings.y + recording.readings.z * np.sin(recording.readings.yaw)
+    assert ((ends > 4.8) & (ends < 7.1))[met].all(), 'the person walks in the corridor'

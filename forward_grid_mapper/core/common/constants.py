@@ -80,7 +80,7 @@ FREE_MARGIN = 0.1
 unknown cells stands before every wall."""
 
 LEAST_EVIDENCE = 0.1
-"""Nats, either way, from which on a cell counts as observed though the ML map does not know it."""
+"""Nats, either way, from which on a cell counts as observed though the maximum likelihood map does not know it."""
 
 # The standard map
 

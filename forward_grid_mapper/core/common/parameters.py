@@ -235,7 +235,7 @@ class SearchParameters:
 
 @dataclass(frozen=True)
 class LiveMapParameters:
-    """The standard log-odds map ((3), (4), (14)-(16) of the paper), updated reading by reading."""
+    """The standard map: log odds ((3), (4), (14)-(16) of the paper), updated reading by reading."""
 
     live_p_occupied: float = _param(
         0.99,
@@ -295,12 +295,19 @@ class NodeParameters:
     )
     map_frame: str = _param(
         '',
-        "Frame of the maps, if another than odometry's, whose transform to odometry's frame TF gives.",
+        "Frame of the maps, if another than odometry's: TF gives its transform to odometry's frame, or with "
+        "refine_poses this node does, by default from 'map'.",
         read_only=True,
+    )
+    refine_poses: bool = _param(
+        False,
+        'Take the drift out of odometry when run_em is called, and publish the transform from map to odom. Needs walls '
+        "at right angles; odometry's poses stay where readings that were held out do not speak for others.",
     )
     online: bool = _param(
         False,
-        'Keep the ML map and the uncertainty map up to date with every reading, and start EM from there.',
+        'Keep the maximum likelihood map and the uncertainty map up to date with every reading, and start EM from '
+        'there.',
         read_only=True,
     )
     publish_rate: float = _param(
@@ -310,6 +317,11 @@ class NodeParameters:
         '',
         'Folder of the journal, which keeps every accepted reading on disk and gives them back after a restart; empty: '
         'none.',
+        read_only=True,
+    )
+    autostart: bool = _param(
+        True,
+        'Start at once; if not, a lifecycle manager configures and activates the node.',
         read_only=True,
     )
     save_directory: str = _param('~/forward_grid_mapper', 'Folder in which save_maps makes a new folder at each call.')
@@ -359,7 +371,7 @@ class Parameter:
             int: 'a whole number',
             bool: 'true or false',
             str: 'text',
-            tuple: 'a list of text',
+            tuple: 'a list of text, none of it empty',
         }[self.type]
         if isinstance(value, np.generic):
             value = value.item()

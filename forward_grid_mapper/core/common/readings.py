@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,6 +33,8 @@ class Readings:
         Index into `sensor_names`.
     sensor_names : tuple of str
         The `frame_id` of each sensor.
+    drive : int32, shape (N,)
+        Which drive it is of; 0 where there is only one.
     """
 
     x: Floats
@@ -44,6 +47,12 @@ class Readings:
     stamp: NDArray[np.int64]
     sensor: NDArray[np.int32]
     sensor_names: tuple[str, ...] = ()
+    drive: NDArray[np.int32] = field(default_factory=lambda: np.zeros(0, np.int32))
+
+    def __post_init__(self) -> None:
+        if len(self.drive) != len(self.z):
+            # takes no memory
+            object.__setattr__(self, 'drive', np.broadcast_to(np.int32(0), self.z.shape))
 
     def __len__(self) -> int:
         return len(self.z)
@@ -67,7 +76,7 @@ class Readings:
 
     @classmethod
     def from_columns(cls, names: tuple[str, ...] = (), **columns: object) -> Readings:
-        """Build from anything array-like; absent `sigma`, `stamp` and `sensor` are zero.
+        """Build from anything array-like; absent `sigma`, `stamp`, `sensor` and `drive` are zero.
 
         Raises
         ------
@@ -75,26 +84,49 @@ class Readings:
             If a column's shape is not that of `z`.
         """
         z = np.atleast_1d(np.asarray(columns['z'], np.float64))
-        types = {'stamp': np.int64, 'sensor': np.int32}
+        types = {'stamp': np.int64, 'sensor': np.int32, 'drive': np.int32}
         made = {}
-        for field in fields(cls):
-            if field.name == 'sensor_names':
+        for column in fields(cls):
+            if column.name == 'sensor_names':
                 continue
-            kind = types.get(field.name, np.float64)
-            optional = field.name in ('sigma', 'stamp', 'sensor')
-            value = columns.get(field.name, 0 if optional else None)
+            kind = types.get(column.name, np.float64)
+            optional = column.name in ('sigma', 'stamp', 'sensor', 'drive')
+            value = columns.get(column.name, 0 if optional else None)
             if value is None:
-                raise ValueError(f'column {field.name} is missing')
-            made[field.name] = np.array(np.broadcast_to(np.asarray(value, kind), z.shape))
+                raise ValueError(f'column {column.name} is missing')
+            made[column.name] = np.array(np.broadcast_to(np.asarray(value, kind), z.shape))
         return cls(**made, sensor_names=tuple(names))
 
 
 def in_canonical_order(readings: Readings) -> Readings:
-    """Return the readings ordered by stamp, sensor name and values, so that the maps do not depend on arrival.
+    """Return the readings ordered by stamp, sensor name, values and drive, so that the maps do not depend on arrival.
 
     Sums of floating point numbers depend on their order; two readings that are still equal are interchangeable.
     """
     rank = np.argsort(np.argsort(np.array(readings.sensor_names or ('',))))
     r = readings
-    keys = (r.sigma, r.half_angle, r.z_max, r.yaw, r.y, r.x, r.z, rank[r.sensor], r.stamp)
+    keys = (r.drive, r.sigma, r.half_angle, r.z_max, r.yaw, r.y, r.x, r.z, rank[r.sensor], r.stamp)
     return readings.select(np.lexsort(keys))
+
+
+def of_drives(drives: Sequence[Readings]) -> Readings:
+    """Return the readings of several drives, numbered in their order; sensors of one name are one sensor."""
+    names = tuple(sorted({name for readings in drives for name in readings.sensor_names})) or ('',)
+    number = {name: k for k, name in enumerate(names)}
+    columns: dict[str, list[NDArray[np.generic]]] = {}
+    for k, readings in enumerate(drives):
+        sensors = np.array([number[name] for name in readings.sensor_names] or [0], np.int32)
+        of = replace(readings, sensor=sensors[readings.sensor], drive=np.full(len(readings), k, np.int32))
+        for column in fields(Readings):
+            if column.name != 'sensor_names':
+                columns.setdefault(column.name, []).append(getattr(of, column.name))
+    return Readings.from_columns(names, **{name: np.concatenate(parts) for name, parts in columns.items()})
+
+
+def drives_of(readings: Readings) -> list[Readings]:
+    """Return the readings of each drive, in the order of the drives' numbers; empty ones are left out."""
+    if not readings.drive.any():
+        return [readings]
+    order = np.argsort(readings.drive, kind='stable')
+    at = np.flatnonzero(np.diff(readings.drive[order])) + 1
+    return [readings.select(part) for part in np.split(order, at)]

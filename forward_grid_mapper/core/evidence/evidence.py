@@ -157,6 +157,7 @@ class Evidence:
         stop: NDArray[np.uint8] | None = None,
         start: NDArray[np.uint8] | None = None,
         renewable: bool = False,
+        normals: SurfaceNormals | None = None,
     ) -> None:
         """Begin without readings, on an empty map or on the map `start` (1 occupied, shape `grid.shape`).
 
@@ -174,6 +175,8 @@ class Evidence:
         renewable : bool
             Keep what it takes to renew the surface normals as readings come, 24 bytes a cell. Otherwise the first
             readings added decide about the normals.
+        normals : SurfaceNormals, optional
+            Those of the cells of `grid`, where they are known beforehand; then the grid cannot grow.
         """
         self.grid, self.model, self._threads = grid, model, threads
         self._words = int(min(memory / WORD, 2.0**60))
@@ -182,8 +185,9 @@ class Evidence:
         learns = model.max_incidence_angle < NO_INCIDENCE_LIMIT
         self._sums = np.zeros((3, grid.size), np.int64) if learns and renewable else None
         self._since: Window | None = None
+        self._given_normals = normals is not None
         self.state = State(
-            normals=no_normals(),
+            normals=no_normals() if normals is None else normals,
             lattice=Lattice(grid.height, grid.width, grid.resolution),
             model=Model(
                 hit_probability(model, grid.resolution),
@@ -230,6 +234,11 @@ class Evidence:
     def log_likelihood(self) -> float:
         """Log p(Z | m) in nats."""
         reading_states = self.state.reading_states[: self._size]
+        return float((reading_states['likelihood'].astype(np.int64) * reading_states['multiplicity']).sum() * QUANTUM)
+
+    def log_likelihood_of(self, which: NDArray[np.bool_]) -> float:
+        """Return the log-likelihood of some readings, shape (N,), in nats; sums of parts add up without rounding."""
+        reading_states = self.state.reading_states[: self._size][which]
         return float((reading_states['likelihood'].astype(np.int64) * reading_states['multiplicity']).sum() * QUANTUM)
 
     @property
@@ -294,7 +303,7 @@ class Evidence:
         since = united(self._since, *(box_of(cones, self.grid) for cones in later))
         before = self._index_so_far()
         try:
-            if not begin and self.model.max_incidence_angle < NO_INCIDENCE_LIMIT:
+            if not begin and not self._given_normals and self.model.max_incidence_angle < NO_INCIDENCE_LIMIT:
                 self._first_normals(end)
             self._insert(begin, end)
             try:

@@ -1,6 +1,6 @@
 """The health of each sensor: what its readings are worth, and which sensor stands out from the others.
 
-Fractions of a sensor's readings, given the ML map:
+Fractions of a sensor's readings, given the maximum likelihood map:
 
     random    a random measurement is the likeliest cause (e_* above one half)
     no echo   max-range readings

@@ -70,6 +70,12 @@ class CellEvidence:
         return float(self.nats.sum())
 
 
+def prior_odds(grid: Grid, ml: NDArray[np.int8], parameters: Parameters) -> Floats:
+    """Return the log prior odds of an obstacle in each cell given its neighbours, nats, shape `grid.shape`."""
+    prior = wall_prior(parameters.search, np.zeros(grid.size, np.bool_), grid.resolution)
+    return odds_given_neighbours(prior, ml == 1).reshape(grid.shape)
+
+
 def cell_evidence(
     readings: Readings,
     grid: Grid,
@@ -115,7 +121,6 @@ def cell_evidence(
     order = order[np.abs(nats[order]) > NOTHING]
     which, nats = which[order], nats[order]
     traversed = traversed_cells(readings, grid)
-    prior = wall_prior(parameters.search, np.zeros(grid.size, np.bool_), grid.resolution)
     error = np.abs(cones['z'][which] - distance[which])
     return CellEvidence(
         row=int(row),
@@ -127,5 +132,5 @@ def cell_evidence(
         ends_here=(error <= HERE * cones['sigma'][which]) & readings.echo[which],
         silent=~readings.echo[which],
         wall=wall,
-        prior=float(odds_given_neighbours(prior, ml == 1)[row * grid.width + column]),
+        prior=float(prior_odds(grid, ml, parameters)[row, column]),
     )

@@ -1,4 +1,4 @@
-"""The standard log-odds map ((3), (4) and (14)-(16) of the paper), updated reading by reading.
+"""The standard map: log odds ((3), (4) and (14)-(16) of the paper), updated reading by reading.
 
 Inverse sensor model. A reading adds to the cells of its cone, weighted by the strength of the beam there
 (`cone.strength`), so that the edge of the cone says little. With d the distance of a cell, b and a the depths of the
@@ -29,7 +29,7 @@ from ..common.constants import ARC, arc_depths
 from ..common.grid import Grid
 from ..common.parameters import Parameters
 from ..common.readings import Readings
-from ..sensor.cone_table import Floats, grid_of
+from ..sensor.cone_table import Floats, check_size, grid_of
 from .log_odds_kernel import PADDING, UNTOUCHED, Beams, InverseModel, Lattice, add_readings, is_steep
 
 MARGIN = 64
@@ -92,6 +92,24 @@ class LogOddsMap:
         beams = Beams(*(np.ascontiguousarray(v) for v in (r.x, r.y, r.yaw, r.half_angle, r.z, r.z_max)))
         lattice = Lattice(float(g.resolution), g.column, g.row, g.width, g.height)
         add_readings(beams, self._model(), lattice, self._planes)
+
+    def add_map(self, other: LogOddsMap) -> None:
+        """Add all that another map of the same parameters says; it comes to the same as adding its readings.
+
+        Raises
+        ------
+        InputError
+            If the grid would exceed `max_cells`; the map is unchanged.
+        """
+        if not other.grid.size:
+            return
+        grid = self.grid.union(other.grid)
+        check_size(grid, self._parameters.grid)
+        self.grid = grid
+        self._grow()
+        for k in range(len(self._planes)):
+            mine = self._plane(self._planes, k, self._stored)[self._stored.window(other.grid)]
+            mine += other._plane(other._planes, k, other._stored)[other._stored.window(other.grid)]
 
     def log_odds(self, grid: Grid | None = None) -> Floats:
         """Return the log-odds on `grid` (by default the map's own); NaN is not observed.

@@ -23,7 +23,7 @@ class MapSet:
     ----------
     grid : Grid
     live : float32
-        Occupancy probability of the standard log-odds map, NaN where no reading says anything.
+        Occupancy probability of the standard map, NaN where no reading says anything.
     ml : int8
         Maximum likelihood map: 0 free, 1 occupied, -1 not observed.
     uncertainty : float32

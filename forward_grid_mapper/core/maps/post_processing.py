@@ -39,7 +39,7 @@ def _grown(cells: NDArray[np.bool_]) -> NDArray[np.bool_]:
 def post_process(
     evidence: Evidence, extension: float, least_passed: float, traversed: NDArray[np.bool_]
 ) -> NDArray[np.int8]:
-    """Return the ML map that is handed out, shape `grid.shape`: 1 occupied, 0 free, -1 not observed.
+    """Return the maximum likelihood map that is handed out, shape `grid.shape`: 1 occupied, 0 free, -1 not observed.
 
     Parameters
     ----------

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..common.grid import Grid
-from ..common.readings import Readings
+from ..common.readings import Readings, drives_of
 from ..runtime.jit import kernel
 from ..sensor.cone_table import Floats
 
@@ -117,5 +117,7 @@ def mark_traversed(
 def traversed_cells(readings: Readings, grid: Grid) -> NDArray[np.bool_]:
     """Return which cells lie where sensors were, or between where they were about then, shape `grid.shape`."""
     out = np.zeros(grid.shape, np.bool_)
-    mark_traversed(readings.x, readings.y, readings.stamp, grid, out, longest_step(readings))
+    # no line leads from one robot to another, nor from one day to the next
+    for drive in drives_of(readings):
+        mark_traversed(drive.x, drive.y, drive.stamp, grid, out, longest_step(drive))
     return out

@@ -48,7 +48,7 @@ def uncertainty_map(
     evidence, neighbours : float64, shape (cells,)
         As in `marginals`.
     ml : int8, shape (height, width)
-        The ML map: 1 occupied, 0 free, -1 not observed.
+        The maximum likelihood map: 1 occupied, 0 free, -1 not observed.
     parameters : SearchParameters
     """
     probability = marginals(evidence, neighbours, parameters).reshape(ml.shape)

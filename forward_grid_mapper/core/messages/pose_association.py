@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from ..common.parameters import Parameters
 from ..common.readings import Readings
+from .extrinsics import ExtrinsicsLookup, Later, Mount, project
 from .limit_watch import LimitWatch
 from .map_extent import MapExtent, possible
 from .message_types import NANOSECONDS, OdometryMessage, Pose2, RangeMessage
@@ -24,17 +25,6 @@ from .pose_history import PoseHistory
 from .reading_buffer import ReadingBuffer
 from .rep117 import LONGEST_NAME, Measurement, measure
 from .robot_path import RobotPath
-
-
-class Later:
-    """What a lookup answers when the pose may still become known."""
-
-
-LATER = Later()
-
-ExtrinsicsLookup = Callable[[str, str, int], 'Pose2 | Later | None']
-"""(base frame, sensor frame, stamp in ns) → pose of the sensor in the base frame, `LATER`, or None if unknown."""
-
 
 JUMP = NANOSECONDS
 """Odometry older than the newest by more than this means that the clock jumped back, not that messages overtook."""
@@ -66,15 +56,17 @@ class PoseAssociator:
         Messages by reason (`REASONS`, `ODOMETRY_REASONS`).
     rejected_by_frame : dict of frame_id → Counter
     unknown_frames : set of str
-        Sensor frames without a mounting pose.
+        Sensor frames whose mounting pose is not known now.
     map_frame, base_frame : str
         The frames of the first odometry message; empty before it.
     time_jumps : int
         How often odometry's clock jumped back.
     behind : bool
-        Whether more readings than `at_once` can be placed now: call `settle` before the next message is added.
+        Whether more than `at_once` readings can be placed now: call `settle` before the next message.
     settled : int
         Readings placed, rejected or looked at again so far: how much work there was.
+    record : OdometryRecord
+        Of the poses that odometry gave.
     limits : LimitWatch
         Warns of ranges and limits in different units.
     """
@@ -92,7 +84,7 @@ class PoseAssociator:
         Parameters
         ----------
         extrinsics : callable
-            Answers where a sensor sits on the robot.
+            Answers where a sensor sits on the robot (`extrinsics`).
         parameters : Parameters, optional
         patient : bool
             Keep all odometry and let readings wait for it without a bound, as befits a file: then the readings accepted
@@ -113,25 +105,23 @@ class PoseAssociator:
         self._patient = patient
         self.buffer = ReadingBuffer(self.parameters.max_readings)
         self.limits = LimitWatch()
-        self.received = self.odometry_received = 0
+        self.received = self.odometry_received = self.time_jumps = 0
         self.rejected: Counter[str] = Counter()
         self.odometry_rejected: Counter[str] = Counter()
         self.rejected_by_frame: dict[str, Counter[str]] = {}
         self.unknown_frames: set[str] = set()
         self.map_frame = self.base_frame = ''
-        self.time_jumps = 0
         self._waiting: list[Measurement] = []
-        self._path = RobotPath()
-        self._history = PoseHistory()
+        self._path, self._history = RobotPath(), PoseHistory(patient)
+        self.record = self._history.record
         self._newest_range: int | None = None
-        self._held: deque[tuple[Measurement, Pose2]] = deque()
+        self._held: deque[tuple[Measurement, Pose2, Later]] = deque()
         self._retrying = 0
         self._next_try = self._next_look = 0
         self._at_once = at_once or sys.maxsize
         self._odometry_arrival = self._odometry_sent = 0.0
-        self.behind = False
+        self.behind = self._other_frame = False
         self.settled = 0
-        self._other_frame = False
 
     @property
     def waiting(self) -> int:
@@ -154,8 +144,9 @@ class PoseAssociator:
 
     @property
     def odometry(self) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """The poses of odometry that are held: stamps in ns, shape (M,), and x, y, yaw, shape (M, 3)."""
-        return self._history.held()
+        """The poses of the drive as odometry gave them: stamps in ns, shape (M,), and x, y, yaw, shape (M, 3)."""
+        stamps = self.buffer.snapshot().stamp
+        return self.record.snapshot(int(stamps.min()) if len(stamps) else None)
 
     def add_range(self, message: RangeMessage, sent: int = 0) -> None:
         """Take one Range message; `sent` is when it was published, nanoseconds of the system's clock, 0 if unknown."""
@@ -188,6 +179,7 @@ class PoseAssociator:
         if self._other_frame:
             self.map_frame = self.base_frame = ''
             self._history.clear()
+        self.record.begin_anew()
         self.buffer.clear()
         self.limits.clear()
         self.rejected.clear()
@@ -196,8 +188,7 @@ class PoseAssociator:
         self.unknown_frames.clear()
         self._waiting.clear()
         self._held.clear()
-        self._retrying = 0
-        self.behind = False
+        self._retrying, self.behind = 0, False
         self._path.clear()
         self.received = self.odometry_received = self.time_jumps = 0
         self._extent.clear()
@@ -240,8 +231,8 @@ class PoseAssociator:
         for measured in sorted(self._waiting):
             self._reject(measured.frame_id, 'no_odometry' if newest is None else 'after_odometry')
         self._waiting.clear()
-        for measured, _ in self._held:
-            self._reject_unknown(measured)
+        for measured, _, why in self._held:
+            self._reject_unplaced(measured, why.reason)
         self._held.clear()
 
     def restore(self, readings: Readings) -> int:
@@ -276,15 +267,17 @@ class PoseAssociator:
         frame = name if name in known or new else OTHERS
         self.rejected_by_frame.setdefault(frame, Counter())[reason] += count
 
-    def _reject_unknown(self, measured: Measurement) -> None:
-        if len(self.unknown_frames) < MOST_FRAMES:
+    def _reject_unplaced(self, measured: Measurement, reason: str) -> None:
+        if reason == 'unknown_extrinsics' and len(self.unknown_frames) < MOST_FRAMES:
             self.unknown_frames.add(measured.frame_id)
-        self._reject(measured.frame_id, 'unknown_extrinsics')
+        self._reject(measured.frame_id, reason)
 
     def _jump_back(self, newest: int) -> None:
         self._settle_up_to(newest)
         self.time_jumps += 1
-        for frame_id, count in Counter(m.frame_id for m in (*self._waiting, *(held for held, _ in self._held))).items():
+        for frame_id, count in Counter(
+            m.frame_id for m in (*self._waiting, *(held for held, _, _ in self._held))
+        ).items():
             self._reject(frame_id, 'time_jump', count)
         self._waiting.clear()
         self._held.clear()
@@ -331,9 +324,9 @@ class PoseAssociator:
         while left and self._retrying:
             self._retrying -= 1
             left -= 1
-            measured, pose = self._held.popleft()
+            measured, pose, why = self._held.popleft()
             if measured.stamp < limit and measured.arrival < oldest:
-                self._reject_unknown(measured)
+                self._reject_unplaced(measured, why.reason)
             else:
                 self._add_extrinsics(measured, pose)
         return left
@@ -376,13 +369,20 @@ class PoseAssociator:
         """Add the sensor's pose on the robot to the robot's, and keep the reading."""
         extrinsic = self._extrinsics(self.base_frame, measured.frame_id, measured.stamp)
         if isinstance(extrinsic, Later):
-            self._held.append((measured, pose))
+            if extrinsic.reason != 'unknown_extrinsics':
+                self.unknown_frames.discard(measured.frame_id)
+            self._held.append((measured, pose, extrinsic))
             return
         if extrinsic is None:
-            self._reject_unknown(measured)
+            self._reject_unplaced(measured, 'unknown_extrinsics')
+            return
+        self.unknown_frames.discard(measured.frame_id)
+        if isinstance(extrinsic, str):
+            self._reject(measured.frame_id, extrinsic)
             return
         sensor = pose.compose(extrinsic)
-        reason = self._extent.admit(sensor, measured, self._all)
+        reason = project(measured, extrinsic.elevation) if isinstance(extrinsic, Mount) else ''
+        reason = reason or self._extent.admit(sensor, measured, self._all)
         if reason:
             self._reject(measured.frame_id, reason)
             return

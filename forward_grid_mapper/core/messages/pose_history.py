@@ -5,17 +5,16 @@ from __future__ import annotations
 import math
 from bisect import bisect_left
 
-import numpy as np
-from numpy.typing import NDArray
-
 from .message_types import NANOSECONDS, Pose2
+from .odometry_record import MOST_POSES as MOST_RECORDED
+from .odometry_record import OdometryRecord
 
 HISTORY = 600 * NANOSECONDS
 """Nanoseconds before the newest pose from which on poses are forgotten: Range messages are late by less, even where a
 bag is replayed faster than they can be taken."""
 
 MOST_POSES = 100_000
-"""Poses that are kept at the most; 15 MB."""
+"""Poses that are kept at the most, beside the record; 15 MB."""
 
 FEWEST = 64
 """Poses below which none is forgotten, so that trimming costs nothing where there are few."""
@@ -38,9 +37,17 @@ def interpolate(before: Pose2, after: Pose2, fraction: float) -> Pose2:
 
 
 class PoseHistory:
-    """Poses by stamp, in nanoseconds, at most one for each stamp."""
+    """Poses by stamp, in nanoseconds, at most one for each stamp.
 
-    def __init__(self) -> None:
+    Attributes
+    ----------
+    record : OdometryRecord
+        Of all of them, those that were forgotten too.
+    """
+
+    def __init__(self, patient: bool = False) -> None:
+        """Begin without poses; the record has no bound where there is no hurry and the drive has an end (`patient`)."""
+        self.record = OdometryRecord(0 if patient else MOST_RECORDED)
         self._stamps: list[int] = []
         self._poses: list[Pose2] = []
 
@@ -52,17 +59,15 @@ class PoseHistory:
         """The latest stamp; None while there is none."""
         return self._stamps[-1] if self._stamps else None
 
-    def held(self) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Return the stamps that are held, shape (M,), and the poses x, y, yaw, shape (M, 3)."""
-        return np.array(self._stamps, np.int64), np.array(self._poses, np.float64).reshape(-1, 3)
-
     def clear(self) -> None:
-        """Forget every pose."""
+        """Forget every pose, those of the record too."""
+        self.record.clear()
         self._stamps.clear()
         self._poses.clear()
 
     def add(self, stamp: int, pose: Pose2) -> None:
         """Add a pose, in any order of stamps; it replaces one of the same stamp."""
+        self.record.add(stamp, pose)
         stamps, poses = self._stamps, self._poses
         if not stamps or stamp > stamps[-1]:
             stamps.append(stamp)

@@ -8,8 +8,8 @@ TOLERANCE = 0.01
 """Bound on |x² + y² + z² + w² − 1|, no unit. tf2 refuses what is beyond, so the node and a bag take the same ones."""
 
 STEEPEST = math.radians(60.0)
-"""Largest angle between an x axis and the plane, radians. Beyond it the heading is ill-defined, and the cone of a
-sensor is foreshortened to less than half its length."""
+"""Largest angle between an x axis and the plane, radians. Beyond it the heading is ill-defined, and the range of a
+sensor in the plane is less than half of what it measures."""
 
 Rotation = tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]]
 """Rows of a rotation matrix; its first column is the x axis."""

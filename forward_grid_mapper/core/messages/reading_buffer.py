@@ -47,7 +47,9 @@ class ReadingBuffer:
         that appends, or nothing if it failed. By default thinning keeps the caller of `append` waiting.
     """
 
-    _TYPES = {f.name: np.float64 for f in fields(Readings) if f.name not in ('stamp', 'sensor', 'sensor_names')} | {
+    _TYPES = {
+        f.name: np.float64 for f in fields(Readings) if f.name not in ('stamp', 'sensor', 'sensor_names', 'drive')
+    } | {
         'stamp': np.int64,
         'sensor': np.int32,
         'number': np.int64,

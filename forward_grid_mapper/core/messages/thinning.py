@@ -57,18 +57,23 @@ def kept(readings: Readings, bound: int) -> NDArray[np.int64]:
 def _bins(readings: Readings) -> Words:
     """Return a hash of each reading's bin; two bins have the same one with a probability of 1e-19."""
     r = readings
-    names = [hashlib.blake2b(name.encode('utf-8', 'surrogatepass'), digest_size=8).digest() for name in r.sensor_names]
-    sensor = np.array([int.from_bytes(name, 'little') for name in names] or [0], np.uint64)[r.sensor]
     turn = np.floor(np.mod(r.yaw, 2 * math.pi) / SECTOR)
-    return _hash(sensor, np.floor(r.x / SQUARE), np.floor(r.y / SQUARE), turn)
+    return mixed(name_hashes(r)[r.sensor], np.floor(r.x / SQUARE), np.floor(r.y / SQUARE), turn)
 
 
 def _ties(readings: Readings) -> Words:
     """Return a hash of each reading's values, so that the order of arrival never decides between equal stamps."""
-    return _hash(np.zeros(len(readings), np.uint64), readings.x, readings.y, readings.yaw, readings.z, readings.sigma)
+    return mixed(np.zeros(len(readings), np.uint64), readings.x, readings.y, readings.yaw, readings.z, readings.sigma)
 
 
-def _hash(seed: Words, *columns: NDArray[np.float64]) -> Words:
+def name_hashes(readings: Readings) -> Words:
+    """Return a hash of each sensor's name."""
+    names = (name.encode('utf-8', 'surrogatepass') for name in readings.sensor_names)
+    digests = [hashlib.blake2b(name, digest_size=8).digest() for name in names]
+    return np.array([int.from_bytes(digest, 'little') for digest in digests] or [0], np.uint64)
+
+
+def mixed(seed: Words, *columns: NDArray[np.float64]) -> Words:
     """Return 64 mixed bits of each row (the finaliser of splitmix64, column after column)."""
     mixed = seed
     for column in columns:

@@ -29,7 +29,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..common.constants import LONGEST_GAP, SHORT_WALL
+from ..common.constants import FORBIDDEN, LONGEST_GAP, SHORT_WALL
 from ..common.grid import Window
 from ..common.parameters import SearchParameters
 from ..evidence.evidence import Evidence
@@ -109,6 +109,7 @@ class Search:
         parameters: SearchParameters,
         traversed: NDArray[np.bool_] | None = None,
         window: Window | None = None,
+        hold: bool = False,
     ) -> None:
         """Start from the map that `evidence` has.
 
@@ -119,7 +120,9 @@ class Search:
         traversed : bool, shape (cells,), optional
             Cells over which sensors were moved.
         window : optional
-            First row, last one plus one, and columns likewise, of the cells that may change; by default all.
+            First row, last one plus one, and columns likewise, of the cells where moves begin; by default all.
+        hold : bool
+            Whether all cells outside of the window stay as they are; otherwise moves may reach out of it.
         """
         self.evidence, self._parameters = evidence, parameters
         height, width = evidence.grid.shape
@@ -134,6 +137,17 @@ class Search:
         if occupied[traversed].any():
             occupied[traversed] = 0
             evidence.rebuild()
+        if hold:
+            self._hold()
+
+    def _hold(self) -> None:
+        """Make every change outside of the window cost more than any can gain."""
+        bottom, top, left, right = self._window
+        inside = np.zeros(self.evidence.grid.shape, np.bool_)
+        inside[bottom:top, left:right] = True
+        stay = np.where(self.evidence.state.maps.occupied == 1, FORBIDDEN, -FORBIDDEN)
+        for prior in (self._prior, self._of_walls):
+            np.copyto(prior.local, stay, where=~inside.ravel())
 
     def _advance(self, flips: int, shifts: int, gain: float, watch: Watch) -> None:
         check(self.evidence.state.stop)
@@ -177,6 +191,11 @@ class Search:
             self._settled[:] = 0
             converged = self._climb(watch)
         return self._result(converged)
+
+    def improve(self, watch: Watch = lambda progress: None) -> SearchResult:
+        """Go on from a map that `run` found, with the prior of walls alone, until nothing gains."""
+        self._prior = self._of_walls
+        return self._result(self._climb(watch))
 
     def _result(self, converged: bool) -> SearchResult:
         maps = self.evidence.state.maps

@@ -81,13 +81,24 @@ def grid_of(
     reach = np.maximum(reach, readings.z + beyond if beyond else 0.0)
     made = Grid.covering(_box(readings, reach), grid.resolution)
     made = made.union(within) if within else made
+    check_size(made, grid)
+    return made
+
+
+def check_size(made: Grid, grid: GridParameters) -> None:
+    """Check that a grid does not exceed `max_cells`.
+
+    Raises
+    ------
+    InputError
+        If it does.
+    """
     if made.size > grid.max_cells:
         raise InputError(
             f'the map would be {made.width * grid.resolution:.0f} x {made.height * grid.resolution:.0f} m: {made.size} '
             f'cells of {grid.resolution} m, more than max_cells = {grid.max_cells}; check the poses, or raise '
             f'resolution or max_cells'
         )
-    return made
 
 
 def _box(readings: Readings, reach: Floats) -> tuple[float, float, float, float]:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from .chain import axes_at
 from .likelihood import scores
 from .local_map import LocalMap
-from .matching import KAPPA, grid_around, measure
+from .matching import grid_around, measure
 from .passes import FEWEST, Found, Progress
 from .poses import Floats, compose, relative, wrapped
 from .scans import FEWEST_ON_MAP, Scans
@@ -62,9 +62,6 @@ CLIMBS = 3
 
 CANDIDATES = 2
 """Places that a block is looked for at, at the most."""
-
-SHARED = 3
-"""Windows in a row whose place has one map."""
 
 
 @dataclass(frozen=True)
@@ -132,7 +129,7 @@ def find_loop(
     values = scores(joint, around, poses, stride)
     off = relative(guess, poses)
     prior = 0.5 * ((off / np.maximum(sigma, LEAST / 2)) ** 2).sum(1)
-    total = KAPPA * values - prior
+    total = values - prior
     best = poses[int(total.argmax())]
     for _ in range(CLIMBS):
         best = measure(joint, around, best).pose
@@ -144,7 +141,7 @@ def find_loop(
     apart, axes = relative(best, poses), axes_at(best[2])
     curved = np.einsum('pi,ij,pj->p', apart, axes.T @ final.information @ axes, apart)
     elsewhere = (np.hypot(apart[:, 0], apart[:, 1]) > OTHER) & (curved > TOLD)
-    if elsewhere.any() and KAPPA * final.score - (KAPPA * values[elsewhere]).max() < CLEAR:
+    if elsewhere.any() and final.score - values[elsewhere].max() < CLEAR:
         return None
     found = Found()
     for j, local in zip(block, shape, strict=True):

@@ -1,9 +1,8 @@
 """Matching: where a scan fits in a local map, and how certain that is.
 
-Readings depend on each other, so the log-likelihood ratio counts κ < 1 of its sum. Near a pose it is taken as a
-parabola through 27 poses around it:
+Near a pose the log-likelihood ratio is taken as a parabola through 27 poses around it:
 
-    κ Σ log ratio(x + s q) ≈ a + gᵀ q − ½ qᵀ H q
+    Σ log ratio(x + s q) ≈ a + gᵀ q − ½ qᵀ H q
 
 whose top is the measured pose, with the information H. Directions in which the parabola is not curved, as along a bare
 corridor, are not measured.
@@ -20,10 +19,6 @@ import numpy as np
 from .likelihood import Scan, scores
 from .local_map import LocalMap
 from .poses import Floats, compose, relative
-
-KAPPA = 0.3
-"""What a reading counts. With it stated variances agree with the errors of matches, in recorded drives with known
-poses."""
 
 CURVED = np.array([0.06, 0.06, math.radians(1.5)])
 """s: metres ahead and aside, and radians, between the poses of a parabola."""
@@ -73,7 +68,7 @@ class Match(NamedTuple):
 def measure(scan: Scan, around: LocalMap, pose: Floats) -> Match:
     """Return where a scan fits near a pose."""
     values = scores(scan, around, pose + NEIGHBOURS * CURVED)
-    fit = _PARABOLA @ values * KAPPA
+    fit = _PARABOLA @ values
     xx, yy, tt, xy, xt, yt = -fit[4:]
     curvature, axes = np.linalg.eigh(np.array([[xx, xy, xt], [xy, yy, yt], [xt, yt, tt]]))
     kept = curvature > LEAST_CURVATURE
@@ -107,7 +102,7 @@ def search(scan: Scan, around: LocalMap, poses: Floats, center: Floats, informat
         About how many readings of the scan to ask.
     """
     off = relative(center, poses)
-    value = KAPPA * scores(scan, around, poses, max(len(scan.readings) // readings, 1))
+    value = scores(scan, around, poses, max(len(scan.readings) // readings, 1))
     value -= 0.5 * np.einsum('pi,ij,pj->p', off, information, off)
     best: Floats = poses[int(value.argmax())]
     return best

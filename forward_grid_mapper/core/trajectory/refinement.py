@@ -62,6 +62,10 @@ HEADINGS = np.radians([-1.5, 0.0, 1.5])
 MOST_STEPS = 3
 """Steps beyond the ends."""
 
+UNSEEN = 2.0
+"""Times that the yaw drifts more than walls say: an echo votes with all others of three metres, and what drifts within
+these is not seen."""
+
 SIGMA = np.array([0.01, math.radians(0.5), math.radians(0.5), 0.02])
 """σ of the calibration found."""
 
@@ -252,7 +256,7 @@ class Refiner:
         start = windows.node[0] + np.array([0.0, 0.0, walls.correction[0]])
         change = sensitivity(odometry, windows)
         motion = motions(odometry, windows) + change @ calibration
-        covariance = covariances(windows, Noise(yaw=walls.drifts.noise))
+        covariance = covariances(windows, Noise(yaw=UNSEEN * walls.drifts.noise))
         count = np.arange(len(windows))
         information = np.asarray(np.linalg.inv(covariance), np.float64)
         steps = Edges(count[:-1], count[1:], motion, information)

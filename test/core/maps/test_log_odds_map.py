@@ -218,3 +218,16 @@ def test_when_the_grid_grew_does_not_matter(seed: int) -> None:
         parts.add(readings.select(which))
     assert parts.grid == whole.grid
     np.testing.assert_array_equal(parts.log_odds(), whole.log_odds())
+
+
+def test_maps_are_added_as_if_their_readings_were() -> None:
+    rng = np.random.default_rng(5)
+    for _ in range(20):
+        readings = random_readings(rng, AREA, 30)
+        cut = int(rng.integers(0, 31))
+        whole, part, rest = (LogOddsMap(Parameters()) for _ in range(3))
+        whole.add(readings)
+        part.add(readings.select(slice(0, cut)))
+        rest.add(readings.select(slice(cut, 30)))
+        part.add_map(rest)
+        np.testing.assert_array_equal(part.log_odds(whole.grid), whole.log_odds())

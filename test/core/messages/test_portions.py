@@ -10,8 +10,9 @@ import pytest
 
 from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.messages import reading_buffer
+from forward_grid_mapper.core.messages.extrinsics import LATER
 from forward_grid_mapper.core.messages.message_types import NANOSECONDS, OdometryMessage, Pose2, RangeMessage
-from forward_grid_mapper.core.messages.pose_association import LATER, PoseAssociator
+from forward_grid_mapper.core.messages.pose_association import PoseAssociator
 from forward_grid_mapper.core.messages.reading_buffer import STEP, ReadingBuffer
 
 AT_ONCE = 50

@@ -12,7 +12,7 @@ from forward_grid_mapper.core.common.readings import Readings
 from forward_grid_mapper.core.sensor.density import CUT
 from forward_grid_mapper.core.trajectory.likelihood import RAYS, SPREAD, make_scan, scores
 from forward_grid_mapper.core.trajectory.local_map import UNKNOWN, LocalMap, at_poses, local_map
-from forward_grid_mapper.core.trajectory.matching import CURVED, KAPPA, grid_around, measure, search
+from forward_grid_mapper.core.trajectory.matching import CURVED, grid_around, measure, search
 from forward_grid_mapper.core.trajectory.poses import compose
 from forward_grid_mapper.simulation.drive import drive
 from forward_grid_mapper.simulation.sonar import NOISY, sonar_ring
@@ -154,7 +154,7 @@ def test_the_parabola_is_that_of_the_scores(room) -> None:
     curvature = np.linalg.eigvalsh(match.information * np.outer(CURVED, CURVED))
     assert curvature.min() > -1e-9
     # along the most curved direction: least squares of the three values in a line, among others
-    assert curvature.max() < 60 * KAPPA * len(scan.readings)
+    assert curvature.max() < 60 * len(scan.readings)
 
 
 def test_a_bare_wall_measures_no_way_along_it() -> None:

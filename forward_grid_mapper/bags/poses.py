@@ -1,0 +1,50 @@
+"""Poses of the robot in messages that are no Odometry: stamped poses, and transforms that move."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from ..core.messages.message_types import OdometryMessage, odometry_message, planar_pose, stamp_of
+from .decoder import TF_MESSAGE
+
+ODOMETRY = 'nav_msgs/msg/Odometry'
+POSE = 'geometry_msgs/msg/PoseStamped'
+POSE_WITH_COVARIANCE = 'geometry_msgs/msg/PoseWithCovarianceStamped'
+
+BASE_FRAMES = ('base_link', 'base_footprint')
+"""Frames of a robot's base (REP 105), the one that is taken first. A pose without a child frame is of the first."""
+
+
+def _pose(message: Any) -> OdometryMessage:
+    return _stamped(message, message.pose)
+
+
+def _pose_with_covariance(message: Any) -> OdometryMessage:
+    return _stamped(message, message.pose.pose)
+
+
+def _stamped(message: Any, pose: Any) -> OdometryMessage:
+    header = message.header
+    where = planar_pose(pose.position, pose.orientation)
+    return OdometryMessage(stamp_of(header), str(header.frame_id), BASE_FRAMES[0], where)
+
+
+def _transform(message: Any) -> OdometryMessage | None:
+    """Return the pose of the robot's base in its parent frame; None if the message has none."""
+    for frame in BASE_FRAMES:
+        for item in message.transforms:
+            child = str(item.child_frame_id)
+            if child.lstrip('/') == frame:
+                where = planar_pose(item.transform.translation, item.transform.rotation)
+                return OdometryMessage(stamp_of(item.header), str(item.header.frame_id), child, where)
+    return None
+
+
+POSES: dict[str, Callable[[Any], OdometryMessage | None]] = {
+    ODOMETRY: odometry_message,
+    POSE: _pose,
+    POSE_WITH_COVARIANCE: _pose_with_covariance,
+    TF_MESSAGE: _transform,
+}
+"""How each type of message becomes a pose of the robot, those first that are looked for first."""

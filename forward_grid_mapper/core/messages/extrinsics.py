@@ -1,0 +1,88 @@
+"""Where sensors sit on the robot: what is answered when somebody asks, and what an inclined sensor says of the plane.
+
+A sensor that looks up or down measures along its axis, and the map is a plane. A wall that stands upright is met at the
+horizontal part of the range, r cos e for an axis at elevation e. The cone's shadow on the plane is wider than the cone:
+its half angle a has sin a = sin h / cos e for a cone of half angle h, from the two upright planes through the sensor
+that touch the cone.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+
+from .message_types import Pose2
+from .quaternions import STEEPEST, elevation_of
+from .rep117 import Measurement
+
+STEEP = 'steep_sensor'
+"""The reason of `rep117.REASONS` for sensors that say nothing of the plane."""
+
+
+class Mount(Pose2):
+    """The pose of a sensor on the robot: as a tuple, its projection on the plane, and besides its `elevation`.
+
+    Attributes
+    ----------
+    elevation : float
+        Of the sensor's axis above the plane, radians; REP 103's pitch with the other sign.
+    """
+
+    elevation: float
+
+    def __new__(cls, x: float, y: float, yaw: float, elevation: float = 0.0) -> Mount:
+        """Return the pose; metres and radians."""
+        made = super().__new__(cls, x, y, yaw)
+        made.elevation = elevation
+        return made
+
+
+class Later:
+    """The answer that the pose may still become known; `reason` is for readings that cannot wait any longer."""
+
+    def __init__(self, reason: str) -> None:
+        self.reason = reason
+
+
+LATER = Later('unknown_extrinsics')
+"""Nobody knows the frame so far."""
+
+LATE = Later('late_transform')
+"""The frame is known, but not at this stamp."""
+
+ExtrinsicsLookup = Callable[[str, str, int], 'Pose2 | Later | str | None']
+"""(base frame, sensor frame, stamp in ns) → pose of the sensor in the base frame, a `Later`, the reason why there can
+be no reading of it (`rep117.REASONS`), or None if its pose is unknown. A `Pose2` is a `Mount` of elevation 0."""
+
+
+def mount_of(x: float, y: float, axis: Sequence[float]) -> Mount | str:
+    """Return the pose of a sensor at (x, y) that looks along `axis`, shape (3,), or `STEEP` if it is too steep."""
+    elevation = elevation_of(*axis)
+    return STEEP if abs(elevation) > STEEPEST else Mount(x, y, math.atan2(axis[1], axis[0]), elevation)
+
+
+def shadow_of(half_angle: float, elevation: float) -> float | None:
+    """Return the half angle of the shadow that a cone casts on the plane; None if it holds the vertical. Radians."""
+    if half_angle + abs(elevation) >= math.pi / 2:
+        return None
+    return math.asin(math.sin(half_angle) / math.cos(elevation))
+
+
+def project(measured: Measurement, elevation: float) -> str:
+    """Turn a measurement along an axis of this elevation into what it says of the plane.
+
+    Returns
+    -------
+    str
+        '', or the reason why it says nothing; then it is unchanged.
+    """
+    factor = math.cos(elevation)
+    if factor == 1.0:
+        return ''
+    shadow = None if abs(elevation) > STEEPEST else shadow_of(measured.half_angle, elevation)
+    if shadow is None:
+        return STEEP
+    measured.half_angle = shadow
+    # no echo stays no echo: z and z_max are multiplied by the same
+    measured.z, measured.z_max, measured.sigma = measured.z * factor, measured.z_max * factor, measured.sigma * factor
+    return ''

@@ -1,0 +1,153 @@
+"""All poses of a drive as odometry gave them, for whoever places its readings anew.
+
+`pose_history` places readings as they come, and forgets; this remembers. Columns of 32 bytes a pose.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .message_types import NANOSECONDS, Pose2
+
+Floats = NDArray[np.float64]
+
+MOST_POSES = 300_000
+"""Poses that are kept at the most, 10 MB: of more, those go that their neighbours tell. At 50 Hz it is 100 minutes of
+driving without a rest."""
+
+TOLERANCE = 1e-4
+"""Metres, and radians, by which the neighbours may miss a pose that goes in any case, as where the robot stands."""
+
+PART = 16_384
+"""Poses that are looked through at once when some have to go: it takes a few milliseconds."""
+
+OVERLAP = 60 * NANOSECONDS
+"""Nanoseconds of the drive before that stay when another one begins: readings are late by less."""
+
+MOST_LATE = 1024
+"""Poses that came late and wait to be sorted in: it costs the same for many."""
+
+
+class OdometryRecord:
+    """Stamps and poses in order of time, one for each stamp; snapshots never change.
+
+    Parameters
+    ----------
+    most : int
+        Poses that are kept at the most; 0 is no bound.
+    """
+
+    def __init__(self, most: int = MOST_POSES) -> None:
+        self._most = most
+        self.clear()
+
+    def __len__(self) -> int:
+        return self._size + len(self._late)
+
+    @property
+    def newest(self) -> tuple[int, Pose2] | None:
+        """The last stamp, ns, and its pose; None while there is none."""
+        if not self._size:
+            return None
+        return int(self._stamp[self._size - 1]), Pose2(*self._pose[self._size - 1].tolist())
+
+    def clear(self) -> None:
+        """Forget every pose."""
+        self._size, self._next, self._anew = 0, 0, False
+        self._late: dict[int, Pose2] = {}
+        self._stamp = np.empty(1024, np.int64)
+        self._pose = np.empty((1024, 3))
+
+    def add(self, stamp: int, pose: Pose2) -> None:
+        """Add a pose, in any order of stamps; it replaces one of the same stamp."""
+        size = self._size
+        if size and stamp <= self._stamp[size - 1]:
+            self._late[stamp] = pose
+            if len(self._late) >= MOST_LATE:
+                self._sort_in()
+            return
+        if size == len(self._stamp):
+            rows = max(2 * size, 1024)
+            if self._most:
+                rows = max(size + 1, min(rows, self._most + 1))
+            self._stamp, self._pose = _longer(self._stamp, rows), _longer(self._pose, rows)
+        self._stamp[size] = stamp
+        self._pose[size] = pose
+        self._size = size + 1
+        if self._most and self._size > self._most:
+            self._thin()
+
+    def begin_anew(self) -> None:
+        """Begin a drive where another one ended: the next reading may be of any time, the drive begins with it."""
+        self._sort_in()
+        self._anew = True
+        newest = int(self._stamp[self._size - 1]) if self._size else 0
+        begin = int(np.searchsorted(self._stamp[: self._size], newest - OVERLAP))
+        # what stays is not much, and the rest is to be freed
+        self._stamp, self._pose = self._stamp[begin : self._size].copy(), self._pose[begin : self._size].copy()
+        self._size = len(self._stamp)
+
+    def snapshot(self, first: int | None = None) -> tuple[NDArray[np.int64], Floats]:
+        """Return stamps in ns, shape (M,), and x, y, yaw, shape (M, 3), which nobody must change.
+
+        Parameters
+        ----------
+        first : int, optional
+            Stamp of the drive's first reading, ns: after `begin_anew`, poses begin with the last one before it.
+        """
+        self._sort_in()
+        stamp, pose = self._stamp[: self._size], self._pose[: self._size]
+        if not self._anew or first is None:
+            return stamp, pose
+        begin = max(int(np.searchsorted(stamp, first, side='right')) - 1, 0)
+        return stamp[begin:], pose[begin:]
+
+    def _sort_in(self) -> None:
+        """Sort in what came late; into copies, since the columns are those of snapshots."""
+        if not self._late:
+            return
+        stamp = np.concatenate([self._stamp[: self._size], np.array(list(self._late), np.int64)])
+        pose = np.concatenate([self._pose[: self._size], np.array(list(self._late.values()))])
+        self._late.clear()
+        order = np.argsort(stamp, kind='stable')
+        # of one stamp the one that came last
+        last = np.append(np.diff(stamp[order]) > 0, True)
+        self._stamp, self._pose = stamp[order[last]], pose[order[last]]
+        self._size = len(self._stamp)
+        if self._most and self._size > self._most:
+            self._thin()
+
+    def _thin(self) -> None:
+        """Let poses of a part of the drive go that lie between their neighbours; the next time, of the next part."""
+        begin = self._next if self._next < self._size - 2 else 0
+        end = min(begin + PART, self._size)
+        stay = np.ones(self._size, np.bool_)
+        stay[begin:end] = _telling(self._stamp[begin:end], self._pose[begin:end])
+        self._next = begin + int(np.count_nonzero(stay[begin:end]))
+        self._stamp, self._pose = self._stamp[: self._size][stay], self._pose[: self._size][stay]
+        self._size = len(self._stamp)
+
+
+def _telling(stamp: NDArray[np.int64], pose: Floats) -> NDArray[np.bool_]:
+    """Return the poses that stay, shape (M,).
+
+    Of every other one those go that lie nearest to the line between the poses beside them, half of them at least.
+    """
+    stay = np.ones(len(stamp), np.bool_)
+    before, middle, after = slice(0, -2, 2), slice(1, -1, 2), slice(2, None, 2)
+    part = ((stamp[middle] - stamp[before]) / (stamp[after] - stamp[before]))[:, None]
+    whole, half = pose[after] - pose[before], pose[middle] - pose[before]
+    for turn in (whole[:, 2], half[:, 2]):
+        turn[:] = np.remainder(turn + np.pi, 2 * np.pi) - np.pi
+    off = np.abs(half - part * whole).max(1)
+    stay[middle] = off > max(float(np.median(off)), TOLERANCE)
+    return stay
+
+
+def _longer(column: NDArray[Any], rows: int) -> NDArray[Any]:
+    longer = np.empty((rows, *column.shape[1:]), column.dtype)
+    longer[: len(column)] = column
+    return longer

@@ -1,0 +1,204 @@
+"""From readings to the three maps in tiles: block coordinate ascent over windows of the map.
+
+    normals        of each tile's core, from the readings that reach into it; they are those of the whole map
+    first maps     each tile and its halo by itself, all at once; the cores are put together
+    rounds         colour by colour, each stale tile is searched on with all others held, until no tile changes
+    maps           of each core, from the readings that reach into it
+    judgement      of each reading, by the tile in whose core its sensor was
+
+The objective is a sum over readings and a local prior. So what a window gains is what the whole map gains, it rises
+with every change, and where no tile changes any more no single flip gains. Tiles of one colour do not see each other:
+the maps do not depend on how many are searched at once. They depend on the size of the tiles, as a search depends on
+where it starts.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Callable, Iterable
+from functools import partial
+from typing import Any, TypeVar
+
+import numpy as np
+
+from .common.parameters import Parameters
+from .common.readings import Readings, in_canonical_order
+from .evidence.neighbourhood import patterns
+from .mapping import Watch
+from .maps.log_odds_map import LogOddsMap, map_grid
+from .maps.map_set import MapSet
+from .runtime.cancelling import check
+from .runtime.threads import cores
+from .search.prior import log_prior, wall_prior
+from .search.search import Progress
+from .tiles.mosaic import Each, Mosaic
+from .tiles.windows import Given, finished, first_map, found_normals, improved, judged
+
+T = TypeVar('T')
+
+
+class TiledMapper:
+    """Runs from readings to maps, tile by tile; can be cancelled from another thread."""
+
+    def __init__(self, parameters: Parameters, size: float, each: Each[Any] = map, at_once: int = 1) -> None:
+        """Prepare runs.
+
+        Parameters
+        ----------
+        parameters : Parameters
+        size : float
+            Edge of a tile, metres. The smaller the tiles, the more readings belong to several of them.
+        each : callable, optional
+            How tiles are worked on; `map`, one after the other, or the `map` of an executor.
+        at_once : int
+            How many tiles `each` works on at once, which share the cores.
+        """
+        self._size, self._each = size, each
+        threads = max((parameters.search.threads or cores()) // at_once, 1)
+        self._parameters = parameters
+        self._of_a_tile = dataclasses.replace(
+            parameters, search=dataclasses.replace(parameters.search, threads=threads)
+        )
+        self._stop = np.zeros(1, np.uint8)
+        self._seconds: dict[str, float] = {}
+        self._visits = 0
+        self._progress = Progress(0, 0, 0, 0.0)
+        self._watch: Watch = lambda stage, progress: None
+
+    def cancel(self) -> None:
+        """Make `run` raise `Cancelled` soon; may be called from any thread."""
+        self._stop[0] = 1
+
+    def run(self, readings: Readings, watch: Watch = lambda stage, progress: None) -> MapSet:
+        """Return the maps of `readings`; `watch` is as for `core.mapping.Mapper.run`.
+
+        Raises
+        ------
+        InputError
+            If there are no readings, or they span too large a map.
+        Cancelled
+            If `cancel` was called.
+        """
+        self._watch, self._seconds, self._visits = watch, {}, 0
+        self._progress = Progress(0, 0, 0, 0.0)
+        p = self._parameters
+        readings = in_canonical_order(readings)
+        mosaic = Mosaic(readings, map_grid(readings, p), p, self._size)
+        self._visit('normals', mosaic, mosaic.filled, found_normals, mosaic.take_normals)
+        converged = self._search(mosaic)
+        self._visit('maps of tiles', mosaic, range(len(mosaic.tiling.tiles)), finished, self._finish(mosaic))
+        self._visit('uncertainty', mosaic, mosaic.filled, judged, mosaic.take_judged)
+        begun = time.perf_counter()
+        watch('live map', None)
+        live = LogOddsMap(p)
+        live.add(readings)
+        shown = live.probability(mosaic.grid)
+        self._seconds['live map'] = time.perf_counter() - begun
+        return self._maps(mosaic, shown, converged)
+
+    def _visit(
+        self,
+        stage: str,
+        mosaic: Mosaic,
+        numbers: Iterable[int],
+        work: Callable[..., T],
+        take: Callable[[int, T], None],
+        given: Callable[[int], Given] | None = None,
+    ) -> None:
+        """Have tiles worked on, and keep what comes out."""
+        check(self._stop)
+        self._watch(stage, None)
+        begun = time.perf_counter()
+        numbers = list(numbers)
+        found = self._each(partial(work, parameters=self._of_a_tile), map(given or mosaic.given, numbers))
+        for number, result in zip(numbers, found, strict=True):
+            check(self._stop)
+            take(number, result)
+        self._seconds[stage] = self._seconds.get(stage, 0.0) + time.perf_counter() - begun
+
+    def _search(self, mosaic: Mosaic) -> bool:
+        """Search until no tile changes; return whether all searches converged."""
+        open_ends = 0
+
+        def count(progress: Progress, converged: bool) -> None:
+            nonlocal open_ends
+            self._visits += 1
+            open_ends += not converged
+            p = self._progress
+            self._progress = Progress(
+                p.iterations + progress.iterations,
+                p.flips + progress.flips,
+                p.shifts + progress.shifts,
+                p.gain + progress.gain,
+            )
+            self._watch('search', self._progress)
+
+        def first(number: int, found: Any) -> None:
+            mosaic.take_first(number, found)
+            count(found.progress, found.converged)
+
+        def again(number: int, found: Any) -> None:
+            mosaic.take(number, found)
+            count(found.progress, found.converged)
+
+        self._visit('search', mosaic, mosaic.filled, first_map, first, mosaic.given_first)
+        while mosaic.stale:
+            for colour in mosaic.tiling.colours:
+                if numbers := [number for number in colour if number in mosaic.stale]:
+                    self._visit('search', mosaic, numbers, improved, again)
+        return not open_ends
+
+    def _finish(self, mosaic: Mosaic) -> Callable[[int, Any], None]:
+        self._pairs = self._bytes = self._unstored = 0
+        self._searched = 0.0
+
+        def take(number: int, found: Any) -> None:
+            mosaic.take_finished(number, found)
+            self._pairs += found.pairs
+            self._bytes += found.nbytes
+            self._unstored += found.unstored
+            self._searched += found.log_likelihood
+
+        return take
+
+    def _maps(self, mosaic: Mosaic, live: Any, converged: bool) -> MapSet:
+        p, ml = self._parameters, mosaic.ml
+        mosaic.dynamic[ml != 0] = 0.0
+        prior = wall_prior(p.search, mosaic.traversed.ravel(), mosaic.grid.resolution)
+
+        def of_prior(occupied: Any) -> float:
+            return log_prior(prior, occupied.ravel(), patterns(occupied, mosaic.grid.shape))
+
+        occupied = (ml == 1).astype(np.uint8)
+        log_likelihood, exponent = float(mosaic.log_likelihood.sum()), p.model.likelihood_exponent
+        return MapSet(
+            grid=mosaic.grid,
+            live=live,
+            ml=ml,
+            uncertainty=mosaic.uncertainty,
+            readings=mosaic.readings,
+            unexplained=mosaic.unexplained,
+            log_likelihood=log_likelihood,
+            objective=exponent * log_likelihood + of_prior(occupied),
+            parameters=p,
+            searched=mosaic.searched,
+            dynamic=mosaic.dynamic,
+            normals=mosaic.all_normals(),
+            statistics={
+                'pairs': self._pairs,
+                'bytes_per_pair': self._bytes / max(self._pairs, 1),
+                'readings_not_stored': self._unstored,
+                'searched_log_likelihood': self._searched,
+                'searched_objective': exponent * self._searched + of_prior(mosaic.occupied),
+                'flips': self._progress.flips,
+                'shifts': self._progress.shifts,
+                'iterations': self._progress.iterations,
+                'converged': converged,
+                'tiles': len(mosaic.filled),
+                'searches_of_tiles': self._visits,
+                'evaluations_of_a_reading': mosaic.halo,
+                'seconds': self._seconds,
+                'occupied': int(occupied.sum()),
+            },
+        )

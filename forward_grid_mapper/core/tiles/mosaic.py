@@ -1,0 +1,151 @@
+"""The whole map that tiles are cut from and put back into."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterable
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..common.grid import UNKNOWN, Grid
+from ..common.parameters import Parameters
+from ..common.readings import Readings
+from ..maps.traversed import traversed_cells
+from ..sensor.cone_table import grid_of
+from ..sensor.surface_normals import SurfaceNormals
+from .tiling import Tiling
+from .windows import Finished, Given, Judged, Searched, normals_from
+
+T = TypeVar('T')
+
+Each = Callable[[Callable[[Given], T], Iterable[Given]], Iterable[T]]
+"""Calls a function with each item, in any order or at once, and returns the results in the order of the items: `map`,
+or that of an executor."""
+
+
+FIRST_AROUND = 2.0
+"""Metres around a core whose readings make its first map."""
+
+
+class Mosaic:
+    """The map of all tiles as far as it is known, and the tiles that have to be searched again.
+
+    Attributes
+    ----------
+    readings : Readings
+        In canonical order.
+    grid : Grid
+    tiling : Tiling
+    traversed : bool, shape `grid.shape`
+    occupied : uint8, shape `grid.shape`
+    normals : float32, shape (2, *grid.shape)
+    ml, searched : int8, shape `grid.shape`
+    uncertainty, dynamic : float32, shape `grid.shape`
+    log_likelihood : float64, shape (N,)
+    unexplained : bool, shape (N,)
+    """
+
+    def __init__(self, readings: Readings, grid: Grid, parameters: Parameters, size: float) -> None:
+        """Begin with an empty map in tiles of `size` metres."""
+        self.readings, self.grid = readings, grid
+        self.tiling = Tiling(grid, readings, parameters, size)
+        self._parameters = parameters
+        self._readings_of, self._owner = self.tiling.readings_of(), self.tiling.owners(readings)
+        self.traversed = traversed_cells(readings, grid)
+        self.occupied = np.zeros(grid.shape, np.uint8)
+        self.normals = np.zeros((2, *grid.shape), np.float32)
+        self.ml, self.searched = (np.full(grid.shape, UNKNOWN, np.int8) for _ in range(2))
+        self.uncertainty = np.full(grid.shape, np.nan, np.float32)
+        self.dynamic = np.zeros(grid.shape, np.float32)
+        self.log_likelihood, self.unexplained = np.zeros(len(readings)), np.zeros(len(readings), np.bool_)
+        self._first_readings = self.tiling.readings_of(FIRST_AROUND)
+        self._boxes = [self._box(k, indices) for k, indices in enumerate(self._readings_of)]
+        self.stale = {k for k, indices in enumerate(self._readings_of) if len(indices)}
+
+    @property
+    def halo(self) -> float:
+        """Readings of all tiles together, by those that there are: how often each is evaluated."""
+        return sum(map(len, self._readings_of)) / len(self.readings)
+
+    @property
+    def filled(self) -> list[int]:
+        """The tiles that have readings."""
+        return [k for k, indices in enumerate(self._readings_of) if len(indices)]
+
+    def _box(self, number: int, indices: NDArray[np.int64]) -> Grid:
+        around = self.tiling.around(self.tiling.tiles[number])
+        readings = self.readings.select(indices)
+        if not len(readings):
+            return around
+        # no box is larger than the whole
+        unlimited = dataclasses.replace(self._parameters.grid, max_cells=self.grid.size)
+        return grid_of(readings, self._parameters.model, unlimited, within=around)
+
+    def given(self, number: int) -> Given:
+        """Return what is known around a tile."""
+        return self._given(number, self._readings_of[number], self._boxes[number])
+
+    def given_first(self, number: int) -> Given:
+        """Return what is known around a tile for its first map, which is made without its neighbours."""
+        indices = self._first_readings[number]
+        return self._given(number, indices, self._box(number, indices))
+
+    def _given(self, number: int, indices: NDArray[np.int64], box: Grid) -> Given:
+        part = self.grid.window(box)
+        return Given(
+            self.tiling.tiles[number],
+            box,
+            self.readings.select(indices),
+            self._owner[indices] == number,
+            self.traversed[part],
+            self.occupied[part].copy(),
+            self.normals[(slice(None), *part)],
+            self.ml[part],
+        )
+
+    def _core(self, number: int) -> tuple[slice, slice]:
+        return self.grid.window(self.tiling.tiles[number].core)
+
+    def all_normals(self) -> SurfaceNormals:
+        """Return the normals of the whole map."""
+        return normals_from(self.normals, self._parameters)
+
+    def take_normals(self, number: int, normals: NDArray[np.float32]) -> None:
+        """Keep the normals of a core."""
+        self.normals[(slice(None), *self._core(number))] = normals
+
+    def take_first(self, number: int, found: Searched) -> None:
+        """Keep the core of a map that was found without its neighbours."""
+        tile = self.tiling.tiles[number]
+        self.occupied[self._core(number)] = found.occupied[tile.window.window(tile.core)]
+
+    def take(self, number: int, found: Searched) -> None:
+        """Keep the map of a window; tiles that see what changed are stale."""
+        self.stale.discard(number)
+        if not found.changed:
+            return
+        window = self.tiling.tiles[number].window
+        kept = self.occupied[self.grid.window(window)]
+        rows, columns = np.nonzero(kept != found.occupied)
+        kept[:] = found.occupied
+        first = window.row + int(rows.min()), window.column + int(columns.min())
+        last = window.row + int(rows.max()), window.column + int(columns.max())
+        for other in self.filled:
+            box = self._boxes[other]
+            above = box.row <= last[0] and first[0] < box.row + box.height
+            if other != number and above and box.column <= last[1] and first[1] < box.column + box.width:
+                self.stale.add(other)
+
+    def take_finished(self, number: int, found: Finished) -> None:
+        """Keep the maps of a core."""
+        core = self._core(number)
+        self.ml[core], self.uncertainty[core], self.searched[core] = found.ml, found.uncertainty, found.searched
+
+    def take_judged(self, number: int, found: Judged) -> None:
+        """Keep what was found of the readings of a tile."""
+        indices = self._readings_of[number]
+        own = indices[self._owner[indices] == number]
+        self.log_likelihood[own], self.unexplained[own] = found.log_likelihood, found.unexplained
+        self.dynamic[self.grid.window(self._boxes[number])] += found.dynamic

@@ -1,0 +1,177 @@
+"""What is done with one tile: functions of its readings and of the map around it, which any process may call.
+
+Each takes a `Given` and returns arrays of the tile's core alone (of its window, where the search may change it).
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..common.constants import EXTENSION
+from ..common.grid import Grid
+from ..common.parameters import Parameters
+from ..common.readings import Readings
+from ..evidence.evidence import NEVER, NO_INCIDENCE_LIMIT, Evidence
+from ..maps.dynamic import dynamic_echoes
+from ..maps.post_processing import post_process
+from ..maps.uncertainty import uncertainty_map
+from ..runtime.memory import memory_for_pairs
+from ..search.prior import has_walls, odds_given_neighbours, wall_prior
+from ..search.search import Progress, Search
+from ..sensor.cone_table import cone_table
+from ..sensor.forward_model import ForwardModel
+from ..sensor.surface_normals import SurfaceNormals, gather, known_normals, no_normals, normals_of
+from .tiling import Tile
+
+
+class Given(NamedTuple):
+    """What is known around a tile.
+
+    Attributes
+    ----------
+    tile : Tile
+    box : Grid
+        Holds the cones of all its readings, and its window.
+    readings : Readings
+        Whose cones may touch the window, in canonical order.
+    own : bool, shape (N,)
+        Those whose sensors were in the core.
+    traversed : bool, shape `box.shape`
+    occupied : uint8, shape `box.shape`
+        The map.
+    normals : float32, shape (2, *box.shape)
+        Unit vectors along the surface normals, 0 where none is known.
+    ml : int8, shape `box.shape`
+        The map that is handed out; only for `judged`.
+    """
+
+    tile: Tile
+    box: Grid
+    readings: Readings
+    own: NDArray[np.bool_]
+    traversed: NDArray[np.bool_]
+    occupied: NDArray[np.uint8]
+    normals: NDArray[np.float32]
+    ml: NDArray[np.int8]
+
+    def core(self, values: NDArray[Any]) -> NDArray[Any]:
+        """Return a copy of the part of an array of the box that is the core's."""
+        return np.array(values.reshape(self.box.shape)[self.box.window(self.tile.core)])
+
+
+def normals_from(xy: NDArray[np.float32], parameters: Parameters) -> SurfaceNormals:
+    """Return normals from their unit vectors, float32, shape (2, height, width), 0 where none is known."""
+    angle = parameters.model.max_incidence_angle
+    if angle >= NO_INCIDENCE_LIMIT:
+        return no_normals()
+    x, y = xy
+    return known_normals(((x != 0) | (y != 0)).astype(np.uint8), x, y, angle)
+
+
+class Searched(NamedTuple):
+    """The map of a window after a search: `changed` says whether any cell of it was."""
+
+    occupied: NDArray[np.uint8]
+    changed: bool
+    progress: Progress
+    converged: bool
+
+
+class Finished(NamedTuple):
+    """The maps of a core that the search gives, and sums over the tile's own readings."""
+
+    ml: NDArray[np.int8]
+    uncertainty: NDArray[np.float32]
+    searched: NDArray[np.int8]
+    log_likelihood: float
+    pairs: int
+    nbytes: int
+    unstored: int
+
+
+class Judged(NamedTuple):
+    """What the map says of the tile's own readings."""
+
+    log_likelihood: NDArray[np.float64]
+    unexplained: NDArray[np.bool_]
+    dynamic: NDArray[np.float32]
+
+
+def found_normals(given: Given, parameters: Parameters) -> NDArray[np.float32]:
+    """Return the surface normals of the core, float32, shape (2, *core.shape), 0 where none is known."""
+    box, angle = given.box, parameters.model.max_incidence_angle
+    if angle >= NO_INCIDENCE_LIMIT:
+        return np.zeros((2, *given.tile.core.shape), np.float32)
+    sums = np.zeros((3, box.size), np.int64)
+    cones = cone_table(given.readings, box, parameters.model)
+    gather(cones, box.shape, (0, len(cones)), sums, NEVER)
+    normals = normals_of(sums, box, angle)
+    return np.stack([given.core(normals.x), given.core(normals.y)])
+
+
+def _evidence(given: Given, parameters: Parameters, stop: NDArray[np.uint8] | None = None) -> Evidence:
+    threads = parameters.search.threads or 1
+    memory = memory_for_pairs(parameters)
+    normals = normals_from(given.normals, parameters)
+    made = Evidence(given.box, parameters.model, memory, threads, stop, given.occupied, normals=normals)
+    if len(given.readings):
+        made.extend(given.readings)
+    return made
+
+
+def first_map(given: Given, parameters: Parameters, stop: NDArray[np.uint8] | None = None) -> Searched:
+    """Search all of the box from the empty map, and return the window's part of it.
+
+    What lies outside of the window is not seen by all its readings, and serves to explain those of the window.
+    """
+    given = given._replace(occupied=np.zeros_like(given.occupied))
+    evidence = _evidence(given, parameters, stop)
+    found = Search(evidence, parameters.search, given.traversed.ravel()).run()
+    occupied = evidence.state.maps.occupied.reshape(given.box.shape)
+    part = np.array(occupied[given.box.window(given.tile.window)])
+    return Searched(part, bool(part.any()), found.progress, found.converged)
+
+
+def improved(given: Given, parameters: Parameters, stop: NDArray[np.uint8] | None = None) -> Searched:
+    """Search the window, and hold the rest of the box, until nothing gains."""
+    evidence = _evidence(given, parameters, stop)
+    rows, columns = given.box.window(given.tile.window)
+    window = rows.start, rows.stop, columns.start, columns.stop
+    before = evidence.state.maps.occupied.copy()
+    search = Search(evidence, parameters.search, given.traversed.ravel(), window, hold=True)
+    found = search.improve()
+    after = evidence.state.maps.occupied
+    part = np.array(after.reshape(given.box.shape)[rows, columns])
+    return Searched(part, bool((after != before).any()), found.progress, found.converged)
+
+
+def finished(given: Given, parameters: Parameters) -> Finished:
+    """Return the maps of the core that go with the map that the search found."""
+    p = parameters
+    evidence = _evidence(given, p)
+    searched, of_occupancy = evidence.observed(), evidence.of_occupancy()
+    extension = EXTENSION if has_walls(p.search) else 0.0
+    ml = post_process(evidence, extension, p.search.least_passed, given.traversed)
+    prior = wall_prior(p.search, given.traversed.ravel(), given.box.resolution)
+    odds = odds_given_neighbours(prior, ml == 1)
+    return Finished(
+        given.core(ml),
+        given.core(uncertainty_map(of_occupancy, odds, ml, p.search)),
+        given.core(searched),
+        evidence.log_likelihood_of(given.own),
+        evidence.pairs,
+        evidence.nbytes,
+        evidence.unstored,
+    )
+
+
+def judged(given: Given, parameters: Parameters) -> Judged:
+    """Return what the map that is handed out says of the tile's own readings."""
+    own = given.readings.select(given.own)
+    forward = ForwardModel(own, given.box, parameters.model, normals_from(given.normals, parameters))
+    e = forward.expectations(given.ml)
+    unexplained = e.random > 0.5
+    return Judged(e.log_likelihood, unexplained, dynamic_echoes(forward, unexplained, given.ml))

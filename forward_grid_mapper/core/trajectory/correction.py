@@ -1,0 +1,73 @@
+"""What a refined trajectory makes of poses that odometry gives, those that come after its end included.
+
+The pose of odometry's frame in the map frame, T, is what `map` → `odom` says on TF:
+
+    T(t) = trajectory(t) · odometry(t)⁻¹
+
+After the end of the trajectory it stays as it was there, until another one is found.
+"""
+
+from __future__ import annotations
+
+from functools import cached_property
+
+import numpy as np
+
+from ..common.readings import Readings
+from .local_map import at_poses
+from .poses import Floats, compose, inverse
+from .refinement import replaced
+from .windows import Odometry
+
+
+class Correction:
+    """From the frame of odometry to that of the map.
+
+    Parameters
+    ----------
+    odometry, trajectory : Odometry
+        Poses of the robot in both, at the same stamps.
+    """
+
+    def __init__(self, odometry: Odometry, trajectory: Odometry) -> None:
+        self.odometry, self.trajectory = odometry, trajectory
+
+    @property
+    def end(self) -> int:
+        """The last stamp of the trajectory, nanoseconds."""
+        return int(self.trajectory.stamp[-1])
+
+    @cached_property
+    def last(self) -> Floats:
+        """T at the end and after it, shape (3,): metres, radians."""
+        pose = compose(self.trajectory.pose[-1], inverse(self.odometry.pose[-1]))
+        pose[2] = np.remainder(pose[2] + np.pi, 2 * np.pi) - np.pi
+        return pose
+
+    @property
+    def moved(self) -> float:
+        """Metres between odometry and trajectory at the end."""
+        return float(np.hypot(*(self.trajectory.pose[-1, :2] - self.odometry.pose[-1, :2])))
+
+    def apply(self, readings: Readings) -> Readings:
+        """Return readings that odometry placed where they belong on the map."""
+        sensors = np.stack([readings.x, readings.y, readings.yaw], axis=1)
+        placed = compose(self.last, sensors)
+        early = readings.stamp <= self.end
+        if early.any():
+            before = replaced(readings.select(early), self.odometry, self.trajectory)
+            placed[early] = np.stack([before.x, before.y, before.yaw], axis=1)
+        return at_poses(readings, placed)
+
+    def path_of(self, stamp: np.ndarray, pose: Floats) -> Floats:
+        """Return the robot's path, shape (P, 2), metres: the trajectory, and poses of odometry after its end.
+
+        Parameters
+        ----------
+        stamp : int64, shape (M,)
+            Nanoseconds, increasing.
+        pose : float64, shape (M, 3)
+            As odometry gives them.
+        """
+        later = compose(self.last, pose[np.searchsorted(stamp, self.end, side='right') :])
+        return np.concatenate([self.trajectory.pose[:, :2], later[:, :2]])

@@ -1,0 +1,213 @@
+"""`report.html`: the maps, the readings and the report as one page, which needs neither a server nor a network.
+
+The page is a canvas with a few hundred lines of script (folder `web`). bokeh would add 1.6 MB of script to every
+report, plotly 4.8 MB, and neither knows what a reading says of a cell: that part would be the same. Cones, densities,
+causes and priors are computed here, by the functions of the core; the page only walks a cone and sums, as `explain`
+does.
+"""
+
+from __future__ import annotations
+
+import base64
+import html
+import json
+import zlib
+from collections.abc import Mapping
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core.common.constants import THROUGH
+from ..core.common.errors import OutputError
+from ..core.common.grid import UNKNOWN, Grid
+from ..core.maps.cell_evidence import HERE, NOTHING, prior_odds
+from ..core.maps.map_set import MapSet
+from ..core.maps.traversed import traversed_cells
+from ..core.messages.message_types import NANOSECONDS
+from ..core.sensor.density import CUT, causes_of
+from .output_folder import output_errors
+from .picture import NOWHERE, figures_of, view_of
+from .report_text import report_text
+
+WEB = Path(__file__).with_name('web')
+SCRIPTS = ('evidence.js', 'chart.js', 'page.js')
+
+MOST_CELLS = 6_000_000
+"""More cells than that make a page that browsers labour with."""
+
+MOST_READINGS = 100_000
+"""Readings that a page holds; they take some 60 bytes each. Beyond, it shows the maps, and `explain` tells the rest."""
+
+MOST_POINTS = 4000
+"""Points of a path: more cannot be told apart."""
+
+UNKNOWN_SHARE = 65535
+STEPS = 10_000
+"""Steps of probabilities on the page."""
+
+CAUSES = ('hit', 'random', 'lost', 'no_echo')
+"""Causes of a reading as `Expectations` has them, in the order of the page."""
+
+_CONE = ('x', 'y', 'axis_x', 'axis_y', 'sine', 'cosine', 'z', 'z_max', 'sigma', 'reach')
+
+
+def write_page(
+    path: Path,
+    maps: MapSet,
+    report: Mapping[str, Any],
+    title: str,
+    path_xy: NDArray[np.float64] = NOWHERE,
+    odometry_xy: NDArray[np.float64] = NOWHERE,
+    reference: tuple[Grid, NDArray[np.int8]] | None = None,
+) -> None:
+    """Write the page.
+
+    Parameters
+    ----------
+    path : Path
+    maps : MapSet
+    report : mapping
+        What `report_data` returned.
+    title : str
+    path_xy : float64, shape (P, 2)
+        Where the robot was, in order, metres; may be empty. Rows of NaN part several drives.
+    odometry_xy : float64, shape (Q, 2)
+        The path that odometry gives, metres, where the robot was elsewhere.
+    reference : (Grid, int8 array), optional
+        The true map.
+
+    Raises
+    ------
+    OutputError
+        If the map has more cells than `MOST_CELLS`, or the file cannot be written; then there is none.
+    """
+    if maps.grid.size > MOST_CELLS:
+        raise OutputError(f'a page shows at most {MOST_CELLS:,} cells, the map has {maps.grid.size:,}')
+    page = page_data(maps, report, path_xy, odometry_xy, reference)
+    count = len(maps.readings)
+    hint = (
+        'Point at a cell to see what is known of it. Click it to see which readings speak for an obstacle or against.'
+    )
+    if count > MOST_READINGS:
+        hint = f'{count:,} readings are too many for a page: forward_grid_mapper explain tells what they say.'
+    warnings = ''.join(f'<li>{html.escape(str(text))}</li>' for text in report.get('warnings') or ())
+    parts = {
+        'title': html.escape(title),
+        'figures': html.escape(figures_of(maps)),
+        'warnings': f'<ul id="warnings">{warnings}</ul>' if warnings else '',
+        'hint': html.escape(hint),
+        'report': html.escape(report_text(dict(report))),
+        'style': (WEB / 'page.css').read_text(encoding='utf-8'),
+        'script': '\n'.join((WEB / name).read_text(encoding='utf-8') for name in SCRIPTS),
+        # what a bag names may hold the end of a script
+        'data': json.dumps(page, allow_nan=False).replace('<', '\\u003c'),
+    }
+    # in one pass, since a title may hold the name of another part
+    pieces = (WEB / 'page.html').read_text(encoding='utf-8').split('{{')
+    text = pieces[0] + ''.join(parts[piece.partition('}}')[0]] + piece.partition('}}')[2] for piece in pieces[1:])
+    try:
+        with output_errors(path):
+            path.write_text(text, encoding='utf-8', errors='backslashreplace')
+    except OutputError:
+        with suppress(OSError):
+            path.unlink()
+        raise
+
+
+def page_data(
+    maps: MapSet,
+    report: Mapping[str, Any],
+    path_xy: NDArray[np.float64],
+    odometry_xy: NDArray[np.float64],
+    reference: tuple[Grid, NDArray[np.int8]] | None,
+) -> dict[str, Any]:
+    """Return the numbers of the page, ready for JSON; the parameters are those of `write_page`."""
+    arrays: dict[str, NDArray[Any]] = {
+        'ml_map': np.where(maps.ml == UNKNOWN, 255, maps.ml).astype(np.uint8),
+        'live_map': _shares(maps.live),
+        'uncertainty_map': _shares(maps.uncertainty),
+        'prior': prior_odds(maps.grid, maps.ml, maps.parameters).astype(np.float32),
+        'traversed': traversed_cells(maps.readings, maps.grid).astype(np.uint8),
+        'path': _thinned(path_xy),
+    }
+    if len(odometry_xy):
+        arrays['odometry'] = _thinned(odometry_xy)
+    if reference is not None:
+        arrays['reference'] = np.where(reference[1] == UNKNOWN, 255, reference[1]).astype(np.uint8)
+    if 0 < len(maps.readings) <= MOST_READINGS:
+        arrays |= _readings(maps)
+    everywhere = np.concatenate([path_xy.reshape(-1, 2), odometry_xy])
+    model = maps.parameters.model
+    stamps = maps.readings.stamp
+    return {
+        'grid': _grid(maps.grid),
+        'reference': None if reference is None else _grid(reference[0]),
+        'view': view_of(maps, everywhere[np.isfinite(everywhere).all(axis=1)]),
+        'model': {
+            'p_hit': causes_of(maps.readings.select(slice(0)), np.zeros(0), model, maps.grid.resolution).p_hit,
+            'mixture_weight': 1.0 - model.p_rand - model.p_lost,
+            'exponent': model.likelihood_exponent,
+            'surface_offset': model.surface_offset,
+            'cut': CUT,
+            'here': HERE,
+            'nothing': NOTHING,
+            'through': THROUGH,
+            'cos2_limit': maps.normals.cos2_limit if len(maps.normals.known) else 0.0,
+        },
+        'start': float(stamps.min() / NANOSECONDS) if len(stamps) else 0.0,
+        'sensors': [_sensor(name, report) for name in maps.readings.sensor_names or ('',)],
+        'arrays': {name: _packed(values) for name, values in arrays.items()},
+    }
+
+
+def _readings(maps: MapSet) -> dict[str, NDArray[Any]]:
+    """Return the columns from which the page computes what each reading says of a cell."""
+    forward, readings = maps.forward_model(), maps.readings
+    expected = forward.expectations(maps.ml)
+    likely = np.stack([getattr(expected, name) for name in CAUSES])
+    # as in the report: random where that is likelier than all else together
+    likely[CAUSES.index('random')] = np.where(maps.unexplained, 2.0, 0.0)
+    causes = causes_of(readings, forward.cones['sigma'] * maps.grid.resolution, forward.model, maps.grid.resolution)
+    columns: dict[str, NDArray[Any]] = {name: forward.cones[name] for name in _CONE}
+    columns |= {'random': causes.random, 'lost': causes.lost, 'max_range': causes.max_range}
+    columns |= {'stamp': readings.stamp / NANOSECONDS}
+    columns |= {'sensor': readings.sensor.astype(np.uint16), 'cause': likely.argmax(axis=0).astype(np.uint8)}
+    if len(maps.normals.known):
+        columns |= {'normal_x': maps.normals.x, 'normal_y': maps.normals.y}
+    return columns
+
+
+def _shares(probability: NDArray[np.float32]) -> NDArray[np.uint16]:
+    steps = np.rint(np.nan_to_num(probability) * STEPS)
+    return np.where(np.isnan(probability), UNKNOWN_SHARE, steps).astype(np.uint16)
+
+
+def _thinned(xy: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Return a path of some `MOST_POINTS` points, the last one among them; rows of NaN, which part drives, stay."""
+    which = np.linspace(0, len(xy) - 1, min(len(xy), MOST_POINTS)).astype(np.int64)
+    parted = np.flatnonzero(~np.isfinite(xy).all(axis=1))
+    ends = np.concatenate([parted - 1, parted, parted + 1])
+    which = np.union1d(which, ends[(ends >= 0) & (ends < len(xy))])
+    return xy[which].astype(np.float32)
+
+
+def _grid(grid: Grid) -> dict[str, float]:
+    x, y = grid.origin
+    return {'width': grid.width, 'height': grid.height, 'resolution': grid.resolution, 'x': x, 'y': y}
+
+
+def _sensor(name: str, report: Mapping[str, Any]) -> dict[str, Any]:
+    row = (report.get('sensors') or {}).get(name) or {}
+    total = row.get('accepted') or 0
+    shares = [f'{100 * (row.get(key) or 0) / max(total, 1):.1f} %' for key in ('no_echo', 'unexplained')]
+    return {'name': name, 'cells': [f'{total:,}', *shares], 'verdict': (row.get('health') or {}).get('verdict', '')}
+
+
+def _packed(values: NDArray[Any]) -> dict[str, str]:
+    """Return an array as a browser unpacks it: little-endian, deflated, in base64."""
+    little = np.ascontiguousarray(values, values.dtype.newbyteorder('<'))
+    data = base64.b64encode(zlib.compress(little.tobytes(), 6)).decode('ascii')
+    return {'type': f'{little.dtype.kind}{little.dtype.itemsize}', 'data': data}

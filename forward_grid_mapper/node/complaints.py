@@ -1,0 +1,83 @@
+"""What is wrong with the command line of the node, or with what ROS was given, in words."""
+
+from __future__ import annotations
+
+import difflib
+import re
+from collections.abc import Mapping, Sequence
+
+from ..core.common.parameters import TABLE
+
+OPTIONS = ('--ros-args', '--help')
+ROS_OPTIONS = (
+    *('--param', '--params-file', '--remap', '--log-level', '--log-config-file', '--log-file-name', '--enclave'),
+    *('--enable-rosout-logs', '--disable-rosout-logs', '--enable-stdout-logs', '--disable-stdout-logs'),
+    *('--enable-external-lib-logs', '--disable-external-lib-logs', '-p', '-r', '-e'),
+)
+TOPICS = ('sonar', 'odom')
+HIGHEST_DOMAIN = 232
+"""DDS has ports for no more."""
+
+_SOURCE = re.compile(r', at /\S+:\d+')
+_INIT = re.compile(r'^failed to initialize rcl: ')
+_RULE = re.compile(r"Couldn't parse remap rule: '(?:-r|--remap) (?P<rule>.*?)'\.")
+_PARAMETER = re.compile(r"Couldn't parse parameter override rule: '(?:-p|--param) (?P<rule>.*?)'\.")
+_FILE = re.compile(r"Couldn't parse params file: '--params-file (?P<file>.*?)'\. Error: (?P<why>.*)")
+
+
+def _nearest(word: str, known: Sequence[str]) -> str:
+    near = difflib.get_close_matches(word, known, n=1)
+    return f'; did you mean {near[0]}?' if near else ''
+
+
+def of_arguments(left: Sequence[str]) -> str:
+    """Return what to do about arguments that are none of ROS's."""
+    parameters = [row.name for row in TABLE]
+    for word in left:
+        name, given, _value = word.partition(':=')
+        if given and name in parameters:
+            return f'{name} is a parameter: --ros-args -p {word}'
+        if given and (name in TOPICS or name.startswith(('~', '/', '_'))):
+            return f'a topic, or a name of the node, is given as --ros-args -r {word}'
+        if given:
+            near = _nearest(name, (*parameters, *TOPICS))
+            return f'{word} means nothing{near}; parameters come as --ros-args -p NAME:=VALUE'
+    for word in left:
+        if word in ROS_OPTIONS:
+            return f'{word} comes after --ros-args: --ros-args {" ".join(left)}'
+    return f'{" ".join(left)} means nothing{_nearest(left[0], OPTIONS)}; ROS options come after --ros-args'
+
+
+def of_ros_arguments(text: str) -> str:
+    """Return what to do about arguments after --ros-args that ROS does not know; rclpy gives them as a list in text."""
+    unknown = re.findall(r"'([^']*)'", text) or [text]
+    word = unknown[0]
+    if ':=' in word:
+        return f'{word} has to come after -p (a parameter) or -r (another name for a topic or the node)'
+    return f'{", ".join(unknown)}: no such ROS option{_nearest(word, ROS_OPTIONS)}; known are {", ".join(ROS_OPTIONS)}'
+
+
+def of_domain(environment: Mapping[str, str]) -> str:
+    """Return what is wrong with ROS_DOMAIN_ID, or ''."""
+    text = environment.get('ROS_DOMAIN_ID', '').strip()
+    if re.fullmatch(r'[+-]?\d+', text or '0') and int(text or '0') <= HIGHEST_DOMAIN:
+        return ''
+    return f'ROS_DOMAIN_ID is {text}, not a whole number from 0 to {HIGHEST_DOMAIN}'
+
+
+def of_ros(error: BaseException) -> str:
+    """Return what rclpy says of a failure, without the lines of its sources, and with a remedy where there is one."""
+    lines = _SOURCE.sub('', str(error)).splitlines()
+    text = _INIT.sub('', ' '.join(filter(None, (line.strip() for line in lines))))
+    if found := _RULE.search(text):
+        return (
+            f'-r {found["rule"]} is no rule: it takes -r OLD:=NEW, such as -r sonar:=/my/sonar, -r __node:=my_mapper '
+            'or -r __ns:=/robot1; names have letters, digits, _ and /, and no part begins with a digit'
+        )
+    if found := _PARAMETER.search(text):
+        return f'-p {found["rule"]} is no parameter: it takes -p NAME:=VALUE, such as -p resolution:=0.05'
+    if found := _FILE.search(text):
+        return f'--params-file {found["file"]}: {found["why"]}'
+    if 'PARAMETER_NOT_SET' in text:
+        return 'a parameter has no value, or an empty list (range_topics:=[]): leave it out, or give it one'
+    return text or repr(error)

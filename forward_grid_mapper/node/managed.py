@@ -1,0 +1,159 @@
+"""A node with a lifecycle, which Nav2's lifecycle manager can drive, or that starts by itself."""
+
+from __future__ import annotations
+
+import traceback
+from collections.abc import Callable
+from typing import Any
+
+from ..core.common.errors import MapperError
+from .complaints import of_ros
+
+try:
+    from rclpy.lifecycle import LifecycleNode as Base
+    from rclpy.lifecycle.node import TransitionCallbackReturn
+
+    MANAGED = True
+except ImportError:  # without lifecycle_msgs it is a node like any other, and starts by itself
+    from rclpy.node import Node as Base
+
+    MANAGED = False
+
+
+class ManagedNode(Base):
+    """Turns transitions into four methods, and destroys after the last what was created since the first.
+
+    A subclass has `configure`, `activate`, `deactivate` and `close`. What they raise refuses the transition, and is
+    logged; the node is then unconfigured.
+    """
+
+    def __init__(self, name: str, **options: Any) -> None:
+        self._created: list[tuple[Callable[[Any], Any], Any]] = []
+        self._refusal: Exception | None = None
+        self._starting = False
+        super().__init__(name, **options)
+        # what the node itself is made of stays
+        self._created.clear()
+
+    # for subclasses
+
+    def configure(self) -> None:
+        """Make everything but subscriptions."""
+
+    def activate(self) -> None:
+        """Begin to take messages."""
+
+    def deactivate(self) -> None:
+        """Take no messages any more."""
+
+    def close(self) -> None:
+        """End what `configure` began."""
+
+    # starting without a manager
+
+    def start(self) -> None:
+        """Configure and activate.
+
+        Raises
+        ------
+        Exception
+            What either raised.
+        """
+        self._starting = True
+        try:
+            if not MANAGED:
+                self.configure()
+                self.activate()
+                return
+            for turn in (self.trigger_configure, self.trigger_activate):
+                turn()
+                if self._refusal is not None:
+                    raise self._refusal
+        finally:
+            self._starting = False
+
+    def wait_for_manager(self) -> None:
+        """Say that the node waits to be configured.
+
+        Raises
+        ------
+        MapperError
+            If nobody could.
+        """
+        if not MANAGED:
+            raise MapperError('autostart is false, but without lifecycle_msgs nothing else can start the node')
+        self.get_logger().info('unconfigured: a lifecycle manager, or `ros2 lifecycle set`, has to configure the node')
+
+    # transitions
+
+    def on_configure(self, state: Any) -> Any:
+        """Configure the node."""
+        return self._turn(self.configure, undo=True)
+
+    def on_activate(self, state: Any) -> Any:
+        """Activate the node."""
+        return self._turn(self.activate)
+
+    def on_deactivate(self, state: Any) -> Any:
+        """Deactivate the node."""
+        return self._turn(self.deactivate)
+
+    def on_cleanup(self, state: Any) -> Any:
+        """Make the node unconfigured."""
+        return self._turn(self._undo)
+
+    def on_shutdown(self, state: Any) -> Any:
+        """End the node's work for good; its process goes on until it is ended."""
+        return self._turn(self._undo)
+
+    def on_error(self, state: Any) -> Any:
+        """Make the node unconfigured after something failed."""
+        return self._turn(self._undo)
+
+    def _turn(self, work: Callable[[], None], undo: bool = False) -> Any:
+        """Do the work of a transition; return whether it succeeded."""
+        try:
+            self._refusal = None
+            work()
+            return TransitionCallbackReturn.SUCCESS
+        except Exception as error:
+            if undo:
+                self._undo()
+            self._refusal = error
+            if not self._starting:
+                expected = isinstance(error, (MapperError, ValueError)) or type(error).__name__ == 'RCLError'
+                self.get_logger().error(of_ros(error) if expected else traceback.format_exc())
+            return TransitionCallbackReturn.FAILURE
+
+    def _undo(self) -> None:
+        """End the work, and destroy what was created for it."""
+        self.close()
+        while self._created:
+            destroy, entity = self._created.pop()
+            destroy(entity)
+
+    # what is created is noted
+
+    def create_publisher(self, *arguments: Any, **options: Any) -> Any:
+        """Create a publisher, as `Node` does."""
+        return self._noted(super().create_publisher(*arguments, **options), self.destroy_publisher)
+
+    def create_subscription(self, *arguments: Any, **options: Any) -> Any:
+        """Create a subscription, as `Node` does."""
+        return self._noted(super().create_subscription(*arguments, **options), self.destroy_subscription)
+
+    def create_service(self, *arguments: Any, **options: Any) -> Any:
+        """Create a service, as `Node` does."""
+        return self._noted(super().create_service(*arguments, **options), self.destroy_service)
+
+    def create_timer(self, *arguments: Any, **options: Any) -> Any:
+        """Create a timer, as `Node` does."""
+        return self._noted(super().create_timer(*arguments, **options), self.destroy_timer)
+
+    def create_guard_condition(self, *arguments: Any, **options: Any) -> Any:
+        """Create a guard condition, as `Node` does."""
+        return self._noted(super().create_guard_condition(*arguments, **options), self.destroy_guard_condition)
+
+    def _noted(self, entity: Any, destroy: Callable[[Any], Any]) -> Any:
+        self._created.append((destroy, entity))
+        return entity

@@ -1,0 +1,147 @@
+"""The robot's pose on the map for others: the transform from the map to odometry, and the path.
+
+As SLAM nodes do it: the transform goes out again and again, stamped a little later than the odometry that it is good
+for, so that whoever asks for the pose of now need not wait for the next one.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, TransformStamped
+from nav_msgs.msg import Path
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+
+from ..core.messages.message_types import NANOSECONDS, Pose2
+from ..core.trajectory.poses import Floats
+from ..core.trajectory.windows import Odometry
+
+PERIOD = 0.05
+"""Seconds between two transforms."""
+
+TOLERANCE = NANOSECONDS // 5
+"""Nanoseconds that a transform's stamp is later than odometry's."""
+
+MOST_POINTS = 2000
+"""Poses of the path at the most: more would keep the executor for long when the middleware takes them."""
+
+STEP = 0.1
+"""Metres between two of them, at least."""
+
+TRANSFORMS = QoSProfile(depth=100)
+LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+
+
+def transform_sender(node: Any) -> Callable[[TransformStamped], object] | None:
+    """Return what sends a transform on TF, by tf2_ros or else with tf2_msgs alone; None without either."""
+    try:
+        from tf2_ros import TransformBroadcaster
+    except ImportError:
+        pass
+    else:
+        sender: Callable[[TransformStamped], object] = TransformBroadcaster(node).sendTransform
+        return sender
+    try:
+        from tf2_msgs.msg import TFMessage
+    except ImportError:
+        return None
+    out = node.create_publisher(TFMessage, '/tf', TRANSFORMS)
+    return lambda transform: out.publish(TFMessage(transforms=[transform]))
+
+
+class PosePublishers:
+    """Publishes where the robot is on the map.
+
+    Without tf2_ros and tf2_msgs the pose goes to `~/pose` instead of TF; its covariance is zero, which is unknown.
+    """
+
+    def __init__(self, node: Any) -> None:
+        self._send = transform_sender(node)
+        self._pose = None if self._send else node.create_publisher(PoseWithCovarianceStamped, '~/pose', 10)
+        self._path = node.create_publisher(Path, '~/path', LATCHED)
+        self._sent: tuple[int, tuple[float, ...]] = (-1, ())
+
+    @property
+    def by_tf(self) -> bool:
+        """Whether the transform goes to TF."""
+        return self._send is not None
+
+    def send(self, frames: tuple[str, str, str], correction: Floats, newest: tuple[int, Pose2]) -> None:
+        """Send the transform, or the pose, if odometry or the correction is new.
+
+        Parameters
+        ----------
+        frames : (str, str, str)
+            Of the map, of odometry, and of the robot.
+        correction : float64, shape (3,)
+            The pose of odometry's frame in the map frame.
+        newest : (int, Pose2)
+            The last pose of odometry.
+        """
+        stamp, pose = newest
+        x, y, yaw = correction.tolist()
+        sent_stamp, sent = self._sent
+        if stamp <= sent_stamp:
+            if sent == (x, y, yaw):
+                return
+            # TF takes no second transform of the same stamp, and odometry may have ended
+            stamp = sent_stamp + 1
+        self._sent = stamp, (x, y, yaw)
+        map_frame, odom_frame, _ = (frame.lstrip('/') for frame in frames)
+        if self._send is not None:
+            transform = TransformStamped(child_frame_id=odom_frame)
+            transform.header.frame_id = map_frame
+            _set_stamp(transform.header.stamp, stamp + TOLERANCE)
+            transform.transform.translation.x, transform.transform.translation.y = x, y
+            _set_yaw(transform.transform.rotation, yaw)
+            self._send(transform)
+        elif self._pose is not None:
+            there = Pose2(x, y, yaw).compose(pose)
+            message = PoseWithCovarianceStamped()
+            message.header.frame_id = map_frame
+            _set_stamp(message.header.stamp, stamp)
+            message.pose.pose.position.x, message.pose.pose.position.y = there.x, there.y
+            _set_yaw(message.pose.pose.orientation, there.yaw)
+            self._pose.publish(message)
+
+    def forget(self) -> None:
+        """Send the next transform whatever its stamp, since the clock jumped or the drive begins anew."""
+        self._sent = (-1, ())
+
+    def publish_path(self, frame: str, trajectory: Odometry | None, stamp: Any) -> None:
+        """Publish a trajectory as the path, kept for late subscribers; without one, a path of no poses."""
+        self._path.publish(path_message(frame, trajectory, stamp))
+
+
+def path_message(frame: str, trajectory: Odometry | None, stamp: Any) -> Path:
+    """Return the path along a trajectory, of `MOST_POINTS` poses at the most."""
+    path = Path()
+    path.header.frame_id, path.header.stamp = frame.lstrip('/'), stamp
+    if trajectory is None or not len(trajectory.stamp):
+        return path
+    travel = trajectory.travel
+    count = 1 + min(MOST_POINTS - 2, int(travel[-1] / STEP))
+    # the first pose of each step, and the last one
+    chosen = np.unique([*np.searchsorted(travel, np.linspace(0.0, travel[-1], count)).tolist(), len(travel) - 1])
+    poses = []
+    for k in chosen.tolist():
+        pose = PoseStamped()
+        pose.header.frame_id = path.header.frame_id
+        _set_stamp(pose.header.stamp, int(trajectory.stamp[k]))
+        x, y, yaw = trajectory.pose[k].tolist()
+        pose.pose.position.x, pose.pose.position.y = x, y
+        _set_yaw(pose.pose.orientation, yaw)
+        poses.append(pose)
+    path.poses = poses
+    return path
+
+
+def _set_stamp(stamp: Any, nanoseconds: int) -> None:
+    stamp.sec, stamp.nanosec = divmod(nanoseconds, NANOSECONDS)
+
+
+def _set_yaw(rotation: Any, yaw: float) -> None:
+    rotation.z, rotation.w = math.sin(yaw / 2), math.cos(yaw / 2)

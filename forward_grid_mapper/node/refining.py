@@ -1,0 +1,144 @@
+"""A run of EM that finds the trajectory first: what `process_bag --refine-poses` does, in the node's worker."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core.common.errors import Cancelled
+from ..core.common.grid import Grid
+from ..core.common.parameters import Parameters
+from ..core.common.readings import Readings
+from ..core.mapping import Mapper, Watch
+from ..core.maps.log_odds_map import LogOddsMap
+from ..core.maps.map_set import MapSet
+from ..core.trajectory.correction import Correction
+from ..core.trajectory.refinement import Refinement, Refiner
+from ..core.trajectory.windows import Odometry
+from ..files.trajectory_text import calibration_words
+
+BATCH = 20_000
+"""Readings after which the live map looks whether it is still wanted."""
+
+
+class Drive(NamedTuple):
+    """What a trajectory is found from: the poses of odometry, and all readings that they placed."""
+
+    odometry: Odometry
+    readings: Readings
+
+
+class Found(NamedTuple):
+    """What became of a trajectory.
+
+    `refinement` is None where none was to be found, `correction` where odometry stays. `live` is the live map of the
+    drive's readings, None where the one that there is need not be replaced.
+    """
+
+    refinement: Refinement | None
+    correction: Correction | None
+    live: LogOddsMap | None
+
+
+class RefiningMapper:
+    """Runs from readings to maps as `Mapper` does, at the poses of the trajectory that the readings speak for.
+
+    Attributes
+    ----------
+    found : Found or None
+        Set before the maps are made.
+    """
+
+    def __init__(self, parameters: Parameters, drive: Callable[[], Drive], refine: bool, bent: bool) -> None:
+        """Prepare a run.
+
+        Parameters
+        ----------
+        parameters : Parameters
+        drive : callable
+            Called in the thread of the run, once the readings are there.
+        refine : bool
+            Whether to look for a trajectory; without, odometry stays.
+        bent : bool
+            Whether the live map so far is along another trajectory than odometry's.
+        """
+        self.found: Found | None = None
+        self._parameters, self._drive = parameters, drive
+        self._to_refine, self._bent = refine, bent
+        self._mapper, self._refiner = Mapper(parameters), Refiner(parameters)
+        self._cancelled = False
+
+    def cancel(self) -> None:
+        """Make `run` raise `Cancelled` soon; may be called from any thread."""
+        self._cancelled = True
+        self._refiner.cancel()
+        self._mapper.cancel()
+
+    def so_far(self) -> tuple[Grid, NDArray[np.int8]] | None:
+        """Return what `Mapper.so_far` does."""
+        return self._mapper.so_far()
+
+    def run(
+        self,
+        readings: Readings,
+        watch: Watch = lambda stage, progress: None,
+        start: tuple[Grid, NDArray[np.int8]] | None = None,
+    ) -> MapSet:
+        """Return the maps of `readings`, which odometry placed; the rest is as in `Mapper.run`.
+
+        `start` is used only where odometry stays.
+        """
+        drive, refinement, correction = self._drive(), None, None
+        seconds: dict[str, float] = {}
+        if self._to_refine:
+            begun = time.perf_counter()
+            refinement = self._refine(readings, drive.odometry, watch)
+            seconds['trajectory'] = time.perf_counter() - begun
+            readings = refinement.readings
+            if refinement.accepted:
+                correction, start = Correction(drive.odometry, refinement.trajectory), None
+        live = None
+        if correction is not None or self._bent:
+            watch('live map along the trajectory', None)
+            live = self._live_map(drive.readings, correction)
+        maps = self._mapper.run(readings, watch, start)
+        maps.statistics['seconds'] = {**seconds, **maps.statistics['seconds']}
+        if refinement is not None:
+            # the readings are kept once
+            refinement = replace(refinement, readings=maps.readings)
+        self.found = Found(refinement, correction, live)
+        return maps
+
+    def _refine(self, readings: Readings, odometry: Odometry, watch: Watch) -> Refinement:
+        return self._refiner.run(
+            readings, odometry, lambda stage, part: watch(f'trajectory ({stage}, {part:.0%})', None)
+        )
+
+    def _live_map(self, readings: Readings, correction: Correction | None) -> LogOddsMap:
+        live = LogOddsMap(self._parameters)
+        for first in range(0, len(readings), BATCH):
+            if self._cancelled:
+                raise Cancelled('the work was cancelled')
+            part = readings.select(slice(first, first + BATCH))
+            live.add(part if correction is None else correction.apply(part))
+        return live
+
+
+def outcome_words(found: Found) -> str:
+    """Return what became of the trajectory, in words; empty if none was to be found."""
+    refinement, correction = found.refinement, found.correction
+    if refinement is None:
+        return ''
+    if correction is None:
+        return f'trajectory as odometry gives it: {refinement.reason}'
+    wheels = calibration_words(refinement.calibration)
+    return (
+        f'trajectory refined: odometry was off by {refinement.moved:.2f} m (root mean square), '
+        f'{correction.moved:.2f} m at the end of the drive, {refinement.loops} places recognised'
+        + (f'; {wheels}' if wheels else '')
+    )

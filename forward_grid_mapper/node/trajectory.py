@@ -1,0 +1,169 @@
+"""The trajectory in force: what readings are moved by on their way to the maps, and what others are told of it.
+
+The associator keeps readings and poses as odometry gives them, and so does the journal. What `refine_poses` finds is a
+correction, applied wherever they go to a map; without one they go there as they are, to the bit.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from diagnostic_msgs.msg import DiagnosticStatus
+
+from ..core.common.parameters import Parameters
+from ..core.common.readings import Readings
+from ..core.mapping import Mapper
+from ..core.maps.log_odds_map import LogOddsMap
+from ..core.messages.pose_association import PoseAssociator
+from ..core.trajectory.correction import Correction
+from ..files.trajectory_text import calibration_words
+from .background import Worker
+from .diagnostics import status
+from .pose_publishers import PERIOD, PosePublishers
+from .refining import Drive, Found, RefiningMapper, outcome_words
+
+MAP = 'map'
+"""Name of the map frame where `map_frame` gives none (REP 105)."""
+
+
+class Trajectory:
+    """Owned by the executor.
+
+    Attributes
+    ----------
+    on : bool
+        Whether maps are in the map frame, and the transform from there to odometry's is published.
+    correction : Correction or None
+        What readings are moved by.
+    found : Found or None
+        What became of the trajectory of the latest maps; None where none was looked for.
+    publishing : Worker
+        Makes long messages.
+    changed : callable
+        Called when maps are to be made anew: with the live map, None if only the frame changed, and with the number of
+        readings in it.
+    """
+
+    def __init__(self, node: Any, associator: PoseAssociator, clock: Any) -> None:
+        """Prepare for `begin`; `clock` is that of timers."""
+        self._node, self._associator, self._clock = node, associator, clock
+        self.publishing: Worker | None = None
+        self._out: PosePublishers | None = None
+        self._jumps = 0
+        self.on = self._parameters.node.refine_poses
+        self.correction: Correction | None = None
+        self.found: Found | None = None
+        self.changed: Callable[[LogOddsMap | None, int], object] = lambda live, count: None
+
+    @property
+    def obstacle(self) -> str:
+        """Why there can be no other trajectory than odometry's, in words; empty if there can."""
+        if self._associator.map_frame.lstrip('/') != self._map_frame:
+            return ''
+        return (
+            f'odometry comes in frame {self._map_frame}, which is that of a localised pose that does not drift '
+            f'(REP 105): where it does, set map_frame to another name, in which the maps are to be'
+        )
+
+    @property
+    def frame(self) -> str:
+        """The frame of the maps; empty while odometry has named none and no parameter does."""
+        if self.on and not self.obstacle:
+            return self._map_frame
+        return self._associator.map_frame or str(self._parameters.node.map_frame)
+
+    @property
+    def place(self) -> Callable[[Readings], Readings] | None:
+        """What readings are moved by on their way to a map; None if they stay."""
+        return None if self.correction is None else self.correction.apply
+
+    @property
+    def _parameters(self) -> Parameters:
+        parameters: Parameters = self._node.parameters
+        return parameters
+
+    @property
+    def _map_frame(self) -> str:
+        return (self._parameters.node.map_frame or MAP).lstrip('/')
+
+    def begin(self) -> None:
+        """Begin a drive, with the trajectory of odometry."""
+        self.correction = self.found = None
+        self.correction = self.found = None
+        self._switch(self._parameters.node.refine_poses)
+        if self._out is not None:
+            self._out.forget()
+        self._show_path()
+
+    def mapper(self, parameters: Parameters, drive: Callable[[], Drive]) -> RefiningMapper | Mapper:
+        """Return what makes the maps of a run; `drive` returns what it was begun with."""
+        refine, bent = parameters.node.refine_poses and not self.obstacle, self.correction is not None
+        return RefiningMapper(parameters, drive, refine, bent) if refine or bent else Mapper(parameters)
+
+    def adopt(self, found: Found | None, count: int) -> None:
+        """Take what was found for the maps of the first `count` readings; None if they are as odometry has it."""
+        before, live = self.frame, found.live if found else None
+        self.correction = found.correction if found else None
+        # the live map belongs to the one who shows it
+        self.found = found._replace(live=None) if found and found.refinement else None
+        self._switch(self.found is not None)
+        self._show_path()
+        if live is not None or self.frame != before:
+            self.changed(live, count)
+
+    def outcome(self) -> str:
+        """Return what became of the trajectory of the latest maps, in words; empty if it is odometry's anyway."""
+        if self._parameters.node.refine_poses and self.obstacle:
+            return f'trajectory as odometry gives it: {self.obstacle}'
+        return outcome_words(self.found) if self.found else ''
+
+    def statuses(self, name: str) -> list[DiagnosticStatus]:
+        """Return the status of the trajectory, if it is to be refined."""
+        if not (self.on or self._parameters.node.refine_poses):
+            return []
+        values: dict[str, Any] = {
+            'map frame': self.frame,
+            'transform': 'on TF' if self._out is None or self._out.by_tf else 'none: tf2_ros is not installed',
+            'poses of odometry kept': len(self._associator.record),
+        }
+        refinement = self.found.refinement if self.found else None
+        if refinement is not None and self.correction is not None:
+            x, y, yaw = self.correction.last.tolist()
+            values |= {
+                'odometry off (m, root mean square)': f'{refinement.moved:.2f}',
+                'odometry off (deg, standard deviation)': f'{math.degrees(refinement.turned):.1f}',
+                'moved at the end of the drive (m)': f'{self.correction.moved:.2f}',
+                'places recognised': refinement.loops,
+                'correction (x m, y m, yaw deg)': f'{x:.2f}, {y:.2f}, {math.degrees(yaw):.1f}',
+                'wheels': calibration_words(refinement.calibration) or 'nothing worth a word',
+            }
+        level = DiagnosticStatus.WARN if self.obstacle else DiagnosticStatus.OK
+        message = self.outcome() or 'as odometry gives it until run_em is called'
+        return [status(f'{name}: trajectory', level, message, name, values)]
+
+    def _switch(self, on: bool) -> None:
+        self.on = on
+        if on and self._out is None:
+            self._out = PosePublishers(self._node)
+            self._node.create_timer(PERIOD, self._tick, clock=self._clock)
+
+    def _tick(self) -> None:
+        """Send the transform; called by a timer."""
+        associator, newest = self._associator, self._associator.record.newest
+        if self._out is None or not self.on or self.obstacle or newest is None:
+            return
+        if associator.time_jumps != self._jumps:
+            self._jumps = associator.time_jumps
+            self._out.forget()
+        correction = np.zeros(3) if self.correction is None else self.correction.last
+        self._out.send((self.frame, associator.map_frame, associator.base_frame), correction, newest)
+
+    def _show_path(self) -> None:
+        out, frame, found = self._out, self.frame, self.found
+        trajectory = found.refinement.trajectory if found and found.refinement else None
+        stamp = self._node.get_clock().now().to_msg()
+        if out is not None and self.publishing is not None:
+            self.publishing.put(lambda: out.publish_path(frame, trajectory, stamp))

@@ -1,0 +1,213 @@
+"""What speaks against mapping several drives together: other frames, other sensors, or the same drive twice."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from typing import NamedTuple, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core.common.errors import InputError
+from ..core.common.readings import Readings
+from ..core.messages.message_types import Pose2
+from ..core.messages.thinning import mixed, name_hashes
+
+SHARED = 0.5
+"""Part of the echoes of a drive that another one has as well, of the same sensor, stamp and range, from where on it is
+the same recording. Of two drives at other times none is; simulated ones, which all begin at one time, share few."""
+
+METRES, RADIANS = 0.01, math.radians(1.0)
+"""By how much the poses of a sensor, or its limits, must differ."""
+
+NAMED = 6
+"""Drives or sensors that a warning names."""
+
+T = TypeVar('T')
+
+
+class Described(NamedTuple):
+    """What is compared of a drive: its name for the user, frames, sensor poses by frame and readings."""
+
+    name: str
+    map_frame: str
+    base_frame: str
+    extrinsics: Mapping[str, Pose2]
+    readings: Readings
+
+
+class Shared(NamedTuple):
+    """Two drives, by number, that share echoes: how many, and how many each has."""
+
+    one: int
+    other: int
+    shared: int
+    echoes: tuple[int, int]
+
+    @property
+    def same(self) -> bool:
+        """Whether all echoes of both are shared."""
+        return self.shared == self.echoes[0] == self.echoes[1]
+
+
+def check_frames(drives: Sequence[Described]) -> None:
+    """Check that all drives are in one map frame.
+
+    Raises
+    ------
+    InputError
+        If not; names the drives of each frame.
+    """
+    frames: dict[str, list[str]] = {}
+    for drive in drives:
+        frames.setdefault(drive.map_frame.lstrip('/'), []).append(drive.name)
+    if len(frames) == 1:
+        return
+    of = '; '.join(f'{frame or "no name"}: {listed(names)}' for frame, names in frames.items())
+    few = min(frames.values(), key=len)
+    raise InputError(
+        f'these drives are not in one map frame ({of}), so they make no one map. Localise all of them in one map and '
+        f'record that odometry (--odom-topic chooses it), or leave out {listed(few)}'
+    )
+
+
+def shared_echoes(drives: Sequence[Readings]) -> list[Shared]:
+    """Return the pairs of drives of which one has at least the part `SHARED` of its echoes from the other."""
+    echoes = [np.unique(_echo_hashes(readings)) for readings in drives]
+    count = [len(hashes) for hashes in echoes]
+    every = np.concatenate(echoes) if echoes else np.zeros(0, np.uint64)
+    owner = np.repeat(np.arange(len(drives)), count)
+    order = np.argsort(every, kind='stable')
+    every, owner = every[order], owner[order]
+    pairs: Counter[tuple[int, int]] = Counter()
+    again = np.flatnonzero(every[1:] == every[:-1]) + 1
+    begin = again[~np.isin(again - 1, again)] - 1
+    for first in begin.tolist():
+        last = first + 1
+        while last < len(every) and every[last] == every[first]:
+            for earlier in range(first, last):
+                pairs[int(owner[earlier]), int(owner[last])] += 1
+            last += 1
+    return [
+        Shared(one, other, n, (count[one], count[other]))
+        for (one, other), n in sorted(pairs.items())
+        if n >= max(SHARED * min(count[one], count[other]), 1)
+    ]
+
+
+def _echo_hashes(readings: Readings) -> NDArray[np.uint64]:
+    """Return a hash of sensor, stamp and range of every echo."""
+    heard = readings.select(readings.echo)
+    return mixed(name_hashes(heard)[heard.sensor] ^ heard.stamp.view(np.uint64), heard.z)
+
+
+def contradictions(drives: Sequence[Described]) -> list[str]:
+    """Return a warning for each thing in which drives of one robot (one base frame) differ."""
+    told: list[str] = []
+    robots: dict[str, list[Described]] = {}
+    for drive in drives:
+        robots.setdefault(drive.base_frame.lstrip('/'), []).append(drive)
+    for group in robots.values():
+        told += _poses(group)
+        told += _limits(group)
+        told += _missing(group)
+    return told
+
+
+def _poses(drives: Sequence[Described]) -> Iterator[str]:
+    def key(pose: Pose2) -> Hashable:
+        turn = math.remainder(pose.yaw, 2 * math.pi)
+        return round(pose.x / METRES), round(pose.y / METRES), round(turn / RADIANS)
+
+    poses = [{frame.lstrip('/'): pose for frame, pose in drive.extrinsics.items()} for drive in drives]
+    for names, frames, usual, value in _differing(drives, poses, key, _same_pose):
+        yield (
+            f'{_is_where(frames[0], value)} in {listed(names)}, and {_at(usual)} in the other drives of this robot'
+            f'{_and_more(frames)}: if it is a mistake, give --sensor {frames[0]}=x,y,yaw; if the sensor was moved '
+            f'between the drives, all is well; if these are different robots, give their base frames different names'
+        )
+
+
+def _limits(drives: Sequence[Described]) -> Iterator[str]:
+    def limits(readings: Readings) -> dict[str, tuple[float, float]]:
+        found = {}
+        for number, name in enumerate(readings.sensor_names):
+            mine = readings.sensor == number
+            if mine.any():
+                found[name.lstrip('/')] = (
+                    float(np.median(readings.z_max[mine])),
+                    2 * float(np.median(readings.half_angle[mine])),
+                )
+        return found
+
+    def key(value: tuple[float, float]) -> Hashable:
+        return round(value[0] / METRES), round(value[1] / RADIANS)
+
+    def same(one: tuple[float, float], other: tuple[float, float]) -> bool:
+        return abs(one[0] - other[0]) <= METRES and abs(one[1] - other[1]) <= RADIANS
+
+    for names, frames, usual, value in _differing(drives, [limits(drive.readings) for drive in drives], key, same):
+        yield (
+            f'{frames[0]} reaches {value[0]:.2f} m and sees {math.degrees(value[1]):.0f} degrees in {listed(names)}, '
+            f'and {usual[0]:.2f} m and {math.degrees(usual[1]):.0f} degrees in the other drives of this robot'
+            f'{_and_more(frames)}: is it another sensor? If a driver states it wrongly, set the parameters max_range '
+            f'or field_of_view'
+        )
+
+
+def _missing(drives: Sequence[Described]) -> Iterator[str]:
+    have = [{drive.readings.sensor_names[k].lstrip('/') for k in np.unique(drive.readings.sensor)} for drive in drives]
+    usual = Counter(frame for frames in have for frame in frames)
+    expected = {frame for frame, count in usual.items() if 2 * count > len(drives)}
+    for drive, frames in zip(drives, have, strict=True):
+        if lost := sorted(expected - frames):
+            yield (
+                f'{drive.name} has no reading of {listed(lost)}, as most drives of this robot have: was it switched '
+                f'off, or its topic not recorded or not chosen (--range-topics)?'
+            )
+
+
+def _differing(
+    drives: Sequence[Described],
+    values: Sequence[Mapping[str, T]],
+    key: Callable[[T], Hashable],
+    same: Callable[[T, T], bool],
+) -> Iterator[tuple[list[str], list[str], T, T]]:
+    """Yield drives whose values are not the usual ones, the sensors of which that is so, a usual value and another."""
+    found: dict[tuple[str, ...], list[tuple[str, T, T]]] = {}
+    for frame in sorted({frame for value in values for frame in value}):
+        mine = [(drive.name, value[frame]) for drive, value in zip(drives, values, strict=True) if frame in value]
+        counts = Counter(key(value) for _, value in mine)
+        # of equally many the first
+        most = max(counts.values())
+        usual = next(value for _, value in mine if counts[key(value)] == most)
+        others = [(name, value) for name, value in mine if not same(value, usual)]
+        if others:
+            found.setdefault(tuple(name for name, _ in others), []).append((frame, usual, others[0][1]))
+    for names, rows in found.items():
+        yield list(names), [frame for frame, _, _ in rows], rows[0][1], rows[0][2]
+
+
+def _same_pose(one: Pose2, other: Pose2) -> bool:
+    away = math.hypot(one.x - other.x, one.y - other.y)
+    return away <= METRES and abs(math.remainder(one.yaw - other.yaw, 2 * math.pi)) <= RADIANS
+
+
+def _at(pose: Pose2) -> str:
+    return f'at x = {pose.x:.2f} m, y = {pose.y:.2f} m, yaw = {math.degrees(pose.yaw):.0f} degrees'
+
+
+def _is_where(frame: str, pose: Pose2) -> str:
+    return f'{frame} sits on the robot {_at(pose)}'
+
+
+def _and_more(frames: Sequence[str]) -> str:
+    return f' (and so on for {len(frames) - 1} more sensors)' if len(frames) > 1 else ''
+
+
+def listed(names: Sequence[str]) -> str:
+    """Return names in a row, the first few of them."""
+    more = f' and {len(names) - NAMED} more' if len(names) > NAMED else ''
+    return ', '.join(names[:NAMED]) + more

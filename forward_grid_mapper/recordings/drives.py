@@ -1,0 +1,253 @@
+"""Several drives in one map frame become the readings of one map, whatever the order in which they are given."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core.common.errors import BagError, InputError, MapperError
+from ..core.common.parameters import Parameters
+from ..core.common.readings import Readings, in_canonical_order, of_drives
+from ..core.maps.log_odds_map import LogOddsMap
+from ..core.maps.map_set import MapSet
+from ..core.messages.message_types import Pose2
+from ..core.messages.reading_buffer import bounded
+from ..files.output_folder import readable
+from ..files.quality_warning import thinned
+from .contradictions import Described, check_frames, contradictions, listed, shared_echoes
+from .drive import WHOLE, Drive, Part, thinning_note
+from .finding import SUFFIXES, find_recordings
+from .read_drive import read_drive
+
+MOST_ERRORS = 5
+"""Recordings that cannot be read whose errors are shown."""
+
+Watch = Callable[[str], None]
+"""Receives what goes on."""
+
+
+@dataclass(frozen=True)
+class Drives:
+    """Drives that make one map, in canonical order: by their first stamps, then by what they hold.
+
+    Attributes
+    ----------
+    drives : tuple of Drive
+        At least one.
+    source : dict
+        What was read and rejected, for the report; of a single drive its own, of several with a list of them, `drives`.
+    parameters : Parameters
+    """
+
+    drives: tuple[Drive, ...]
+    source: dict[str, Any]
+    parameters: Parameters
+
+    @property
+    def readings(self) -> Readings:
+        """The readings to map from: all that were accepted, or `max_readings` of them; not ordered."""
+        if len(self.drives) == 1:
+            return self.drives[0].associator.readings
+        return bounded(
+            of_drives([drive.associator.buffer.snapshot() for drive in self.drives]),
+            self.parameters.association.max_readings,
+        )
+
+    @property
+    def path_xy(self) -> NDArray[np.float64]:
+        """Where the robots drove, shape (P, 2), metres; a row of NaN parts two drives."""
+        parts = [self.drives[0].path_xy]
+        for drive in self.drives[1:]:
+            parts += [np.full((1, 2), np.nan), drive.path_xy]
+        return np.concatenate(parts)
+
+    @property
+    def map_frame(self) -> str:
+        """The frame of all drives."""
+        return self.drives[0].associator.map_frame
+
+    def with_live(self, maps: MapSet) -> MapSet:
+        """Return the maps with the live map of all readings, where `max_readings` lets EM have only some."""
+        if len(self.drives) == 1:
+            return self.drives[0].live.on(maps)
+        if len(maps.readings) == sum(len(drive.associator.buffer) for drive in self.drives):
+            return maps
+        live = LogOddsMap(self.parameters)
+        for drive in self.drives:
+            live.add_map(drive.live.complete())
+        return maps.with_live(live.grid, live.probability())
+
+
+def read_drives(
+    words: Sequence[Path | str],
+    parameters: Parameters,
+    extrinsics: Mapping[str, Pose2],
+    range_topics: Sequence[str] | None = None,
+    odom_topic: str | None = None,
+    part: Part = WHOLE,
+    progress: Callable[[int, int], None] | None = None,
+    say: Watch = lambda text: None,
+) -> Drives:
+    """Read all drives that `words` mean (`find_recordings`).
+
+    Parameters
+    ----------
+    words : sequence of Path or str
+    parameters, extrinsics, range_topics, odom_topic
+        For every drive, as `read_drive` takes them.
+    part : Part
+        Of every drive.
+    progress : callable, optional
+        Called with (done, total) messages of a drive.
+    say : callable, optional
+        Called with the name of each drive as it is read, where there are several.
+
+    Raises
+    ------
+    BagError, InputError
+        If one of them cannot be read or mapped, or they are not in one map frame; names it.
+    """
+    paths, repeated = _without_repetition(find_recordings(words))
+    if len(paths) == 1:
+        drive = read_drive(paths[0], parameters, extrinsics, range_topics, odom_topic, progress, part)
+        drive.source['warnings'] += repeated
+        return Drives((drive,), drive.source, parameters)
+    drives, errors = [], []
+    for number, path in enumerate(paths, 1):
+        say(f'reading {number} of {len(paths)}: {readable(path)}')
+        try:
+            drives.append(read_drive(path, parameters, extrinsics, range_topics, odom_topic, None, part))
+        except (BagError, InputError) as error:
+            errors.append((path, error))
+    if errors:
+        raise _unreadable(errors, len(paths))
+    return _together(drives, repeated, parameters)
+
+
+def _unreadable(errors: Sequence[tuple[Path, MapperError]], count: int) -> MapperError:
+    lines = [
+        f'\n  {readable(path)}: {error}' if readable(path) not in str(error) else f'\n  {error}'
+        for path, error in errors[:MOST_ERRORS]
+    ]
+    more = f'\n  and {len(errors) - MOST_ERRORS} more' if len(errors) > MOST_ERRORS else ''
+    kind = BagError if all(isinstance(error, BagError) for _, error in errors) else InputError
+    return kind(
+        f'{len(errors)} of {count} drives cannot be mapped; leave them out, or do as is said:{"".join(lines)}{more}'
+    )
+
+
+def _without_repetition(paths: Sequence[Path]) -> tuple[list[Path], list[str]]:
+    """Return the recordings, each once, and a warning for those that are given more often, by whatever name."""
+    found: dict[object, Path] = {}
+    told = []
+    for path in paths:
+        keys = _files(path)
+        earlier = next((found[key] for key in keys if key in found), None)
+        if earlier is not None:
+            again = '' if earlier == path else f' again as {readable(path)}'
+            told.append(f'{readable(earlier)} is given{again or " more than once"}; it is read once')
+            continue
+        found.update(dict.fromkeys(keys, path))
+    return list(dict.fromkeys(found.values())), list(dict.fromkeys(told))
+
+
+def _files(path: Path) -> list[object]:
+    """Return what tells a recording from others: its files, or where there are none its name."""
+    folder = path.parent if path.name == 'metadata.yaml' else path
+    try:
+        if folder.is_dir():
+            files = [entry for entry in folder.iterdir() if entry.suffix in (*SUFFIXES, '.journal')]
+        else:
+            files = [folder]
+        states = [file.stat() for file in files]
+        return [(state.st_dev, state.st_ino) for state in states] or [path.resolve()]
+    except OSError:
+        return [path]
+
+
+def _digest(readings: Readings) -> bytes:
+    """Return a digest of readings that does not depend on their order."""
+    r = in_canonical_order(readings)
+    digest = hashlib.blake2b(repr(sorted(r.sensor_names)).encode('utf-8', 'surrogatepass'), digest_size=16)
+    for column in (r.stamp, r.z, r.x, r.y, r.yaw, r.z_max, r.half_angle, r.sigma):
+        digest.update(np.ascontiguousarray(column).tobytes())
+    return digest.digest()
+
+
+def _together(drives: Sequence[Drive], repeated: list[str], parameters: Parameters) -> Drives:
+    """Put drives into canonical order, leave out copies, and say what they contradict each other in."""
+    held = [drive.associator.buffer.snapshot() for drive in drives]
+    keys = [(int(readings.stamp.min()), _digest(readings)) for readings in held]
+    order = sorted(range(len(drives)), key=lambda k: (keys[k], drives[k].source['bag']))
+    described = [_described(drives[k], held[k]) for k in order]
+    check_frames(described)
+    left_out: set[int] = set()
+    warnings = list(repeated)
+    for pair in shared_echoes([drive.readings for drive in described]):
+        one, other = described[pair.one].name, described[pair.other].name
+        if pair.same:
+            left_out.add(pair.other)
+            warnings.append(f'{other} is the same drive as {one} (same sensors, stamps and ranges); it is left out')
+        elif not {pair.one, pair.other} & left_out:
+            part, whole = (one, other) if pair.echoes[0] <= pair.echoes[1] else (other, one)
+            warnings.append(
+                f'{pair.shared} of {min(pair.echoes)} echoes of {part} are in {whole} as well: it is a part of it, and '
+                f'what counts twice is wrong evidence; leave out {part}'
+            )
+    kept = [k for k in range(len(order)) if k not in left_out]
+    warnings += contradictions([described[k] for k in kept])
+    chosen = tuple(drives[order[k]] for k in kept)
+    if len(chosen) == 1:
+        chosen[0].source['warnings'] += warnings
+        return Drives(chosen, chosen[0].source, parameters)
+    return Drives(chosen, _source(chosen, warnings, parameters), parameters)
+
+
+def _described(drive: Drive, readings: Readings) -> Described:
+    source = drive.source
+    return Described(source['bag'], source['map_frame'], source['base_frame'], source.get('extrinsics') or {}, readings)
+
+
+def _source(drives: Sequence[Drive], warnings: list[str], parameters: Parameters) -> dict[str, Any]:
+    """Return what was read of all drives together, and of each."""
+    sources = [drive.source for drive in drives]
+    for drive in drives:
+        # all drives together are thinned anew
+        own = [text for text in drive.source['warnings'] if text not in thinning_note(drive.associator)]
+        warnings = warnings + [f'{drive.source["bag"]}: {text}' for text in own]
+    accepted = sum(source['counts']['accepted'] for source in sources)
+    used = min(accepted, parameters.association.max_readings or accepted)
+    stamps = [source['stamps'] for source in sources]
+    topics = sorted({topic for source in sources for topic in source.get('range_topics') or ()})
+    odometry = sorted({source['odom_topic'] for source in sources if source.get('odom_topic')})
+    return {
+        'bag': f'{len(drives)} drives',
+        'drives': [{key: value for key, value in source.items() if key != 'warnings'} for source in sources],
+        'range_topics': topics,
+        'odom_topic': listed(odometry),
+        'odom_frame': sources[0]['map_frame'],
+        'map_frame': sources[0]['map_frame'],
+        'mounts_from': ', '.join(sorted({source['mounts_from'] for source in sources})),
+        'stamps': [min(first for first, _ in stamps), max(last for _, last in stamps)],
+        'duration_s': sum(source['duration_s'] for source in sources),
+        'path_m': sum(source['path_m'] for source in sources),
+        'counts': _summed([source['counts'] for source in sources]),
+        'rejected_by_frame': _summed([source.get('rejected_by_frame') or {} for source in sources]),
+        'warnings': [*warnings, *filter(None, [thinned(used, accepted)])],
+    }
+
+
+def _summed(tables: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Return tables of counts, at any depth, added up."""
+    total: dict[str, Any] = {}
+    for name in dict.fromkeys(name for table in tables for name in table):
+        values = [table[name] for table in tables if name in table]
+        nested = isinstance(values[0], Mapping)
+        total[name] = _summed(values) if nested else sum(values)
+    return total

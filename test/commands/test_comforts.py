@@ -1,0 +1,131 @@
+"""What makes command lines pleasant: JSON, viewers, examples in every help, and tab completion."""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import json
+import os
+import re
+import shlex
+import stat
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from drive_samples import code_of, report_in, tape, write_tape
+
+from forward_grid_mapper.__main__ import COMMANDS
+from forward_grid_mapper.commands import completion, desktop, process_bag
+from forward_grid_mapper.files import drawing
+from forward_grid_mapper.node.main import USAGE
+
+PARSED = [name for name in COMMANDS if name != 'mapper']
+
+
+@pytest.fixture(autouse=True)
+def no_picture(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Drawing takes most of the time of a run, and no part in these tests."""
+    monkeypatch.setattr(drawing, 'draw', lambda path, picture: None)
+
+
+@pytest.fixture(scope='module')
+def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A sound bag of the drive."""
+    return write_tape(tmp_path_factory.mktemp('plain') / 'bag', tape())
+
+
+def parser_of(command: str) -> argparse.ArgumentParser:
+    made: argparse.ArgumentParser = importlib.import_module(f'forward_grid_mapper.{COMMANDS[command][0]}').parser()
+    return made
+
+
+@pytest.mark.parametrize('command', PARSED)
+def test_every_help_has_an_example_that_is_understood(
+    command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / 'MY_BAG').mkdir()
+    example = re.search(rf'^example: {command}\b([^.]*(?:\.\w[^.]*)*)', parser_of(command).epilog or '')
+    assert example, 'the help has no example'
+    parser_of(command).parse_args(shlex.split(example[1]))
+
+
+def test_the_node_has_an_example() -> None:
+    assert 'example: mapper --ros-args' in USAGE
+
+
+def test_json_is_the_report_and_nothing_else(tmp_path: Path, bag: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert code_of(process_bag.main, bag, '-o', tmp_path / 'maps', '--json') == 0
+    said = json.loads(capsys.readouterr().out)
+    assert said.pop('folder') == str(tmp_path / 'maps')
+    assert said == report_in(tmp_path / 'maps')
+
+
+def test_json_prints_nothing_if_it_fails(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert code_of(process_bag.main, tmp_path / 'absent', '-o', tmp_path / 'maps', '--json') == 1
+    out, err = capsys.readouterr()
+    assert out == '' and err.startswith('process_bag: error: ')
+
+
+def viewer(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A desktop whose viewer notes what it is given; return the file of its notes."""
+    notes, program = folder / 'notes', folder / 'xdg-open'
+    os.mkfifo(notes)
+    program.write_text(f'#!/bin/sh\necho "$1" > {shlex.quote(str(notes))}\n')
+    program.chmod(program.stat().st_mode | stat.S_IXUSR)
+    monkeypatch.setenv('PATH', f'{folder}{os.pathsep}{os.environ["PATH"]}')
+    monkeypatch.setenv('DISPLAY', ':7')
+    monkeypatch.setattr(sys, 'platform', 'linux')
+    return notes
+
+
+def test_show_opens_the_report(
+    tmp_path: Path, bag: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    notes = viewer(tmp_path, monkeypatch)
+    assert code_of(process_bag.main, bag, '-q', '-o', tmp_path / 'maps', '--show') == 0
+    # the pipe waits for the viewer to write
+    assert notes.read_text() == f'{tmp_path / "maps" / "report.html"}\n'
+    assert 'no desktop' not in capsys.readouterr().err
+
+
+def test_without_a_desktop_show_says_what_to_open(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name in ('DISPLAY', 'WAYLAND_DISPLAY'):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr(sys, 'platform', 'linux')
+    page = tmp_path / 'a page.html'
+    desktop.show(page)
+    assert page.as_uri() in capsys.readouterr().err
+
+
+def test_commands_and_their_options_are_completed() -> None:
+    made = completion.parser_of_all(COMMANDS, 'forward_grid_mapper', ['forward_grid_mapper', 'learn', '--ro'])
+    (below,) = [action for action in made._actions if isinstance(action, argparse._SubParsersAction)]
+    assert set(below.choices) == set(COMMANDS)
+    assert '--rounds' in below.choices['learn'].format_help()
+    assert '--seeds' not in below.choices['experiment'].format_help(), 'only the command in question is imported'
+
+
+@pytest.mark.parametrize(
+    ('line', 'expected'),
+    [('forward_grid_mapper pro', ['process_bag']), ('forward_grid_mapper learn --roun', ['--rounds'])],
+)
+def test_the_shell_gets_completions(tmp_path: Path, line: str, expected: list[str]) -> None:
+    pytest.importorskip('argcomplete')
+    answer = tmp_path / 'answer'
+    environment = {
+        **os.environ,
+        '_ARGCOMPLETE': '1',
+        '_ARGCOMPLETE_STDOUT_FILENAME': str(answer),
+        'COMP_LINE': line,
+        'COMP_POINT': str(len(line)),
+        'IFS': '\013',
+    }
+    program = 'import sys; from forward_grid_mapper.__main__ import main; sys.exit(main())'
+    done = subprocess.run([sys.executable, '-c', program], env=environment, capture_output=True, check=False)
+    assert done.stdout == b''
+    assert [word.strip() for word in answer.read_text().split('\013')] == expected

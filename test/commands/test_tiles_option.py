@@ -1,0 +1,38 @@
+"""`process_bag --tiles`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from drive_samples import FILES, arrays_in, mapped, refusal, tape, write_tape
+
+from forward_grid_mapper.files import drawing
+
+
+@pytest.fixture(autouse=True)
+def quick_picture(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Drawing takes most of the time of a run."""
+    monkeypatch.setattr(drawing, 'draw', lambda path, picture: path.write_bytes(b''))
+
+
+def test_maps_in_tiles_are_written_as_others_are(tmp_path: Path) -> None:
+    bag = write_tape(tmp_path / 'bag', tape())
+    whole, tiled = mapped(bag, tmp_path / 'whole'), mapped(bag, tmp_path / 'tiled', '--tiles', 3)
+    assert {path.name for path in (tmp_path / 'tiled').iterdir()} == FILES
+    assert tiled['map']['width'] == whole['map']['width'] and tiled['statistics']['tiles'] > 4
+    np.testing.assert_array_equal(*(arrays_in(tmp_path / name)['live_map'] for name in ('whole', 'tiled')))
+    learned = mapped(bag, tmp_path / 'learned', '--tiles', 3, '--learn', 1)
+    assert learned['changed_parameters'].keys() == {'p_hit', 'p_rand', 'p_lost', 'sigma'}
+    text = (tmp_path / 'tiled' / 'report.txt').read_text('utf-8')
+    assert f'\nTiles           {tiled["statistics"]["tiles"]}, searched' in text
+    assert '\nTiles' not in (tmp_path / 'whole' / 'report.txt').read_text('utf-8')
+
+
+@pytest.mark.parametrize('size', ['0', '-5', 'nan', 'inf'])
+def test_tiles_that_cannot_be(tmp_path: Path, size: str, capsys: pytest.CaptureFixture[str]) -> None:
+    bag = write_tape(tmp_path / 'bag', tape())
+    assert f'--tiles {size}: give the edge' in refusal(
+        capsys, tmp_path, bag, '-o', tmp_path / 'maps', f'--tiles={size}'
+    )

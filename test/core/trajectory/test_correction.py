@@ -1,0 +1,82 @@
+"""What a trajectory makes of poses and readings, those after its end included; odometry that readings tell."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from forward_grid_mapper.core.common.readings import Readings
+from forward_grid_mapper.core.trajectory.correction import Correction
+from forward_grid_mapper.core.trajectory.poses import compose, wrapped
+from forward_grid_mapper.core.trajectory.recovering import recovered
+from forward_grid_mapper.core.trajectory.refinement import replaced
+from forward_grid_mapper.core.trajectory.windows import Odometry
+
+MOUNTS = {'left': (0.1, 0.2, 1.0), 'right': (0.1, -0.2, -2.5)}
+
+
+def some_odometry(rng: np.random.Generator, count: int) -> Odometry:
+    steps = np.stack([rng.normal(0.05, 0.02, count), rng.normal(0.0, 0.01, count), rng.normal(0.0, 0.2, count)], 1)
+    pose = [rng.normal(0.0, 5.0, 3)]
+    for step in steps[1:]:
+        pose.append(compose(pose[-1], step))
+    return Odometry.of(np.cumsum(rng.integers(1, 10**8, count)), np.array(pose))
+
+
+def readings_at(rng: np.random.Generator, odometry: Odometry, stamp: np.ndarray) -> Readings:
+    sensor = rng.integers(0, 2, len(stamp))
+    mount = np.array(list(MOUNTS.values()))[sensor]
+    x, y, yaw = compose(odometry.at(stamp), mount).T
+    return Readings.from_columns(
+        tuple(MOUNTS), x=x, y=y, yaw=yaw, z=np.ones(len(stamp)), z_max=4.0, half_angle=0.2, stamp=stamp, sensor=sensor
+    )
+
+
+@pytest.mark.parametrize('seed', range(20))
+def test_readings_go_where_the_robot_was(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    odometry, other = some_odometry(rng, 50), some_odometry(rng, 50)
+    trajectory = Odometry(odometry.stamp, other.pose)
+    correction = Correction(odometry, trajectory)
+    inner = readings_at(rng, odometry, np.sort(rng.integers(odometry.stamp[0], odometry.stamp[-1], 80)))
+    for name in ('x', 'y', 'yaw'):
+        assert np.array_equal(
+            getattr(correction.apply(inner), name), getattr(replaced(inner, odometry, trajectory), name)
+        )
+    # after the end, the transform of the end
+    later = some_odometry(rng, 30)
+    later = Odometry(later.stamp + odometry.stamp[-1], later.pose)
+    outer = readings_at(rng, later, later.stamp[1:-1])
+    moved = correction.apply(outer)
+    assert np.stack([moved.x, moved.y], 1) == pytest.approx(
+        compose(correction.last, np.stack([outer.x, outer.y, outer.yaw], 1))[:, :2]
+    )
+    assert compose(correction.last, odometry.pose[-1])[:2] == pytest.approx(trajectory.pose[-1, :2])
+    assert abs(wrapped(compose(correction.last, odometry.pose[-1])[2] - trajectory.pose[-1, 2])) < 1e-9
+    assert correction.moved == pytest.approx(np.hypot(*(trajectory.pose[-1] - odometry.pose[-1])[:2]))
+    # what is not moved is not changed
+    for name in ('z', 'stamp', 'sensor', 'half_angle'):
+        assert np.array_equal(getattr(moved, name), getattr(outer, name))
+    way = correction.path_of(np.r_[odometry.stamp, later.stamp], np.r_[odometry.pose, later.pose])
+    at_end = int((later.stamp <= odometry.stamp[-1]).sum())
+    assert len(way) == 80 - at_end
+    assert way[50:] == pytest.approx(compose(correction.last, later.pose[at_end:])[:, :2])
+
+
+@pytest.mark.parametrize('seed', range(20))
+def test_readings_tell_the_odometry_that_is_gone(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    odometry = some_odometry(rng, 60)
+    readings = readings_at(rng, odometry, rng.permutation(odometry.stamp))
+    late = Odometry(odometry.stamp[40:], odometry.pose[40:])
+    whole = recovered(late, readings, MOUNTS)
+    assert np.array_equal(whole.stamp, odometry.stamp)
+    assert whole.pose[:, :2] == pytest.approx(odometry.pose[:, :2])
+    assert np.abs(wrapped(whole.pose[:, 2] - odometry.pose[:, 2])).max() < 1e-9
+    nothing = Odometry.of(np.zeros(0, np.int64), np.zeros((0, 3)))
+    assert np.array_equal(recovered(nothing, readings, MOUNTS).stamp, odometry.stamp)
+    # of sensors whose place nobody knows nothing can be told
+    only = recovered(late, readings, {'left': MOUNTS['left']})
+    assert set(only.stamp[: -len(late.stamp)]) == set(readings.stamp[readings.sensor == 0]) - set(late.stamp)
+    assert recovered(late, readings, {}) is late
+    assert recovered(odometry, readings, MOUNTS) is odometry

@@ -1,0 +1,163 @@
+"""The service cancel_em: ends EM, answers everybody in words, and forgets nothing."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip('rclpy', reason='the tests of the node need rclpy')
+
+from inside import Inside
+
+from forward_grid_mapper.core.common.errors import Cancelled
+from forward_grid_mapper.core.common.grid import Grid
+from forward_grid_mapper.core.mapping import Mapper
+from forward_grid_mapper.core.search.search import Progress
+from forward_grid_mapper.node import em
+
+SO_FAR = Grid(0.1, 0, 0, 3, 3)
+
+
+class Endless:
+    """Has EM go on until it is cancelled, and show a map of three by three cells meanwhile."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.running = threading.Event()
+
+        def run(mapper: Mapper, readings: Any, watch: Any, start: Any) -> None:
+            pause = threading.Event()
+            while not mapper._stop[0]:
+                watch('search', Progress(1, 2, 3, 4.0))
+                self.running.set()
+                pause.wait(0.01)
+            raise Cancelled('the work was cancelled; nothing was changed')
+
+        monkeypatch.setattr(em.Mapper, 'run', run)
+        monkeypatch.setattr(em.Mapper, 'so_far', lambda mapper: (SO_FAR, np.ones(SO_FAR.shape, np.int8)))
+
+
+def asked(handler: Callable[[Any], None]) -> list[tuple[Any, ...]]:
+    """Call a service; its answer comes into the list."""
+    answers: list[tuple[Any, ...]] = []
+    handler(SimpleNamespace(send=lambda *fields: answers.append(fields)))
+    return answers
+
+
+def width(robot: Inside) -> int:
+    robot.node.maps.worker.ask(lambda: None)
+    return int(robot.node.maps.latest['ml_map'].info.width)
+
+
+@pytest.mark.parametrize('online', [False, True])
+def test_it_ends_em_and_the_map_of_before_comes_back(
+    inside: Callable[..., Inside], monkeypatch: pytest.MonkeyPatch, online: bool
+) -> None:
+    robot = inside(publish_rate=50.0, online=online).start()
+    node = robot.node
+    robot.drive(0, 30)
+    assert robot.call(node.em.run_em)[0]
+    # of EM, or the online map that goes on from there
+    robot.until(lambda: width(robot) > 3)
+    wide, maps, before = width(robot), node.em.maps, node.maps.latest['ml_map'].data
+    with monkeypatch.context() as patch:
+        endless = Endless(patch)
+        first = asked(node.em.run_em)
+        robot.until(lambda: endless.running.is_set() and width(robot) == 3)
+        # both who wait for the end are told
+        answers = [asked(node.em.cancel), asked(node.em.cancel)]
+        robot.until(lambda: first and all(answers))
+    assert first == [(False, 'EM was cancelled by cancel_em')]
+    for ((success, message),) in answers:
+        assert success
+        assert message.startswith('EM was cancelled by cancel_em (after ')
+        assert message.endswith('readings and earlier maps are kept')
+    robot.until(lambda: width(robot) == wide)
+    assert node.maps.latest['ml_map'].data == before
+    assert node.em.maps is maps
+    assert len(node.associator.buffer) == 30
+    assert robot.status('EM')['last run'] == 'EM was cancelled by cancel_em'
+    assert robot.call(node.em.run_em)[0]
+
+
+def test_without_an_earlier_map_an_empty_one_comes(
+    inside: Callable[..., Inside], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    robot = inside(publish_rate=50.0).start()
+    node = robot.node
+    robot.drive(0, 5)
+    endless = Endless(monkeypatch)
+    saved = asked(node.saver.save_maps)
+    robot.until(lambda: endless.running.is_set() and width(robot) == 3)
+    assert robot.call(node.em.cancel)[0]
+    robot.until(lambda: saved)
+    assert saved == [(False, 'there is no map to save: EM was cancelled by cancel_em')]
+    assert width(robot) == 1
+
+
+def test_a_reset_says_that_it_was_the_reset(inside: Callable[..., Inside], monkeypatch: pytest.MonkeyPatch) -> None:
+    robot = inside().start()
+    node = robot.node
+    robot.drive(0, 5)
+    endless = Endless(monkeypatch)
+    first = asked(node.em.run_em)
+    robot.until(endless.running.is_set)
+    cancelled = asked(node.em.cancel)
+    assert robot.call(node.reset)[0]
+    robot.until(lambda: first and cancelled)
+    assert first == [(False, 'EM was cancelled by reset')]
+    assert cancelled[0][1].startswith('EM was cancelled by reset (after ')
+
+
+def test_there_is_nothing_to_cancel(inside: Callable[..., Inside]) -> None:
+    robot = inside().start()
+    assert robot.call(robot.node.em.cancel) == (False, 'EM does not run: there is nothing to cancel')
+
+
+def test_maps_that_were_found_already_stay(inside: Callable[..., Inside], monkeypatch: pytest.MonkeyPatch) -> None:
+    robot = inside().start()
+    node = robot.node
+    robot.drive(0, 30)
+    found, go_on = threading.Event(), threading.Event()
+    judge = em.sensor_health
+
+    def slow(maps: Any) -> Any:
+        found.set()
+        assert go_on.wait(60.0)
+        return judge(maps)
+
+    monkeypatch.setattr(em, 'sensor_health', slow)
+    first = asked(node.em.run_em)
+    robot.until(found.is_set)
+    cancelled = asked(node.em.cancel)
+    go_on.set()
+    robot.until(lambda: first and cancelled)
+    assert first[0][0] and node.em.maps is not None
+    assert cancelled == [(False, 'EM had found its maps before it could be cancelled; they are published')]
+
+
+def test_an_em_that_fails_by_itself_brings_the_map_back_too(
+    inside: Callable[..., Inside], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    robot = inside(publish_rate=50.0).start()
+    node = robot.node
+    robot.drive(0, 30)
+    assert robot.call(node.em.run_em)[0]
+    wide = width(robot)
+
+    def run(mapper: Mapper, readings: Any, watch: Any, start: Any) -> None:
+        # it is shown as often as `publish_rate` has it
+        while width(robot) != 3:
+            watch('search', Progress(1, 2, 3, 4.0))
+        raise MemoryError
+
+    monkeypatch.setattr(em.Mapper, 'run', run)
+    monkeypatch.setattr(em.Mapper, 'so_far', lambda mapper: (SO_FAR, np.ones(SO_FAR.shape, np.int8)))
+    first = asked(node.em.run_em)
+    robot.until(lambda: first)
+    assert not first[0][0] and 'memory' in first[0][1]
+    assert width(robot) == wide

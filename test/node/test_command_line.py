@@ -1,0 +1,137 @@
+"""What is wrong with the node's command line, said in words and never by a traceback."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+pytest.importorskip('rclpy', reason='the tests of the node need rclpy')
+
+from inside import Inside
+from robot import environment
+
+from forward_grid_mapper.core.common.errors import MapperError
+from forward_grid_mapper.node import complaints
+
+
+def refused(domain: int, *arguments: str, **changes: str) -> tuple[int, str]:
+    command = [sys.executable, '-m', 'forward_grid_mapper', 'mapper', *arguments]
+    done = subprocess.run(
+        command, capture_output=True, text=True, timeout=120, check=False, env={**environment(domain), **changes}
+    )
+    assert done.stdout == '' and 'Traceback' not in done.stderr, done.stderr
+    (line,) = (line for line in done.stderr.splitlines() if line.startswith('mapper: error: '))
+    assert '/src/' not in line
+    return done.returncode, line.removeprefix('mapper: error: ')
+
+
+@pytest.mark.parametrize(
+    ('arguments', 'code', 'expected'),
+    [
+        (['resolutoin:=0.1'], 2, 'did you mean resolution?'),
+        (['--ros-args', '--parms-file', 'x.yaml'], 2, 'did you mean --params-file?'),
+        (['--ros-args', '-r', '__node:=1st'], 1, '-r __node:=1st is no rule'),
+        (['--ros-args', '-p', 'range_topics:=[]'], 1, 'a parameter has no value, or an empty list'),
+        (['--ros-args', '-p', 'odom_topic:="a b"'], 1, "odom_topic: 'a b' is no name of a topic"),
+        (['--ros-args', '-r', '~/ml_map:=/map', '-r', '~/live_map:=/map'], 1, '/map can have one map only'),
+        (['--ros-args', '-p', 'journal:=~nobody_of_this_name/x'], 1, 'There is no such user'),
+    ],
+)
+def test_what_cannot_be_is_refused(domain: int, arguments: list[str], code: int, expected: str) -> None:
+    found, said = refused(domain, *arguments)
+    assert expected in said
+    assert found == code
+
+
+@pytest.mark.parametrize('number', ['5000', 'home', '1.5'])
+def test_a_domain_that_there_is_not(domain: int, number: str) -> None:
+    assert refused(domain, ROS_DOMAIN_ID=number) == (
+        1,
+        f'ROS_DOMAIN_ID is {number}, not a whole number from 0 to 232',
+    )
+
+
+@pytest.mark.parametrize('number', ['', ' ', '0', '232', '+7'])
+def test_domains_that_there_are(number: str) -> None:
+    assert complaints.of_domain({'ROS_DOMAIN_ID': number}) == '' == complaints.of_domain({})
+
+
+@pytest.mark.parametrize(
+    ('arguments', 'expected'),
+    [
+        (['--hlep'], '--hlep means nothing; did you mean --help?'),
+        (['bag.mcap'], 'bag.mcap means nothing; ROS options come after --ros-args'),
+        (['resolution:=0.1'], 'resolution is a parameter: --ros-args -p resolution:=0.1'),
+        (['-p', 'resolution:=0.1'], 'resolution is a parameter: --ros-args -p resolution:=0.1'),
+        (['odom:=/wheels'], '--ros-args -r odom:=/wheels'),
+        (['~/ml_map:=/map'], '--ros-args -r ~/ml_map:=/map'),
+        (['__ns:=/robot1'], '--ros-args -r __ns:=/robot1'),
+        (['--params-file', 'x.yaml'], '--params-file comes after --ros-args: --ros-args --params-file x.yaml'),
+    ],
+)
+def test_arguments_that_ros_does_not_take(arguments: list[str], expected: str) -> None:
+    assert expected in complaints.of_arguments(arguments)
+
+
+@pytest.mark.parametrize(
+    ('text', 'expected'),
+    [
+        ("['--remp', 'a:=b']", '--remp, a:=b: no such ROS option; did you mean --remap?'),
+        ("['resolution:=1']", 'resolution:=1 has to come after -p (a parameter) or -r'),
+        ('odd', 'odd: no such ROS option; known are --param,'),
+    ],
+)
+def test_options_that_ros_does_not_know(text: str, expected: str) -> None:
+    assert expected in complaints.of_ros_arguments(text)
+
+
+@pytest.mark.parametrize(
+    ('text', 'expected'),
+    [
+        (
+            "failed to initialize rcl: Couldn't parse remap rule: '-r foo'. Error: x, at /a/b.c:1, at /c/d.c:22",
+            '-r foo is no rule: it takes -r OLD:=NEW',
+        ),
+        (
+            "failed to initialize rcl: Couldn't parse parameter override rule: '-p foo'. Error: x, at /a/b.c:1",
+            '-p foo is no parameter: it takes -p NAME:=VALUE',
+        ),
+        (
+            "failed to initialize rcl: Couldn't parse params file: '--params-file x'. Error: cannot open, at /a/b.c:1",
+            '--params-file x: cannot open',
+        ),
+        ('failed to create node: name\n is taken, at /a/b.c:12', 'failed to create node: name is taken'),
+        ('', "RuntimeError('')"),
+    ],
+)
+def test_what_rclpy_says_is_told_without_its_sources(text: str, expected: str) -> None:
+    assert complaints.of_ros(RuntimeError(text)).startswith(expected)
+
+
+def test_save_directory_of_a_user_who_is_not_there(domain: int, tmp_path: Path) -> None:
+    robot = Inside(domain, tmp_path, save_directory='~nobody_of_this_name/maps').start()
+    try:
+        robot.drive(0, 10)
+        success, message = robot.call(robot.node.saver.save_maps)
+        assert not success
+        assert message == ('~nobody_of_this_name/maps: whose home is ~nobody_of_this_name? There is no such user.')
+        robot.set(save_directory=str(tmp_path / 'maps'))
+        assert robot.call(robot.node.saver.save_maps)[0]
+    finally:
+        robot.close()
+
+
+def test_no_range_topic_at_all(domain: int, tmp_path: Path) -> None:
+    """ROS takes no empty list on a command line, but a launch file in Python may give one."""
+    robot = Inside(domain, tmp_path)
+    try:
+        node: Any = robot.node.parameters.node
+        object.__setattr__(node, 'range_topics', ())
+        with pytest.raises(MapperError, match='range_topics is empty'):
+            robot.node.start()
+    finally:
+        robot.close()

@@ -1,0 +1,130 @@
+"""Sensors that stop sending are named, and those that come back are not."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from types import SimpleNamespace
+
+import pytest
+
+pytest.importorskip('rclpy', reason='the tests of the node need rclpy')
+
+from inside import Inside
+
+from forward_grid_mapper.node import heard
+from forward_grid_mapper.node.heard import TIME_OUT, USUAL, Heard
+
+OK, WARN = b'\x00', b'\x01'
+
+
+class Clock:
+    """Seconds that the test sets."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.now = 500.0
+        monkeypatch.setattr(heard.time, 'monotonic', lambda: self.now)
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+    return Clock(monkeypatch)
+
+
+def pass_by(clock: Clock, sensors: Heard, seconds: float, **intervals: float) -> None:
+    """Let time pass in which each of these sensors sends once in its interval."""
+    begin = clock.now
+    times = sorted(
+        (begin + k * interval, name)
+        for name, interval in intervals.items()
+        for k in range(1, round(seconds / interval) + 1)
+    )
+    for when, name in times:
+        clock.now = when
+        sensors.note(name)
+    clock.now = begin + seconds
+
+
+def test_who_stops_while_another_goes_on_is_silent_until_he_is_back(clock: Clock) -> None:
+    sensors = Heard()
+    pass_by(clock, sensors, 10.0, left=0.1, right=0.1)
+    assert sensors.silent() == {}
+    pass_by(clock, sensors, TIME_OUT - 0.1, right=0.1)
+    assert sensors.silent() == {}
+    pass_by(clock, sensors, 4.1, right=0.1)
+    assert sensors.silent() == {'left': pytest.approx(TIME_OUT + 4.0)}
+    pass_by(clock, sensors, 0.1, left=0.1)
+    assert sensors.silent() == {}
+    # the gap is not taken for its usual interval
+    pass_by(clock, sensors, TIME_OUT + 0.5, right=0.1)
+    assert set(sensors.silent()) == {'left'}
+
+
+def test_when_nothing_comes_at_all_nobody_is_named(clock: Clock) -> None:
+    sensors = Heard()
+    pass_by(clock, sensors, 10.0, left=0.1, right=0.13, slow=2.0)
+    pass_by(clock, sensors, 1000.0)
+    assert sensors.silent() == {}
+    # who was silent before stays so
+    pass_by(clock, sensors, 30.0, right=0.13, slow=2.0)
+    pass_by(clock, sensors, 1000.0)
+    assert set(sensors.silent()) == {'left'}
+
+
+def test_a_sensor_that_sends_rarely_has_more_time(clock: Clock) -> None:
+    sensors = Heard()
+    pass_by(clock, sensors, 100.0, fast=0.1, slow=5.0)
+    assert sensors.silent() == {}
+    pass_by(clock, sensors, USUAL * 5.0 - 0.1, fast=0.1)
+    assert sensors.silent() == {}
+    pass_by(clock, sensors, 0.3, fast=0.1)
+    assert set(sensors.silent()) == {'slow'}
+    sensors.clear()
+    assert sensors.silent() == {} and 'slow' not in sensors
+
+
+def test_names_that_cannot_be_shown_and_too_many_are_not_kept(clock: Clock) -> None:
+    sensors = Heard()
+    for name in ('', 'a\nb', 'x' * 256, *(f'made up {k}' for k in range(2 * heard.MOST_FRAMES))):
+        sensors.note(name)
+    assert '' not in sensors and 'a\nb' not in sensors and 'x' * 256 not in sensors
+    clock.now += 10.0
+    sensors.note('made up 0')
+    assert len(sensors.silent()) == heard.MOST_FRAMES - 1
+
+
+def test_diagnostics_name_the_silent_sensor(inside: Callable[..., Inside], monkeypatch: pytest.MonkeyPatch) -> None:
+    robot = inside(**{'sensors.other.pose': [0.1, 0.0, 1.0]}).start()
+    clock = Clock(monkeypatch)
+    told: list[str] = []
+    log = SimpleNamespace(info=told.append, warning=told.append, error=told.append)
+    monkeypatch.setattr(robot.node, 'get_logger', lambda: log)
+
+    def drive(first: int, *frames: str) -> None:
+        for k in range(first, first + 50):
+            clock.now += 0.1
+            robot.odometry(100.0 + 0.05 * k, 0.001 * k)
+            for frame in frames:
+                robot.range(100.0 + 0.05 * k, frame=frame)
+        robot.until(lambda: not robot.node.intake.busy)
+
+    drive(0, 'sonar', 'other', 'of nobody')
+    sensors = robot.status('sensors')
+    assert (sensors['level'], sensors['message']) == (OK, 'judged when EM has run')
+    drive(50, 'sonar')
+    sensors = robot.status('sensors')
+    assert sensors['level'] == WARN
+    # a frame without a pose is named elsewhere
+    assert sensors['message'] == 'other: nothing comes any more'
+    assert sensors['other'] == 'SILENT for 5 s; 50 readings, 0% max range'
+    drive(100, 'sonar', 'other')
+    assert robot.status('sensors')['level'] == OK
+    drive(150, 'other')
+    assert 'sonar: nothing' in robot.status('sensors')['message']
+    robot.call(robot.node.reset)
+    drive(200, 'other')
+    assert robot.status('sensors')['level'] == OK
+    assert [line for line in told if 'sensors that' in line] == [
+        'sensors that send nothing any more, while others do: other',
+        'sensors that send again: other',
+        'sensors that send nothing any more, while others do: sonar',
+    ]

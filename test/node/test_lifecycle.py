@@ -1,0 +1,205 @@
+"""The lifecycle of the node: a manager starts and ends it as Nav2's does, and without one it starts by itself."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+pytest.importorskip('rclpy', reason='the tests of the node need rclpy')
+pytest.importorskip('lifecycle_msgs', reason='the tests of the lifecycle need lifecycle_msgs')
+
+import yaml
+from fault_samples import circle
+from lifecycle_msgs.msg import State, Transition
+from lifecycle_msgs.srv import ChangeState, GetState
+from robot import LATCHED, MAPS, Robot, environment
+from test_mapper_node import RELIABLE
+
+from forward_grid_mapper.core.common.parameters import find
+
+OPTIONS = (*RELIABLE, '-p', 'sensors.sonar.pose:=[0.0, 0.0, 0.0]')
+WAITING = (*OPTIONS, '-p', 'autostart:=false')
+PAGE = Path(__file__).resolve().parents[2] / 'docs' / 'nav2.md'
+UNMANAGED = """
+import sys
+sys.modules['rclpy.lifecycle'] = None
+from forward_grid_mapper.node import main
+sys.exit(main.main(sys.argv[1:]))
+"""
+
+
+class Manager:
+    """Calls what Nav2's lifecycle manager calls, and waits as long as that does by default."""
+
+    SECONDS = 5.0
+
+    def __init__(self, robot: Robot) -> None:
+        self._robot = robot
+
+    def change(self, transition: int) -> bool:
+        request = Transition(id=transition)
+        return bool(self._robot.call('change_state', ChangeState, self.SECONDS, transition=request).success)
+
+    def state(self) -> int:
+        return int(self._robot.call('get_state', GetState, self.SECONDS).current_state.id)
+
+    def start_up(self) -> None:
+        assert self.change(Transition.TRANSITION_CONFIGURE)
+        assert self.state() == State.PRIMARY_STATE_INACTIVE
+        assert self.change(Transition.TRANSITION_ACTIVATE)
+        assert self.state() == State.PRIMARY_STATE_ACTIVE
+
+
+@pytest.fixture
+def manager(robot: Robot) -> Manager:
+    return Manager(robot)
+
+
+def published(robot: Robot) -> set[str]:
+    return {name for name, _ in robot.node.get_publisher_names_and_types_by_node('forward_grid_mapper', '/')}
+
+
+def received(robot: Robot) -> int:
+    return int(robot.diagnostics['readings']['readings received'])
+
+
+def later(robot: Robot) -> None:
+    """Wait for diagnostics that were made after this was called."""
+    robot.diagnostics.clear()
+    robot.until(lambda: 'readings' in robot.diagnostics)
+
+
+def test_a_manager_starts_pauses_and_ends_it(start: Any, robot: Robot, manager: Manager) -> None:
+    node = start(*WAITING, ready=False)
+    node.wait_for('unconfigured:')
+    assert manager.state() == State.PRIMARY_STATE_UNCONFIGURED
+    assert not any(name.endswith('_map') for name in published(robot))
+    assert manager.change(Transition.TRANSITION_CONFIGURE)
+    # maps and services are there, and no message is taken
+    robot.until(lambda: {f'/forward_grid_mapper/{name}' for name in MAPS} <= published(robot))
+    robot.until(lambda: robot.diagnostics.get('readings', {}).get('message') == 'inactive: nothing is received')
+    assert robot.range_out.get_subscription_count() == 0
+    node.wait_for('kernels of the EM are ready')
+    assert 'no reading' in robot.call('run_em').message
+    assert manager.change(Transition.TRANSITION_ACTIVATE)
+    robot.meet()
+    robot.play(circle(0, 300))
+    assert robot.call('run_em').success
+    wide = robot.get_map('ml_map').info.width
+    assert wide > 1
+    # what is sent while it is inactive is neither received nor lost, and the maps stay
+    assert manager.change(Transition.TRANSITION_DEACTIVATE)
+    robot.until(lambda: robot.range_out.get_subscription_count() == 0)
+    for message in circle(300, 300):
+        robot.send(message)
+    assert manager.change(Transition.TRANSITION_ACTIVATE)
+    robot.meet()
+    robot.play(circle(600, 300))
+    readings = robot.diagnostics['readings']
+    assert received(robot) == robot.sent
+    assert readings['readings lost in the middleware (estimated)'] == '0'
+    assert robot.get_map('ml_map').info.width == wide
+    # and everything is gone after a cleanup, and comes again, empty
+    assert manager.change(Transition.TRANSITION_DEACTIVATE)
+    assert manager.change(Transition.TRANSITION_CLEANUP)
+    assert manager.state() == State.PRIMARY_STATE_UNCONFIGURED
+    robot.until(lambda: not any(name.endswith('_map') for name in published(robot)))
+    for _ in range(2):
+        manager.start_up()
+        robot.meet()
+        later(robot)
+        assert received(robot) == 0
+        robot.sent = 0
+        robot.play(circle(0, 200))
+        assert robot.call('run_em').success
+        assert robot.get_map('ml_map').info.width > 1
+        assert manager.change(Transition.TRANSITION_DEACTIVATE)
+        assert manager.change(Transition.TRANSITION_CLEANUP)
+    assert manager.change(Transition.TRANSITION_UNCONFIGURED_SHUTDOWN)
+    assert manager.state() == State.PRIMARY_STATE_FINALIZED
+    assert node.stop() == 0
+    assert 'Traceback' not in node.output
+
+
+def test_by_itself_it_is_active(start: Any, robot: Robot, manager: Manager) -> None:
+    node = start(*OPTIONS)
+    assert manager.state() == State.PRIMARY_STATE_ACTIVE
+    robot.meet()
+    robot.play(circle(0, 200))
+    # a shutdown in the midst of work
+    robot.ask('run_em')
+    assert manager.change(Transition.TRANSITION_ACTIVE_SHUTDOWN)
+    assert manager.state() == State.PRIMARY_STATE_FINALIZED
+    assert node.stop() == 0
+
+
+def test_what_cannot_be_configured_is_refused_in_words(start: Any, robot: Robot, manager: Manager) -> None:
+    node = start(*WAITING, '-p', 'odom_topic:=sonar', ready=False)
+    node.wait_for('unconfigured:')
+    for _ in range(2):
+        assert not manager.change(Transition.TRANSITION_CONFIGURE)
+        assert manager.state() == State.PRIMARY_STATE_UNCONFIGURED
+    node.wait_for('/sonar cannot be a topic of Range and of odometry', 10.0)
+    assert not any(name.endswith('_map') for name in published(robot))
+    assert 'Traceback' not in node.output
+    assert node.stop() == 0
+
+
+def test_the_journal_is_given_back_at_every_configuration(
+    start: Any, robot: Robot, manager: Manager, tmp_path: Path
+) -> None:
+    node = start(*WAITING, '-p', f'journal:={tmp_path}/journal', ready=False)
+    node.wait_for('unconfigured:')
+    manager.start_up()
+    robot.meet()
+    robot.play(circle(0, 200))
+    accepted = robot.diagnostics['readings']['readings accepted']
+    assert int(accepted) > 100
+    assert manager.change(Transition.TRANSITION_DEACTIVATE)
+    assert manager.change(Transition.TRANSITION_CLEANUP)
+    manager.start_up()
+    later(robot)
+    robot.until(lambda: robot.diagnostics['readings']['readings accepted'] == accepted, what='they are back')
+    robot.node.create_subscription(type(robot.get_map('live_map')), '/forward_grid_mapper/live_map', print, LATCHED)
+    robot.until(lambda: robot.get_map('live_map').info.width > 1)
+
+
+@pytest.mark.parametrize('autostart', ['true', 'false'])
+def test_without_lifecycle_msgs_it_starts_by_itself_or_not_at_all(domain: int, tmp_path: Path, autostart: str) -> None:
+    log = tmp_path / 'node.log'
+    command = [sys.executable, '-c', UNMANAGED, '--ros-args', *OPTIONS, '-p', f'autostart:={autostart}']
+    with log.open('w') as file:
+        process = subprocess.Popen(command, env=environment(domain), stdout=file, stderr=subprocess.STDOUT)
+    try:
+        if autostart == 'false':
+            assert process.wait(60.0) == 1
+            assert 'without lifecycle_msgs nothing else can start the node' in log.read_text()
+            return
+        while 'ready:' not in log.read_text():
+            assert process.poll() is None, log.read_text()
+        process.terminate()
+        assert process.wait(20.0) == 0
+    finally:
+        process.kill()
+
+
+def test_the_page_gives_parameters_of_a_lifecycle_manager() -> None:
+    """As `nav2_lifecycle_manager` declares them: autostart, node_names, bond_timeout and others."""
+    blocks = re.findall(r'```yaml\n(.*?)```', PAGE.read_text(encoding='utf-8'), re.DOTALL)
+    (given,) = (made for made in map(yaml.safe_load, blocks) if 'lifecycle_manager_mapper' in made)
+    values = given['lifecycle_manager_mapper']['ros__parameters']
+    assert values == {
+        'autostart': True,
+        'node_names': ['forward_grid_mapper'],
+        # the node sends no heartbeat (bond), so the manager must not wait for one
+        'bond_timeout': 0.0,
+    }
+    assert isinstance(values['bond_timeout'], float)
+    # both cannot start it
+    assert 'autostart:=false' in PAGE.read_text(encoding='utf-8')
+    assert find('autostart').default is True

@@ -1,0 +1,284 @@
+"""TF from other nodes over DDS, with stand-ins for tf2_ros and tf2_msgs: what is missing is named."""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Callable, Iterator
+from types import ModuleType, SimpleNamespace
+from typing import Any
+
+import pytest
+
+pytest.importorskip('rclpy', reason='the tests of the node need rclpy')
+
+import rclpy
+from geometry_msgs.msg import Transform
+from inside import Inside
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import MultiDOFJointState
+
+from forward_grid_mapper.node import frames, surroundings
+
+VOLATILE = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.VOLATILE)
+WARN = b'\x01'
+
+
+class TransformError(Exception):
+    """The base of tf2's exceptions."""
+
+
+class Buffer:
+    """As `tf2_ros.Buffer`, but that every transform is the sensor's on the robot."""
+
+    def __init__(self) -> None:
+        self.listener: Any = None
+        self.transform: Any = None
+
+    def clear(self) -> None:
+        """Static transforms stay."""
+
+    def set_transform_static(self, transform: Any, authority: str) -> None:
+        self.transform = transform
+
+    def lookup_transform(self, target: str, source: str, time: Any) -> Any:
+        if self.transform is None or source != 'tower':
+            raise TransformError(source)
+        return SimpleNamespace(transform=self.transform)
+
+
+class Listener:
+    """As `tf2_ros.TransformListener`: it asks for what is kept for late subscribers."""
+
+    def __init__(self, buffer: Any, node: Any, *, spin_thread: bool = False) -> None:
+        quality = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        node.create_subscription(MultiDOFJointState, '/tf_static', lambda message: None, quality)
+
+
+@pytest.fixture(autouse=True)
+def tf2(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Stand-ins; MultiDOFJointState has a field `transforms`, as TFMessage does."""
+    modules = {name: ModuleType(name) for name in ('tf2_ros', 'tf2_msgs', 'tf2_msgs.msg')}
+    given: dict[str, Any] = {
+        'Buffer': Buffer,
+        'TransformListener': Listener,
+        'TransformException': TransformError,
+    }
+    for name, value in given.items():
+        setattr(modules['tf2_ros'], name, value)
+    modules['tf2_msgs.msg'].TFMessage = MultiDOFJointState  # type: ignore[attr-defined]
+    for name, module in modules.items():
+        monkeypatch.setitem(sys.modules, name, module)
+    monkeypatch.setattr(surroundings, 'PERIOD', 0.05)
+    monkeypatch.setattr(frames, 'LASTING', 0.2)
+    monkeypatch.setattr(frames, 'PATIENCE', 0.0)
+
+
+@pytest.fixture
+def player(domain: int) -> Iterator[Callable[[], Any]]:
+    """A node that publishes static transforms as a bag without quality of service does."""
+    context = rclpy.Context()
+    made: list[Any] = []
+
+    def begin(quality: QoSProfile = VOLATILE) -> Any:
+        rclpy.init(context=context, domain_id=domain)
+        made.append(rclpy.create_node('player', context=context))
+        return made[0].create_publisher(MultiDOFJointState, '/tf_static', quality)
+
+    yield begin
+    for node in made:
+        node.destroy_node()
+    if context.ok():
+        rclpy.shutdown(context=context)
+
+
+def begun(inside: Callable[..., Inside], **parameters: Any) -> Inside:
+    robot = inside(**{'sensors.sonar.pose': [0.1, 0.0, 0.4], **parameters})
+    return robot.start()
+
+
+def from_tower(robot: Inside, first: int, count: int) -> None:
+    for k in range(first, first + count):
+        robot.odometry(100.0 + 0.5 * k)
+        robot.range(100.0 + 0.5 * k, frame='tower')
+    robot.until(lambda: not robot.node.intake.busy)
+
+
+def test_static_transforms_that_are_volatile_are_taken(
+    inside: Callable[..., Inside], player: Callable[..., Any]
+) -> None:
+    robot = begun(inside)
+    publisher = player()
+    robot.until(publisher.get_subscription_count)
+    pose = Transform()
+    pose.translation.x, pose.rotation.w = 0.3, 1.0
+    publisher.publish(MultiDOFJointState(transforms=[pose]))
+    robot.until(lambda: robot.node._extrinsics('base_link', 'tower', 1) == (0.3, 0.0, 0.0))
+    from_tower(robot, 0, 5)
+    assert len(robot.node.associator.buffer) == 5
+    assert 'volatile' not in robot.status('readings')['message']
+
+
+def test_static_transforms_that_came_too_early_are_named(
+    inside: Callable[..., Inside], player: Callable[..., Any]
+) -> None:
+    robot = begun(inside, pose_timeout=0.1, max_pose_gap=0.6)
+    player()
+    robot.until(lambda: robot.node.count_publishers('/tf_static'))
+    assert 'volatile' not in robot.status('readings')['message']
+    end = robot.node.associator
+    k = 0
+    while not end.unknown_frames:
+        from_tower(robot, k, 5)
+        robot.spin(0.3)
+        k += 5
+    readings = robot.status('readings')
+    assert readings['level'] == WARN
+    assert (
+        'player publishes /tf_static as volatile: what it sent before this node listened is lost'
+        in (readings['message'])
+    )
+
+
+def test_static_transforms_that_are_not_reliable_are_named(
+    inside: Callable[..., Inside], player: Callable[..., Any]
+) -> None:
+    robot = begun(inside)
+    player(QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT))
+    robot.until(lambda: 'nothing of it is received; have it publish' in robot.status('readings')['message'])
+
+
+def test_a_map_frame_without_its_transform_is_said_by_name(inside: Callable[..., Inside]) -> None:
+    robot = begun(inside, map_frame='map')
+    k = 0
+
+    def message() -> str:
+        nonlocal k
+        k += 1
+        robot.odometry(100.0 + 0.1 * k)
+        return str(robot.status('readings')['message'])
+
+    robot.until(lambda: 'TF has no transform from map (map_frame) to odom' in message())
+    assert 'no odometry' not in message()
+
+
+def test_simulated_time_that_nobody_publishes_is_said(inside: Callable[..., Inside]) -> None:
+    robot = begun(inside, use_sim_time=True)
+    robot.until(lambda: 'use_sim_time is true, and nobody publishes /clock' in robot.status('readings')['message'])
+    from rosgraph_msgs.msg import Clock
+
+    publisher = robot.node.create_publisher(Clock, '/clock', 10)
+    robot.until(lambda: 'nobody has said a time on /clock' in robot.status('readings')['message'])
+    now = Clock()
+    now.clock.sec = 5
+
+    def gone() -> bool:
+        publisher.publish(now)
+        return '/clock' not in robot.status('readings')['message']
+
+    robot.until(gone)
+
+
+def test_inclined_and_steep_sensors(inside: Callable[..., Inside]) -> None:
+    robot = begun(inside)
+    pose = Transform()
+    buffer: Any = robot.node._extrinsics._transforms._buffer
+    for pitch in (math.radians(30.0), math.radians(80.0)):
+        pose.rotation.y, pose.rotation.w = math.sin(pitch / 2), math.cos(pitch / 2)
+        buffer.set_transform_static(pose, '')
+        from_tower(robot, len(robot.node.associator.buffer), 3)
+    assert robot.node.associator.readings.z.tolist() == pytest.approx([2.0 * math.cos(math.radians(30.0))] * 3)
+    readings = robot.status('readings')
+    assert readings['rejected: steep_sensor'] == '3'
+    assert readings['frames without a pose'] == ''
+
+
+class Log:
+    """A logger whose lines the test reads."""
+
+    def __init__(self) -> None:
+        self.lines: list[str] = []
+        self.info = self.warning = self.error = self.lines.append
+
+    def count(self, text: str) -> int:
+        return sum(text in line for line in self.lines)
+
+
+@pytest.fixture
+def log(monkeypatch: pytest.MonkeyPatch) -> Callable[[Inside], Log]:
+    def watch(robot: Inside) -> Log:
+        made = Log()
+        monkeypatch.setattr(robot.node, 'get_logger', lambda: made)
+        return made
+
+    return watch
+
+
+def test_the_log_tells_once_of_a_sensor_without_a_pose_and_of_its_pose(
+    inside: Callable[..., Inside], log: Callable[[Inside], Log]
+) -> None:
+    robot = begun(inside, pose_timeout=0.1, max_pose_gap=0.6)
+    told, node = log(robot), robot.node
+    k = 0
+    while not node.associator.unknown_frames:
+        from_tower(robot, k, 5)
+        robot.spin(0.3)
+        k += 5
+    for _ in range(3):
+        robot.status('readings')
+    assert told.count('no pose on the robot for sensor tower') == 1
+    buffer: Any = node._extrinsics._transforms._buffer
+    pose = Transform()
+    pose.rotation.w = 1.0
+    buffer.set_transform_static(pose, '')
+    from_tower(robot, k, 5)
+    for _ in range(3):
+        assert robot.status('readings')['frames without a pose'] == ''
+    assert told.count('sensor tower has a pose on the robot now') == 1
+    # a reset forgets which frames are unknown, and that is no news of a pose
+    node.associator.unknown_frames.add('tower')
+    robot.status('readings')
+    robot.call(node.reset)
+    robot.status('readings')
+    assert told.count('has a pose on the robot now') == 1
+
+
+def test_the_log_tells_once_of_a_map_frame_without_its_transform_and_of_its_end(
+    inside: Callable[..., Inside], log: Callable[[Inside], Log]
+) -> None:
+    robot = begun(inside, map_frame='map')
+    told, frame, k = log(robot), robot.node._map_frame, 0
+
+    def drive() -> None:
+        nonlocal k
+        k += 1
+        robot.odometry(100.0 + 0.1 * k)
+
+    robot.until(lambda: (drive(), frame.fault())[1])
+    for _ in range(3):
+        robot.status('readings')
+    assert told.count('no reading gets a pose: TF has no transform from map (map_frame) to odom') == 1
+    # the robot stands still for a while: that is no transform
+    robot.until(lambda: not frame.fault())
+    robot.status('readings')
+    assert told.count('the transform to map_frame is there') == 0
+    pose = Transform()
+    pose.rotation.w = 1.0
+    frame._transforms._buffer.lookup_transform = lambda *names: SimpleNamespace(transform=pose)
+    drive()
+    for _ in range(3):
+        robot.status('readings')
+    assert told.count('the transform to map_frame is there') == 1
+
+
+def test_the_log_tells_once_of_a_steep_sensor(inside: Callable[..., Inside], log: Callable[[Inside], Log]) -> None:
+    robot = begun(inside)
+    told = log(robot)
+    pose = Transform()
+    pose.rotation.y, pose.rotation.w = math.sin(0.75), math.cos(0.75)
+    buffer: Any = robot.node._extrinsics._transforms._buffer
+    buffer.set_transform_static(pose, '')
+    from_tower(robot, 0, 5)
+    for _ in range(3):
+        robot.status('readings')
+    assert told.count('readings of tower are rejected: the sensor looks up or down') == 1
