@@ -12,10 +12,12 @@ import naive
 from conftest import random_readings
 from forward_grid_mapper.core.common.constants import ARC
 from forward_grid_mapper.core.common.errors import InputError
-from forward_grid_mapper.core.common.grid import Grid
+from forward_grid_mapper.core.common.grid import Grid, cone_boxes
 from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.common.readings import Readings
-from forward_grid_mapper.core.maps.log_odds_map import LogOddsMap
+from forward_grid_mapper.core.maps.log_odds_kernel import direction_of
+from forward_grid_mapper.core.maps.log_odds_map import LogOddsMap, map_grid
+from forward_grid_mapper.core.sensor.cone_table import effective_sigma, reach_of
 
 AREA = Grid(0.1, -10, 5, 20, 16)
 
@@ -231,3 +233,23 @@ def test_maps_are_added_as_if_their_readings_were() -> None:
         rest.add(readings.select(slice(cut, 30)))
         part.add_map(rest)
         np.testing.assert_array_equal(part.log_odds(whole.grid), whole.log_odds())
+
+
+@pytest.mark.parametrize('count', [1, 2, 16, 17, 500])
+def test_the_grid_is_that_of_the_boxes_of_all_cones(count: int) -> None:
+    rng = np.random.default_rng(count)
+    for _ in range(10):
+        readings = random_readings(rng, Grid(0.1, -100, -50, 200, 100), count)
+        p = Parameters()
+        reach = np.maximum(reach_of(readings, effective_sigma(readings, p.model, 0.1)) + 0.03, readings.z + ARC[1])
+        b = cone_boxes(readings.x, readings.y, readings.yaw, readings.half_angle, reach)
+        assert map_grid(readings, p) == Grid.covering((b[0].min(), b[1].max(), b[2].min(), b[3].max()), 0.1)
+
+
+@pytest.mark.parametrize('directions', [1, 2, 4, 5])
+def test_looking_along_a_line_either_way_is_one_direction(directions: int) -> None:
+    yaw = np.random.default_rng(0).uniform(-9.0, 9.0, 300)
+    for angle in yaw:
+        k = direction_of(angle, directions)
+        assert direction_of(angle + math.pi, directions) == k
+        assert abs(math.remainder(angle - k * math.pi / directions, math.pi)) <= math.pi / directions / 2 + 1e-9
