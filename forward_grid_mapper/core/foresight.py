@@ -4,20 +4,22 @@ The drive is cut into blocks of `BLOCK` seconds, and every fifth block is held o
 learned and two maps made, one with the values from the start and one with the learned values. Both maps are asked how
 likely the readings held out are. Values that fit the noise raise the likelihood of any map, also of one that shows less
 of the walls; so the maps are compared at the same values, once at those from the start and once at those learned. The
-learned values are accepted if their map is not the worse one by either.
+learned values are accepted if their map is the better one by both, by more than a standard error. It is that of the
+differences between blocks, since the readings of one are of one place.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import math
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .common.grid import UNKNOWN
 from .common.parameters import ModelParameters, Parameters
-from .common.readings import Readings
-from .joint_learning import Foresight, Learned, Watch, learn_jointly
+from .common.readings import Floats, Readings
+from .joint_learning import SURE, Foresight, Learned, Watch, learn_jointly
 from .mapping import Mapper
 from .maps.map_set import MapSet
 from .messages.message_types import NANOSECONDS
@@ -33,8 +35,13 @@ FOLDS = 5
 
 def folds_of(readings: Readings) -> NDArray[np.int64]:
     """Return in which fold each reading is held out, shape (N,)."""
+    return blocks_of(readings) % FOLDS
+
+
+def blocks_of(readings: Readings) -> NDArray[np.int64]:
+    """Return the block of each reading, shape (N,)."""
     since = (readings.stamp - readings.stamp.min()) / NANOSECONDS
-    return np.asarray(since // BLOCK, np.int64) % FOLDS
+    return np.asarray(since // BLOCK, np.int64)
 
 
 def foresight(
@@ -55,7 +62,8 @@ def foresight(
     fold = folds_of(readings)
     if len(np.unique(fold)) < FOLDS:
         return None
-    total = np.zeros((2, 2))
+    # of each reading: by the map, and by the values that judge
+    log_likelihood = np.zeros((2, 2, len(readings)))
     for k in range(FOLDS):
         watch(f'held-out readings, {k + 1} of {FOLDS}', None)
         rest, held = readings.select(fold != k), readings.select(fold == k)
@@ -63,16 +71,32 @@ def foresight(
         learned = learn_jointly(rest, parameters, rounds, keep_going=True).maps
         for i, maps in enumerate((first, learned)):
             for j, values in enumerate((parameters.model, learned.parameters.model)):
-                total[i, j] += log_likelihood_of(held, maps, values)
-    return Foresight(*(total / len(readings)).ravel().tolist())
+                log_likelihood[i, j, fold == k] = log_likelihoods(held, maps, values)
+    errors = [standard_error(readings, log_likelihood[1, j] - log_likelihood[0, j]) for j in range(2)]
+    return Foresight(*log_likelihood.mean(axis=2).ravel().tolist(), *errors)
 
 
-def log_likelihood_of(held: Readings, maps: MapSet, values: ModelParameters) -> float:
-    """Return log p(held | map) in nats of readings that the map was not made of; beyond its edges nothing stands."""
+def standard_error(readings: Readings, differences: Floats) -> float:
+    """Return the standard error of the mean of differences, shape (N,), that are alike within a block; inf for one."""
+    _, block = np.unique(blocks_of(readings), return_inverse=True)
+    sums, sizes = np.bincount(block, differences), np.bincount(block)
+    count = len(sums)
+    if count < 2:
+        return math.inf
+    rest = sums - differences.mean() * sizes
+    return math.sqrt(count / (count - 1) * float(rest @ rest)) / len(differences)
+
+
+def log_likelihoods(held: Readings, maps: MapSet, values: ModelParameters) -> Floats:
+    """Return log p(z | map) in nats of readings that the map was not made of; beyond its edges nothing stands."""
     whole = grid_of(held, values, maps.parameters.grid, maps.grid)
     ml = np.full(whole.shape, UNKNOWN, np.int8)
     ml[whole.window(maps.grid)] = maps.ml
-    return ForwardModel(held, whole, values, on_larger_grid(maps.normals, maps.grid, whole)).log_likelihood(ml)
+    return (
+        ForwardModel(held, whole, values, on_larger_grid(maps.normals, maps.grid, whole))
+        .expectations(ml)
+        .log_likelihood
+    )
 
 
 def only_if_foreseen(
@@ -94,11 +118,12 @@ def only_if_foreseen(
         return dataclasses.replace(found, warnings=(*found.warnings, short))
     if seen.better:
         return dataclasses.replace(found, foresight=seen)
+    at_first, at_learned = seen.gains
     why = (
-        f'the learned values are refused: readings that had no part in learning are not likelier with their map '
-        f'({seen.learned_at_first:.3f} nats a reading at the values from the start, {seen.learned_at_learned:.3f} at '
-        f'the learned ones) than with the map of the values from the start ({seen.first_at_first:.3f} and '
-        f'{seen.first_at_learned:.3f}); those are kept. --keep-going hands out the learned ones'
+        f'the learned values are refused: readings that had no part in learning do not speak for their map. At the '
+        f'values from the start it gains {at_first:+.3f} ± {seen.error_at_first:.3f} nats a reading over the map of '
+        f'these values, at the learned ones {at_learned:+.3f} ± {seen.error_at_learned:.3f}; both must be more than '
+        f'{SURE:g} standard error. The values from the start are kept; --keep-going hands out the learned ones'
     )
     return dataclasses.replace(
         found,

@@ -36,6 +36,9 @@ MUCH_CHANCE = 0.3
 """A larger learned p_rand is worth a warning."""
 LIKELIHOOD_DROP = 0.01
 """Nats a reading by which a new map may be less likely than the one before, at the same values."""
+SURE = 1.0
+"""Standard errors by which held-out readings must be likelier with the map of learned values: the rule of one standard
+error in cross-validation, by which the simpler model is kept unless another one is better by more than that."""
 _UPDATES = 100
 _SETTLED = 2e-4
 _CONVERGED = 0.01
@@ -81,18 +84,27 @@ class Round:
 class Foresight(NamedTuple):
     """Mean log-likelihood of a reading held out, nats: of the map of the first values and of that of the learned ones.
 
-    Each is judged at the first values and at the learned ones.
+    Each is judged at the first values and at the learned ones; `error_at_…` is the standard error of the difference of
+    the two maps.
     """
 
     first_at_first: float
     first_at_learned: float
     learned_at_first: float
     learned_at_learned: float
+    error_at_first: float
+    error_at_learned: float
 
     @property
     def better(self) -> bool:
-        """Whether the map of the learned values is not the worse one, whichever values judge."""
-        return self.learned_at_first >= self.first_at_first and self.learned_at_learned >= self.first_at_learned
+        """Whether the map of the learned values is the better one, whichever values judge, by more than chance."""
+        at_first, at_learned = self.gains
+        return at_first > SURE * self.error_at_first and at_learned > SURE * self.error_at_learned
+
+    @property
+    def gains(self) -> tuple[float, float]:
+        """What the map of the learned values gains, at the first values and at the learned ones, nats a reading."""
+        return self.learned_at_first - self.first_at_first, self.learned_at_learned - self.first_at_learned
 
 
 @dataclass(frozen=True)

@@ -83,11 +83,12 @@ def _values(learned: Learned) -> Iterator[str]:
         interval = f'{estimate.low:.4f} … {estimate.high:.4f}' if known else '–'
         yield f'{row}{error:>11}{interval:>19}{estimate.readings:>11,.0f} readings'
     if seen := learned.foresight:
+        at_first, at_learned = seen.gains
         yield (
-            f'  Held-out readings, nats each: {seen.learned_at_learned:.3f} with the map of the learned values, '
-            f'{seen.first_at_learned:.3f} with that of the first'
+            f'  Held-out readings, nats each that the map of the learned values gains: {at_first:+.3f} ± '
+            f'{seen.error_at_first:.3f} at'
         )
-        yield f'  ones; judged at the first values {seen.learned_at_first:.3f} and {seen.first_at_first:.3f}'
+        yield f'  the values from the start, {at_learned:+.3f} ± {seen.error_at_learned:.3f} at the learned ones'
     yield textwrap.fill(_HOW, _WIDTH, initial_indent='  ', subsequent_indent='  ')
 
 

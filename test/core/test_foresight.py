@@ -8,10 +8,18 @@ import pytest
 from forward_grid_mapper.core import foresight as module
 from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.common.readings import Readings
-from forward_grid_mapper.core.foresight import FOLDS, folds_of, foresight, log_likelihood_of, only_if_foreseen
+from forward_grid_mapper.core.foresight import (
+    FOLDS,
+    blocks_of,
+    folds_of,
+    foresight,
+    log_likelihoods,
+    only_if_foreseen,
+    standard_error,
+)
 from forward_grid_mapper.core.joint_learning import Foresight, learn_jointly
 from forward_grid_mapper.core.mapping import Mapper
-from forward_grid_mapper.simulation.drive import door_drive
+from forward_grid_mapper.simulation.drive import corridor_drive, door_drive
 from forward_grid_mapper.simulation.sonar import NOISY, front_array
 
 READINGS = door_drive(1, NOISY, 0, front_array()).readings
@@ -33,13 +41,13 @@ def test_readings_held_out_have_no_part_in_learning(monkeypatch: pytest.MonkeyPa
         learned_from.append(set(readings.stamp.tolist()))
         return learn_jointly(readings, *args, **options)  # type: ignore[arg-type]
 
-    def judge(held: Readings, *args: object) -> float:
+    def judge(held: Readings, *args: object) -> object:
         judged.append(set(held.stamp.tolist()))
-        return 0.0
+        return np.zeros(len(held))
 
     monkeypatch.setattr(module, 'learn_jointly', learn)
-    monkeypatch.setattr(module, 'log_likelihood_of', judge)
-    assert foresight(READINGS, Parameters(), 1) == Foresight(0.0, 0.0, 0.0, 0.0)
+    monkeypatch.setattr(module, 'log_likelihoods', judge)
+    assert foresight(READINGS, Parameters(), 1) == Foresight(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     assert len(learned_from) == FOLDS and len(judged) == 4 * FOLDS
     for k, stamps in enumerate(learned_from):
         assert all(not stamps & held for held in judged[4 * k : 4 * k + 4])
@@ -48,26 +56,45 @@ def test_readings_held_out_have_no_part_in_learning(monkeypatch: pytest.MonkeyPa
 
 def test_the_likelihood_is_that_of_a_map_on_any_grid() -> None:
     maps = Mapper(Parameters()).run(READINGS)
-    assert log_likelihood_of(READINGS, maps, maps.parameters.model) == pytest.approx(maps.log_likelihood, abs=1e-6)
+    whole = log_likelihoods(READINGS, maps, maps.parameters.model)
+    assert whole.sum() == pytest.approx(maps.log_likelihood, abs=1e-6)
     part = Mapper(Parameters()).run(READINGS.select(slice(0, 200)))
-    rest = READINGS.select(slice(200, None))
-    found = log_likelihood_of(rest, part, part.parameters.model)
-    one_by_one = sum(log_likelihood_of(rest.select(slice(k, k + 1)), part, part.parameters.model) for k in range(40))
-    first = log_likelihood_of(rest.select(slice(0, 40)), part, part.parameters.model)
-    assert one_by_one == pytest.approx(first, abs=1e-6)
-    assert found < 0 or found > first
+    rest = READINGS.select(slice(200, 240))
+    alone = [log_likelihoods(rest.select(slice(k, k + 1)), part, part.parameters.model)[0] for k in range(40)]
+    np.testing.assert_allclose(log_likelihoods(rest, part, part.parameters.model), alone, atol=1e-9)
+
+
+def test_the_standard_error_is_that_of_sums_of_blocks() -> None:
+    """Where all readings of a block say the same, more of them make nothing surer."""
+    blocks = blocks_of(READINGS)
+    _, number = np.unique(blocks, return_inverse=True)
+    count = number.max() + 1
+    values = np.random.default_rng(3).normal(size=count)[number]
+    found = standard_error(READINGS, values)
+    # brute force: the spread of the mean over bootstraps of blocks
+    rng, means = np.random.default_rng(4), []
+    for _ in range(4000):
+        drawn = rng.integers(0, count, count)
+        sums = np.bincount(number, values)[drawn].sum()
+        means.append(sums / np.bincount(number)[drawn].sum())
+    assert found == pytest.approx(float(np.std(means)), rel=0.2)
+    twice = READINGS.select(np.repeat(np.arange(len(READINGS)), 2))
+    assert standard_error(twice, np.repeat(values, 2)) == pytest.approx(found, rel=1e-9)
+    assert standard_error(READINGS.select(blocks == 0), values[blocks == 0]) == np.inf
 
 
 @pytest.mark.parametrize(
     ('seen', 'better'),
     [
-        (Foresight(1.0, 1.0, 1.0, 1.0), True),
-        (Foresight(1.0, 1.0, 1.1, 1.2), True),
-        (Foresight(1.0, 1.0, 0.9, 3.0), False),
-        (Foresight(1.0, 1.0, 3.0, 0.9), False),
+        (Foresight(1.0, 1.0, 1.0, 1.0, 0.0, 0.0), False),
+        (Foresight(1.0, 1.0, 1.1, 1.2, 0.04, 0.04), True),
+        (Foresight(1.0, 1.0, 1.1, 1.2, 0.11, 0.04), False),
+        (Foresight(1.0, 1.0, 1.2, 1.1, 0.04, 0.11), False),
+        (Foresight(1.0, 1.0, 0.9, 3.0, 0.01, 0.01), False),
+        (Foresight(1.0, 1.0, 3.0, 0.9, 0.01, 0.01), False),
     ],
 )
-def test_a_map_has_to_be_no_worse_by_either_values(seen: Foresight, better: bool) -> None:
+def test_a_map_has_to_be_better_by_both_values_and_by_more_than_chance(seen: Foresight, better: bool) -> None:
     assert seen.better == better
 
 
@@ -81,11 +108,11 @@ def test_a_short_drive_is_told_of() -> None:
 
 
 def test_values_are_accepted_where_the_first_ones_are_wrong_and_refused_where_they_are_good() -> None:
-    """The simulated sonar has 5 % of random readings and noise of 5 cm."""
-    readings = door_drive(3, NOISY, 0).readings
-    for given, accepted in (({'p_rand': 0.01, 'p_lost': 0.0}, True), ({}, False)):
+    """The simulated sonar has a noise of 5 cm."""
+    long, short = corridor_drive(0, 1, NOISY, False).readings, door_drive(3, NOISY, 0).readings
+    for readings, given, accepted in ((long, {'sigma': 0.3}, True), (short, {}, False)):
         parameters = Parameters.from_flat(given)
-        found = only_if_foreseen(learn_jointly(readings, parameters, 3), readings, parameters, 3)
+        found = only_if_foreseen(learn_jointly(readings, parameters, 2), readings, parameters, 2)
         assert (found.accepted > 0) == accepted
         assert found.foresight is not None and found.foresight.better == accepted
         assert (found.parameters == parameters) != accepted
