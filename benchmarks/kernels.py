@@ -18,6 +18,7 @@ import numba
 import numpy as np
 from measuring import PATIENCE, machine, stream_seconds, timed
 
+from forward_grid_mapper.core.common.constants import arc_depths
 from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.common.readings import Readings, in_canonical_order
 from forward_grid_mapper.core.evidence.evidence import Evidence
@@ -25,7 +26,6 @@ from forward_grid_mapper.core.evidence.pairs import WORDS_PER_RUN, make
 from forward_grid_mapper.core.evidence.state import State
 from forward_grid_mapper.core.evidence.tile_index import CHUNK, SHIFT
 from forward_grid_mapper.core.evidence.updates import _add_to_free_zone, evaluate, find_observing, flip
-from forward_grid_mapper.core.maps.log_odds_map import arc_depth
 from forward_grid_mapper.core.maps.traversed import traversed_cells
 from forward_grid_mapper.core.search.flips import promising
 from forward_grid_mapper.core.search.prior import wall_prior
@@ -125,7 +125,7 @@ def profile(name: str, readings: Readings, runs: int) -> None:
     """Print the profile of one job."""
     p = Parameters()
     readings = in_canonical_order(readings)
-    grid = grid_of(readings, p.model, p.grid, beyond=arc_depth(p))
+    grid = grid_of(readings, p.model, p.grid, beyond=arc_depths(p.grid.resolution)[1])
     traversed = traversed_cells(readings, grid)
     begin = time.perf_counter()
     evidence = Evidence(grid, p.model)

@@ -17,10 +17,10 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from forward_grid_mapper.core.common.constants import arc_depths
 from forward_grid_mapper.core.common.grid import Grid
 from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.common.readings import Readings
-from forward_grid_mapper.core.maps.log_odds_map import arc_depth
 from forward_grid_mapper.core.search.search import LEAST_GAIN
 from forward_grid_mapper.core.sensor.cone_table import cone_table, grid_of, walk
 from forward_grid_mapper.core.sensor.density import causes_of, density
@@ -103,7 +103,7 @@ def _sweep(table: Any, lists: Any, causes: Any, occupied: Any, shape: tuple[int,
 def search(readings: Readings, parameters: Parameters, most_sweeps: int = 200) -> Table2:
     """Return the map that the loops find, from the empty one."""
     p = parameters
-    grid = grid_of(readings, p.model, p.grid, beyond=arc_depth(p))
+    grid = grid_of(readings, p.model, p.grid, beyond=arc_depths(p.grid.resolution)[1])
     table = cone_table(readings, grid, p.model)
     causes = causes_of(readings, table['sigma'] * grid.resolution, p.model, grid.resolution)
     lists = _lists(table, grid.shape)

@@ -185,18 +185,36 @@ def strength(readings: Readings, t: int, grid: Grid, c: int) -> float:
     return max(0.0, 1 - (off_axis / edge) ** 2)
 
 
-def live_log_odds(readings: Readings, grid: Grid, depth: float, logits: tuple[float, float, float]) -> np.ndarray:
-    """The standard map; `logits` of occupied, free, and free without echo."""
-    out = np.full(grid.size, np.nan)
+def live_log_odds(
+    readings: Readings,
+    grid: Grid,
+    arc: tuple[float, float],
+    logits: tuple[float, float, float],
+    width: float = math.inf,
+    directions: int = 1,
+) -> np.ndarray:
+    """The standard map; `logits` of occupied, free, and free without echo, `width` of the surface of an echo."""
+    apart, touched = np.zeros((directions, grid.size)), np.zeros(grid.size, bool)
+    before, behind = arc
+    centres = np.arange(directions) * math.pi / directions
     for t in range(len(readings)):
         x, y, yaw, z = readings.x[t], readings.y[t], readings.yaw[t], readings.z[t]
         echo = z < readings.z_max[t]
-        for c, d in cone_cells((x, y, yaw), readings.half_angle[t], z + depth, grid).items():
+        # angles between lines, not arrows
+        k = int(np.argmin([abs(math.remainder(yaw - centre, math.pi)) for centre in centres]))
+        length = 2 * z * math.sin(readings.half_angle[t])
+        for c, d in cone_cells((x, y, yaw), readings.half_angle[t], z + behind if echo else z, grid).items():
+            touched[c] = True
             weight = strength(readings, t, grid, c)
-            if d < (z - depth if echo else z):
-                out[c] = np.nansum([out[c], weight * logits[1 if echo else 2]])
-            elif echo:
-                out[c] = np.nansum([out[c], weight * logits[0]])
+            if d < z - before or not echo:
+                apart[k, c] += weight * logits[1 if echo else 2]
+            else:
+                apart[k, c] += weight * logits[0] * (1.0 if length <= width else width / length)
+    out = np.full(grid.size, np.nan)
+    for c in np.flatnonzero(touched):
+        together = sum(apart[:, c])
+        said = [apart[k, c] + (apart[k - 1, c] + apart[(k + 1) % directions, c]) / 16 for k in range(directions)]
+        out[c] = max(*said, together) if directions > 1 and max(said) > 0 else together
     return out.reshape(grid.shape)
 
 

@@ -28,6 +28,9 @@ GAINS = tuple(
 )
 """The settings of the standard map among which the best is taken, which a user could not know; see `standard_map`."""
 
+ONE_SUM = {'live_directions': 1, 'live_echo_width': 1000.0}
+"""The standard map as in the paper: readings of all directions in one sum, and arcs as a whole."""
+
 PAPER = {
     'p_hit': 0.9,
     'p_rand': 0.05,
@@ -39,8 +42,12 @@ PAPER = {
     'end_cost': 0.0,
     'least_passed': 0.0,
     'likelihood_exponent': 1.0,
+    'live_p_occupied': 0.8,
+    'live_p_free': 0.25,
+    'live_p_free_no_echo': 0.3,
+    **ONE_SUM,
 }
-"""Maximum likelihood without a prior, as printed in the paper."""
+"""Maximum likelihood without a prior, as printed in the paper, and its standard map."""
 
 
 class Case(NamedTuple):
@@ -93,7 +100,8 @@ def forward(cases: Iterable[Case], parameters: Parameters, title: str) -> Outcom
 
 def standard_map(gains: dict[str, float]) -> LogOddsMap:
     """Return an empty standard map with these gains, of which `depth` is half the depth of its arcs, metres."""
-    return LogOddsMap(Parameters.from_flat({k: v for k, v in gains.items() if k != 'depth'}), gains['depth'])
+    values = {k: v for k, v in gains.items() if k != 'depth'}
+    return LogOddsMap(Parameters.from_flat({**values, **ONE_SUM}), (gains['depth'], gains['depth']))
 
 
 def standard(cases: Iterable[Case], gains: dict[str, float], title: str) -> Outcome:

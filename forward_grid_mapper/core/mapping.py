@@ -118,9 +118,10 @@ class Mapper:
         """
         self._watch, self._seconds = watch, {}
         given = self._prepare(readings)
+        # first, since it needs as much memory for a while as the evidence does
+        live = self._standard_map(given)
         evidence = self._index(given, start)
         found = self._search(given, evidence)
-        live = self._standard_map(given)
         ml = self._post_process(given, evidence)
         return self._judge(given, evidence, found, live, ml)
 

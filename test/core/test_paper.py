@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import naive
+from forward_grid_mapper.commands.experiment_maps import ONE_SUM
 from forward_grid_mapper.core.common.errors import ParameterError
 from forward_grid_mapper.core.common.grid import Grid
 from forward_grid_mapper.core.common.parameters import ModelParameters, Parameters, find
@@ -139,7 +140,7 @@ def closed_form(each: np.ndarray, prior: float) -> np.ndarray:
 
 
 def test_the_standard_map_is_the_closed_form_of_eq_16_with_logarithms() -> None:
-    parameters = Parameters.from_flat({'resolution': 0.1})
+    parameters = Parameters.from_flat({'resolution': 0.1, **ONE_SUM})
     readings = random_readings(np.random.default_rng(1), AREA, 40)
     live = LogOddsMap(parameters)
     live.add(readings)

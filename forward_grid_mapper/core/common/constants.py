@@ -84,10 +84,12 @@ LEAST_EVIDENCE = 0.1
 
 # The standard map
 
-ARC_DEPTH = 0.05
-"""Metres before and behind its range that an echo marks as occupied: the σ of a usual sonar."""
+ARC = (0.05, 0.1)
+"""Metres before and behind its range that an echo marks as occupied: the σ of a usual sonar, and twice that behind,
+since an arc bends away from a wall towards the sensor. With 0.15 m behind, walls of the maps are too thick."""
 
 
-def arc_depth(resolution: float, least: float = ARC_DEPTH) -> float:
-    """Return half the depth of the arc that an echo marks, metres: no less than half a cell of edge `resolution`."""
-    return max(least, resolution / 2)
+def arc_depths(resolution: float, arc: tuple[float, float] = ARC) -> tuple[float, float]:
+    """Return how deep an echo marks before and behind its range, metres: no less than half a cell of `resolution`."""
+    before, behind = arc
+    return max(before, resolution / 2), max(behind, resolution / 2)

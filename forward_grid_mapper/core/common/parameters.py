@@ -238,15 +238,16 @@ class LiveMapParameters:
     """The standard map: log odds ((3), (4), (14)-(16) of the paper), updated reading by reading."""
 
     live_p_occupied: float = _param(
-        0.8,
-        'Occupancy of a cell on the axis at the measured range, given one reading.',
+        0.99,
+        'Occupancy of a cell on the axis at the measured range, given one reading whose arc is no longer than '
+        'live_echo_width.',
         'probability',
         0.5,
         0.999,
         read_only=True,
     )
     live_p_free: float = _param(
-        0.25,
+        0.01,
         'Occupancy of a cell on the axis before the measured range, given one reading.',
         'probability',
         0.001,
@@ -254,7 +255,25 @@ class LiveMapParameters:
         read_only=True,
     )
     live_p_free_no_echo: float = _param(
-        0.3, 'The same for a reading without echo, which may be a lost one.', 'probability', 0.001, 0.5, read_only=True
+        0.34, 'The same for a reading without echo, which may be a lost one.', 'probability', 0.001, 0.5, read_only=True
+    )
+    live_echo_width: float = _param(
+        0.2,
+        'Length of surface that an echo speaks for; of each cell of a longer arc it says as much less. With 1000 it '
+        'says all of every cell.',
+        'm',
+        0.01,
+        1000.0,
+        read_only=True,
+    )
+    live_directions: int = _param(
+        4,
+        'Directions of looking, over half a turn, whose readings are summed apart, so that readings at a slant do not '
+        "wipe out walls; 1 is the paper's one sum.",
+        'directions',
+        1,
+        16,
+        read_only=True,
     )
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..common.constants import arc_depth
+from ..common.constants import arc_depths
 from ..common.parameters import Parameters
 from ..common.readings import Floats, Readings
 from ..sensor.density import CUT
@@ -40,7 +40,7 @@ def _reach(
     """Return `reach_of` for numbers or for arrays, of which `highest` and `lowest` take the greater and the smaller."""
     cell = parameters.grid.resolution
     evaluated = z + CUT * highest(sigma, cell / 2)
-    return highest(lowest(evaluated, z_max), z + arc_depth(cell)) + 2 * cell
+    return highest(lowest(evaluated, z_max), z + arc_depths(cell)[1]) + 2 * cell
 
 
 Box = tuple[float, float, float, float]

@@ -14,7 +14,7 @@ from ..common.parameters import Parameters
 BYTES_A_READING = 400
 """What the search keeps for a reading without its pairs, twice over where arrays are sorted or grow."""
 
-BYTES_A_CELL = 100
+BYTES_A_CELL = 104
 """What a run on one thread takes for a cell at its peak, when the maps are collected: three maps, the evidence, the
 prior, and the sums that surface normals or passed readings are counted in."""
 

@@ -41,6 +41,9 @@ kernels come upon readings at random.
 
 Cones = NDArray[np.void]
 
+_SAMPLE = 16
+"""Of so many readings one gives a first box of all; a reading whose whole disc lies in there cannot make it larger."""
+
 UNIT = 2.0**-32
 """Cells; coordinates are rounded to it, which leaves 20 bits of float64 for the number of a cell."""
 
@@ -76,9 +79,7 @@ def grid_of(
     reach = reach_of(readings, effective_sigma(readings, model, grid.resolution))
     reach = reach + model.surface_offset * grid.resolution
     reach = np.maximum(reach, readings.z + beyond if beyond else 0.0)
-    boxes = cone_boxes(readings.x, readings.y, readings.yaw, readings.half_angle, reach)
-    box = (float(boxes[0].min()), float(boxes[1].max()), float(boxes[2].min()), float(boxes[3].max()))
-    made = Grid.covering(box, grid.resolution)
+    made = Grid.covering(_box(readings, reach), grid.resolution)
     made = made.union(within) if within else made
     check_size(made, grid)
     return made
@@ -98,6 +99,23 @@ def check_size(made: Grid, grid: GridParameters) -> None:
             f'cells of {grid.resolution} m, more than max_cells = {grid.max_cells}; check the poses, or raise '
             f'resolution or max_cells'
         )
+
+
+def _box(readings: Readings, reach: Floats) -> tuple[float, float, float, float]:
+    """Return left, right, bottom and top of all cones, metres; none but a few need be looked at closely."""
+    r = readings
+
+    def boxes(some: slice | NDArray[np.intp]) -> tuple[float, float, float, float]:
+        b = cone_boxes(r.x[some], r.y[some], r.yaw[some], r.half_angle[some], reach[some])
+        return float(b[0].min()), float(b[1].max()), float(b[2].min()), float(b[3].max())
+
+    left, right, bottom, top = boxes(slice(None, None, _SAMPLE))
+    inside = (r.x - reach >= left) & (r.x + reach <= right) & (r.y - reach >= bottom) & (r.y + reach <= top)
+    others = np.flatnonzero(~inside)
+    if not len(others):
+        return left, right, bottom, top
+    a = boxes(others)
+    return min(left, a[0]), max(right, a[1]), min(bottom, a[2]), max(top, a[3])
 
 
 def cone_table(readings: Readings, grid: Grid, model: ModelParameters) -> Cones:

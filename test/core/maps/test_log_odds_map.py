@@ -9,12 +9,14 @@ import numpy as np
 import pytest
 
 import naive
-from forward_grid_mapper.core.common.constants import ARC_DEPTH
+from forward_grid_mapper.core.common.constants import ARC
 from forward_grid_mapper.core.common.errors import InputError
-from forward_grid_mapper.core.common.grid import Grid
+from forward_grid_mapper.core.common.grid import Grid, cone_boxes
 from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.common.readings import Readings
-from forward_grid_mapper.core.maps.log_odds_map import LogOddsMap
+from forward_grid_mapper.core.maps.log_odds_kernel import direction_of
+from forward_grid_mapper.core.maps.log_odds_map import LogOddsMap, map_grid
+from forward_grid_mapper.core.sensor.cone_table import effective_sigma, reach_of
 from samples import random_readings
 
 AREA = Grid(0.1, -10, 5, 20, 16)
@@ -24,16 +26,73 @@ def logit(p: float) -> float:
     return math.log(p / (1 - p))
 
 
-@pytest.mark.parametrize('depth', [0.05, 0.12, 1.0])
-def test_log_odds_are_those_of_the_twin(depth: float) -> None:
-    readings = random_readings(np.random.default_rng(0), AREA, 80)
-    parameters = Parameters()
-    live = LogOddsMap(parameters, depth)
+PAPER = {'live_directions': 1, 'live_echo_width': 1000.0}
+
+
+@pytest.mark.parametrize('arc', [(0.05, 0.05), (0.12, 0.3), (1.0, 0.2)])
+@pytest.mark.parametrize('directions', [1, 2, 3, 4, 7])
+@pytest.mark.parametrize('width', [0.1, 1000.0])
+def test_log_odds_are_those_of_the_twin(arc: tuple[float, float], directions: int, width: float) -> None:
+    readings = random_readings(np.random.default_rng(directions), AREA, 80)
+    parameters = Parameters.from_flat({'live_directions': directions, 'live_echo_width': width})
+    live = LogOddsMap(parameters, arc)
     live.add(readings)
     p = parameters.live
     logits = logit(p.live_p_occupied), logit(p.live_p_free), logit(p.live_p_free_no_echo)
-    expected = naive.live_log_odds(readings, live.grid, depth, logits)
+    expected = naive.live_log_odds(readings, live.grid, arc, logits, width, directions)
     assert live.log_odds() == pytest.approx(expected, abs=1e-4, nan_ok=True)
+
+
+@pytest.mark.parametrize('half_angle', [1e-6, 0.02, 0.13, 0.6, 1.3, 1.55])
+@pytest.mark.parametrize('degrees', [0, 1e-9, 30, 45, 90, 135, 180, 200, 270, 359])
+def test_a_cone_along_the_lattice_has_the_cells_of_the_twin(half_angle: float, degrees: float) -> None:
+    live = LogOddsMap(Parameters())
+    for x, y in ((0.05, 0.05), (0.031, 0.072)):
+        live.clear()
+        live.add(Readings.from_columns(x=x, y=y, yaw=math.radians(degrees), z=[1.43], z_max=2.0, half_angle=half_angle))
+        pose = (x, y, math.radians(degrees))
+        # what lies on an edge may be in or out by rounding
+        most = set(naive.cone_cells(pose, half_angle, 1.43 + ARC[1], live.grid, 1e-6))
+        least = set(naive.cone_cells(pose, half_angle - 1e-9, 1.43 + ARC[1] - 1e-6, live.grid, -1e-6))
+        known = set(np.flatnonzero(np.isfinite(live.log_odds())).tolist())
+        assert least <= known <= most
+
+
+def test_readings_at_a_slant_leave_a_wall_that_others_meet_head_on() -> None:
+    # a wall along y, 1 m before the sensor
+    def seen(directions: int) -> float:
+        live = LogOddsMap(Parameters.from_flat({'live_directions': directions}))
+        beam = {'half_angle': 0.1, 'z_max': 5.0}
+        live.add(Readings.from_columns(x=0.05, y=0.05, yaw=0.0, z=[1.0] * 3, **beam))
+        live.add(Readings.from_columns(x=1.05, y=-0.95, yaw=math.pi / 2, z=[3.0] * 20, **beam))
+        row, column = live.grid.cells_of(np.array(1.05), np.array(0.05))
+        return float(live.probability()[row, column])
+
+    assert seen(1) < 0.01
+    assert seen(4) > 0.9
+
+
+def test_what_nobody_calls_occupied_is_as_free_as_all_readings_say() -> None:
+    one, four = (LogOddsMap(Parameters.from_flat({'live_directions': n})) for n in (1, 4))
+    yaw = np.linspace(0.0, 3.0, 9)
+    readings = Readings.from_columns(x=0.05, y=0.05, yaw=yaw, z=np.full(9, 2.0), z_max=2.0, half_angle=0.6)
+    for live in (one, four):
+        live.add(readings)
+    np.testing.assert_array_equal(one.log_odds(), four.log_odds())
+    assert np.nanmax(one.log_odds()) <= 0.0
+
+
+def test_a_long_arc_says_less_of_each_of_its_cells() -> None:
+    def on_axis(z: float) -> float:
+        live = LogOddsMap(Parameters())
+        live.add(Readings.from_columns(x=0.05, y=0.05, yaw=0.0, z=[z], z_max=9.0, half_angle=0.25))
+        row, column = live.grid.cells_of(np.array(0.05 + z), np.array(0.05))
+        return float(live.log_odds()[row, column])
+
+    whole = logit(Parameters().live.live_p_occupied)
+    assert on_axis(0.4) == pytest.approx(whole, abs=1e-5)
+    for z in (1.0, 2.0, 4.0):
+        assert on_axis(z) == pytest.approx(whole * 0.2 / (2 * z * math.sin(0.25)), abs=1e-5)
 
 
 def test_the_weight_falls_with_the_sine_of_the_angle_from_the_axis_to_the_edge() -> None:
@@ -80,7 +139,7 @@ def test_probabilities_are_unknown_exactly_where_no_cone_reaches() -> None:
     live.add(readings)
     known = np.isfinite(live.probability()).ravel()
     pose = (readings.x[0], readings.y[0], readings.yaw[0])
-    cells = naive.cone_cells(pose, readings.half_angle[0], readings.z[0] + ARC_DEPTH, live.grid)
+    cells = naive.cone_cells(pose, readings.half_angle[0], readings.z[0] + ARC[1], live.grid)
     assert set(np.flatnonzero(known).tolist()) == set(cells)
 
 
@@ -127,7 +186,7 @@ def test_a_deep_arc_does_not_depend_on_the_order() -> None:
     readings = random_readings(rng, AREA, 40)
     maps = []
     for order in (np.arange(40), np.arange(40)[::-1]):
-        live = LogOddsMap(Parameters(), 3.0)
+        live = LogOddsMap(Parameters(), (3.0, 3.0))
         for k in order:
             live.add(readings.select(np.array([k])))
         maps.append(live.log_odds())
@@ -174,3 +233,23 @@ def test_maps_are_added_as_if_their_readings_were() -> None:
         rest.add(readings.select(slice(cut, 30)))
         part.add_map(rest)
         np.testing.assert_array_equal(part.log_odds(whole.grid), whole.log_odds())
+
+
+@pytest.mark.parametrize('count', [1, 2, 16, 17, 500])
+def test_the_grid_is_that_of_the_boxes_of_all_cones(count: int) -> None:
+    rng = np.random.default_rng(count)
+    for _ in range(10):
+        readings = random_readings(rng, Grid(0.1, -100, -50, 200, 100), count)
+        p = Parameters()
+        reach = np.maximum(reach_of(readings, effective_sigma(readings, p.model, 0.1)) + 0.03, readings.z + ARC[1])
+        b = cone_boxes(readings.x, readings.y, readings.yaw, readings.half_angle, reach)
+        assert map_grid(readings, p) == Grid.covering((b[0].min(), b[1].max(), b[2].min(), b[3].max()), 0.1)
+
+
+@pytest.mark.parametrize('directions', [1, 2, 4, 5])
+def test_looking_along_a_line_either_way_is_one_direction(directions: int) -> None:
+    yaw = np.random.default_rng(0).uniform(-9.0, 9.0, 300)
+    for angle in yaw:
+        k = direction_of(angle, directions)
+        assert direction_of(angle + math.pi, directions) == k
+        assert abs(math.remainder(angle - k * math.pi / directions, math.pi)) <= math.pi / directions / 2 + 1e-9

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from forward_grid_mapper.core.common.constants import arc_depth
+from forward_grid_mapper.core.common.constants import arc_depths
 from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.common.readings import Readings
 from forward_grid_mapper.core.messages.map_extent import FARTHEST, LARGEST_CONE, MapExtent, reach_of
@@ -85,7 +85,7 @@ def test_restored_readings_are_those_that_were_admitted() -> None:
 
 def test_reach_is_that_of_the_echo_and_not_of_the_sensor() -> None:
     assert reach_of(measured(1.0, 3e38), PARAMETERS) < 2.0
-    assert reach_of(measured(4.0, 4.0), PARAMETERS) == pytest.approx(4.0 + max(0.05, 0.05) + 0.2)
+    assert reach_of(measured(4.0, 4.0), PARAMETERS) == pytest.approx(4.0 + 0.1 + 0.2)
 
 
 def test_how_far_a_reading_reaches() -> None:
@@ -93,7 +93,7 @@ def test_how_far_a_reading_reaches() -> None:
     cell = PARAMETERS.grid.resolution
     sigma = PARAMETERS.model.sigma
     assert reach_of(measured(1.0, 9.0), PARAMETERS) == pytest.approx(1.0 + CUT * sigma + 2 * cell)
-    assert reach_of(measured(4.0, 4.0), PARAMETERS) == pytest.approx(4.0 + arc_depth(cell) + 2 * cell)
+    assert reach_of(measured(4.0, 4.0), PARAMETERS) == pytest.approx(4.0 + arc_depths(cell)[1] + 2 * cell)
     stated = measure(RangeMessage(0, 'sonar', 1.0, 0.1, 9.0, 0.3, 0.25), PARAMETERS.association)
     assert isinstance(stated, Measurement)
     assert reach_of(stated, PARAMETERS) == pytest.approx(1.0 + CUT * 0.5 + 2 * cell)

@@ -1,0 +1,220 @@
+"""The kernel of the live map: adds what readings say to the cells of their cones, apart for each direction of looking.
+
+A plane holds the log-odds from the readings of one direction. Planes of directions nearer to the y axis are stored with
+x and y exchanged, so that the cells of a cone lie in few long rows whatever its direction.
+
+A cell that no reading touched holds `UNTOUCHED`. It is −0, to which adding anything, and +0 too, gives what was added;
+so the kernel need not ask. Increments are rounded to `QUANTUM`, so that float64 sums of them are exact.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..runtime.jit import kernel
+from ..sensor.cone import HALF_WIDTH, axis_run, make_cone
+from ..sensor.cone_table import UNIT
+
+QUANTUM = 2.0**-20
+_ROUNDER = 1.5 * 2.0**52 * QUANTUM
+"""Added and taken off again, it rounds to `QUANTUM`: so large that float64 has no smaller steps there."""
+
+UNTOUCHED = -0.0
+
+PADDING = 3
+"""Cells behind the last one of a plane, since the kernel works on four at a time; they stay untouched."""
+
+_HALF_DIAGONAL = math.sqrt(0.5)
+
+_LEVEL = 1e-300
+"""Instead of the height of an edge along a row, which has none."""
+
+
+class Beams(NamedTuple):
+    """The columns of `Readings` that the kernel needs, float64, shape (N,), metres and radians."""
+
+    x: NDArray[np.float64]
+    y: NDArray[np.float64]
+    yaw: NDArray[np.float64]
+    half_angle: NDArray[np.float64]
+    z: NDArray[np.float64]
+    z_max: NDArray[np.float64]
+
+
+class InverseModel(NamedTuple):
+    """What a reading says, in nats, of a cell on its axis; lengths in cells.
+
+    `occupied` is of the arc of an echo, `before` its range to `behind` it, where the arc is no longer than `width`.
+    """
+
+    occupied: float
+    free: float
+    free_no_echo: float
+    before: float
+    behind: float
+    width: float
+
+
+class Lattice(NamedTuple):
+    """The stored grid: edge of a cell in metres, lattice indices of the lower left cell, and columns and rows."""
+
+    resolution: float
+    column: int
+    row: int
+    width: int
+    height: int
+
+
+class _Ends(NamedTuple):
+    """What a reading says by the distance of a cell: squares of radii in cells, nats."""
+
+    free2: float
+    reach2: float
+    free: float
+    occupied: float
+
+
+@kernel
+def direction_of(yaw: float, directions: int) -> int:
+    """Return which of so many directions, even over half a turn, is nearest to looking along `yaw` or against it."""
+    return int(math.floor(yaw * directions / math.pi + 0.5)) % directions
+
+
+@kernel
+def is_steep(direction: int, directions: int) -> bool:
+    """Return whether the plane of a direction has x and y exchanged."""
+    return directions < 4 * direction < 3 * directions
+
+
+@kernel
+def _lattice_place(metres: float, resolution: float) -> tuple[int, float]:
+    """Return the lattice index of the cell of a coordinate, and how far into it that is, cells.
+
+    Cones are walked from their own cell on, so that no rounding depends on where the grid has its corner.
+    """
+    cells = np.rint(metres * (1.0 / resolution) / UNIT) * UNIT
+    cell = math.floor(cells)
+    return int(cell), cells - cell
+
+
+@kernel
+def _add_run(
+    plane: Any, cells: tuple[int, int], offset: tuple[float, float], beam: tuple[float, float, float], ends: _Ends
+) -> None:
+    """Add the increments of a run of cells in one row.
+
+    Parameters
+    ----------
+    plane : float64
+        Log-odds of all cells, row after row.
+    cells
+        The first cell, and the last one plus one.
+    offset
+        From the sensor to the centre of the first cell, cells.
+    beam
+        Unit vector of the axis, squared sine of the half angle.
+    ends
+    """
+    first, end = cells
+    u0, v = offset
+    axis_x, axis_y, sine2 = beam
+    free2, reach2, free, occupied = ends
+    n = end - first
+    # whole fours, which the compiler makes vector instructions of: rows are too short for the loops that it would make
+    for k in range((n + 3) & ~3):
+        u = u0 + k
+        d2 = u * u + v * v
+        across = axis_x * v - axis_y * u
+        weight = max(1.0 - across * across / max(sine2 * d2, HALF_WIDTH * HALF_WIDTH), 0.0)
+        gain = free if d2 < free2 else occupied
+        step = (weight * gain + _ROUNDER) - _ROUNDER
+        plane[np.uint64(first + k)] += step if (d2 <= reach2) & (k < n) else UNTOUCHED
+
+
+class _Edge(NamedTuple):
+    """An edge of a cone: in a row v above the apex, cells lie from v * slope + low to v * slope + high beside it."""
+
+    slope: float
+    low: float
+    high: float
+
+
+@kernel
+def _edge(x: float, y: float) -> _Edge:
+    """Return the edge along the unit vector (x, y) of a cone on its left."""
+    slope = x / (y if y != 0.0 else -math.copysign(_LEVEL, x))
+    return _Edge(slope, -math.inf, 0.0) if y > 0.0 or (y == 0.0 and x < 0.0) else _Edge(slope, 0.0, math.inf)
+
+
+@kernel
+def _wedge_run(edges: tuple[_Edge, _Edge], reach2: float, x: float, v: float) -> tuple[int, int]:
+    """Return the first and last column of a row whose centres lie in the sector, as `cone.wedge_run` does."""
+    right, left = edges
+    half = math.sqrt(max(reach2 - v * v, 0.0))
+    a, b = v * right.slope, v * left.slope
+    low = max(-half, a + right.low, b + left.low)
+    high = min(half, a + right.high, b + left.high)
+    if low > high:
+        return 0, -1
+    return int(math.ceil(low + x - 0.5)), int(math.floor(high + x - 0.5))
+
+
+@kernel
+def add_readings(beams: Beams, model: InverseModel, lattice: Lattice, planes: Any) -> None:
+    """Add what every reading says.
+
+    Parameters
+    ----------
+    beams : Beams
+        Of readings all of whose cells lie on the lattice.
+    model : InverseModel
+    lattice : Lattice
+    planes : float64, shape (directions, width * height + `PADDING`)
+    """
+    directions = len(planes)
+    half_angle, sine, cosine = -1.0, 0.0, 1.0
+    for t in range(len(beams.x)):
+        if beams.half_angle[t] != half_angle:
+            half_angle = beams.half_angle[t]
+            sine, cosine = math.sin(half_angle), math.cos(half_angle)
+        column, x = _lattice_place(beams.x[t], lattice.resolution)
+        row, y = _lattice_place(beams.y[t], lattice.resolution)
+        column, row = column - lattice.column, row - lattice.row
+        axis_x, axis_y = math.cos(beams.yaw[t]), math.sin(beams.yaw[t])
+        width, height = lattice.width, lattice.height
+        k = direction_of(beams.yaw[t], directions)
+        if is_steep(k, directions):
+            x, y, axis_x, axis_y = y, x, axis_y, axis_x
+            column, row, width, height = row, column, height, width
+        z = beams.z[t] / lattice.resolution
+        if beams.z[t] < beams.z_max[t]:
+            reach, free = z + model.behind, max(z - model.before, 0.0)
+            arc = model.width / max(2.0 * sine * z, model.width)
+            ends = _Ends(free * free, reach * reach, model.free, model.occupied * arc)
+        else:
+            reach = z
+            ends = _Ends(math.inf, reach * reach, model.free_no_echo, 0.0)
+        axis, half = (axis_x, axis_y), (sine, cosine)
+        cone = make_cone(x, y, axis, half, (reach, 0.0))
+        # farther off, the centres of all cells that the axis crosses are within the half angle
+        thin = (_HALF_DIAGONAL * cosine + _HALF_DIAGONAL * sine) / sine + 0.1
+        near = make_cone(x, y, axis, half, (min(reach, thin), 0.0))
+        edges = _edge(cone.right_x, cone.right_y), _edge(-cone.left_x, -cone.left_y)
+        beam, plane = (axis_x, axis_y, sine * sine), planes[k]
+        for across in range(max(cone.bottom, -row), min(cone.top, height - 1 - row) + 1):
+            v, begin = across + 0.5 - y, (row + across) * width + column
+            first, last = _wedge_run(edges, ends.reach2, x, v)
+            first, last = max(first, -column), min(last, width - 1 - column)
+            if near.bottom <= across <= near.top:
+                a, b = axis_run(near, across)
+                a, b = max(a, -column), min(b, width - 1 - column)
+                if a <= b and (last < first or a > last + 1 or first > b + 1):
+                    _add_run(plane, (begin + a, begin + b + 1), (a + 0.5 - x, v), beam, ends)
+                elif a <= b:
+                    first, last = min(a, first), max(b, last)
+            if first <= last:
+                _add_run(plane, (begin + first, begin + last + 1), (first + 0.5 - x, v), beam, ends)
