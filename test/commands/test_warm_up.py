@@ -32,14 +32,14 @@ def signatures():
     return {
         (name, kernel, str(types))
         for name, module in list(sys.modules.items())
-        if name.startswith('forward_grid_mapper.core.trajectory')
+        if name.startswith('forward_grid_mapper.core.')
         for kernel, value in vars(module).items()
         for types in getattr(value, 'signatures', None) or []
     }
 """
 
 
-def test_a_trajectory_needs_no_more_kernels() -> None:
+def test_a_trajectory_and_its_maps_need_no_more_kernels() -> None:
     program = f"""{SIGNATURES}
 warm_up()
 before = signatures()
@@ -53,6 +53,8 @@ from forward_grid_mapper.simulation.sonar import NOISY, sonar_ring
 from forward_grid_mapper.simulation.world import building_tour, building_world
 made = with_drift(drive(building_world(), building_tour()[:10], 0.15, sonar_ring(16), NOISY, seed=3), LEVELS['high'], 6)
 poses = np.array([m.pose for m in made.odometry], float)
+from forward_grid_mapper.core.mapping import Mapper
+Mapper(Parameters()).run(made.readings)
 found = Refiner(Parameters()).run(made.readings, Odometry.of(np.array([m.stamp for m in made.odometry]), poses))
 print(found.accepted, len(before) > 2, signatures() - before)
 """

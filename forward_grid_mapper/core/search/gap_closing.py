@@ -170,6 +170,25 @@ def _flip_sets(s: State, prior: Prior, least: Least, cells: Any, starts: Any, ke
         gains[k] = gain
 
 
+@kernel
+def _close(s: State, prior: Prior, least: Least, gaps: Any, paths: Any, starts: Any, gains: Any) -> None:
+    """Close gaps of one length in turn, those that still are some and still gain.
+
+    Parameters
+    ----------
+    gaps, paths
+        Those of `_list_gaps`, in the order in which they are closed.
+    starts : int64, shape (2,)
+        0 and the cells of a gap.
+    gains : float64, shape (gaps,)
+        Filled as by `_flip_sets`.
+    """
+    for k in range(len(gaps)):
+        gains[k] = 0.0
+        if _is_gap(s, prior, gaps[k], paths[k]):
+            _flip_sets(s, prior, least, paths[k], starts, True, gains[k : k + 1])
+
+
 def _gain_of_sets(
     s: State, prior: Prior, least: Least, cells: NDArray[np.int64], starts: NDArray[np.int64], keep: bool
 ) -> Floats:
@@ -206,11 +225,11 @@ def close_gaps(s: State, prior: Prior, least: Least, cells: NDArray[np.int64], l
     for n in range(2, longest + 1):
         gaps, paths = _gaps(s, prior, cells, n)
         gains = _gain_of_sets(s, prior, least, paths.ravel(), np.arange(len(gaps) + 1) * (n - 1), False)
-        for k in np.argsort(-gains, kind='stable')[: int((gains > 0.0).sum())]:
-            if _is_gap(s, prior, gaps[k], paths[k]):
-                gain = float(_gain_of_sets(s, prior, least, paths[k], np.array([0, n - 1]), True)[0])
-                flips += (n - 1) * (gain > 0.0)
-                total += gain
+        order = np.argsort(-gains, kind='stable')[: int((gains > 0.0).sum())]
+        gains = np.empty(len(order))
+        _close(s, prior, least, gaps[order], paths[order], np.array([0, n - 1]), gains)
+        flips += (n - 1) * int((gains > 0.0).sum())
+        total += float(gains.sum())
     return flips, total
 
 
