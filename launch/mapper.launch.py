@@ -134,6 +134,7 @@ def start(context):
                 for name in MAPS
                 for ending in ('', '_updates')
             ),
+            (f'/{PACKAGE}/path', f'{PACKAGE}/path'),
             ('/odom', LaunchConfiguration('odom')),
         ],
         arguments=['-d', LaunchConfiguration('rviz_config')],
