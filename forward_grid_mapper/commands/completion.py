@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
-import argparse
 import importlib
 import os
 from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    import argparse
 
 ASKED = '_ARGCOMPLETE'
 """Set by the shell while it asks for completions."""
@@ -32,6 +35,9 @@ def complete(commands: Mapping[str, tuple[str, str]], package: str) -> None:
 
 def parser_of_all(commands: Mapping[str, tuple[str, str]], package: str, words: list[str]) -> argparse.ArgumentParser:
     """Return a parser with all commands, of which those among `words` have their options."""
+    # it is not there yet when signals get their handlers
+    import argparse
+
     made = argparse.ArgumentParser('forward_grid_mapper')
     made.add_argument('--version', action='store_true')
     below = made.add_subparsers()

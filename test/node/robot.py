@@ -115,7 +115,7 @@ class Robot:
         while time.monotonic() < end:
             self.executor.spin_once(timeout_sec=0.02)
 
-    def until(self, condition: Callable[[], Any], seconds: float = 60.0, what: str = '') -> Any:
+    def until(self, condition: Callable[[], Any], seconds: float = 200.0, what: str = '') -> Any:
         end = time.monotonic() + seconds
         while not (value := condition()):
             assert time.monotonic() < end, f'it did not happen: {what or condition}'
@@ -165,7 +165,7 @@ class Robot:
 
         self.until(taken, 30.0, f'{self.sent} readings received')
 
-    def call(self, service: str, kind: Any = Trigger, seconds: float = 60.0, **fields: Any) -> Any:
+    def call(self, service: str, kind: Any = Trigger, seconds: float = 200.0, **fields: Any) -> Any:
         return self.until(self.ask(service, kind, **fields).result, seconds, f'{service} answers')
 
     def ask(self, service: str, kind: Any = Trigger, **fields: Any) -> Any:
