@@ -6,7 +6,6 @@ Signals get their handlers before the commands' modules are imported, which take
 
 from __future__ import annotations
 
-import difflib
 import importlib
 import os
 import sys
@@ -143,6 +142,8 @@ def _main() -> int:
         print(usage)
         return 0
     if given:
+        import difflib
+
         near = difflib.get_close_matches(given, COMMANDS, n=1)
         hint = f'; did you mean {near[0]}?' if near else ''
         print(f'{program}: error: there is no command {given!r}{hint}\n', file=sys.stderr)
