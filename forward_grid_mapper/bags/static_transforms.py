@@ -94,7 +94,7 @@ class StaticTransforms:
             side = 'up' if pose[2, 0] > 0 else 'down'
             raise SteepSensorError(
                 f'Sensor {sensor_frame!r} looks {side}, more than {math.degrees(STEEPEST):.0f}° out of the plane of '
-                f'{base_frame!r}; leave its topic out or fix its transform (the beam goes along x).'
+                f'{base_frame!r}; fix its transform (the beam goes along x), or leave the sensor out.'
             )
         return mount
 

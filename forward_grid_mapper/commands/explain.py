@@ -126,15 +126,22 @@ def explanation(maps: MapArchive, readings: Readings, found: CellEvidence, shown
     count = len(found.readings)
     yield f'  {_nats(found.data)} nats from {count} readings, {_nats(found.prior)} from the prior of walls'
     groups = (
-        ('end here', found.ends_here),
-        ('reach farther', ~found.ends_here & ~found.silent & (_range(readings, found) > found.distance)),
-        ('heard no echo', found.silent),
-        ('end before it', ~found.ends_here & ~found.silent & (_range(readings, found) <= found.distance)),
+        (('end here', 'ends here'), found.ends_here),
+        (
+            ('reach farther', 'reaches farther'),
+            ~found.ends_here & ~found.silent & (_range(readings, found) > found.distance),
+        ),
+        (('heard no echo', 'heard no echo'), found.silent),
+        (
+            ('end before it', 'ends before it'),
+            ~found.ends_here & ~found.silent & (_range(readings, found) <= found.distance),
+        ),
     )
-    for text, mask in groups:
+    for (several, one), mask in groups:
         if mask.any():
             who = _sensors(readings, found.readings[mask])
-            yield f'    {_nats(found.nats[mask].sum()):>7}  {int(mask.sum())} readings {text}: {who}'
+            said = f'reading {one}' if mask.sum() == 1 else f'readings {several}'
+            yield f'    {_nats(found.nats[mask].sum()):>7}  {int(mask.sum())} {said}: {who}'
     if state == 1:
         yield f'  {_nats(found.wall)} nats for the cell with its occupied neighbours, which share their readings'
     yield f'  {_what_decides(maps, found, state)}'

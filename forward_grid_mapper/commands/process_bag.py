@@ -38,6 +38,9 @@ from .options import (
     chosen_part,
 )
 
+SMALLEST_TILE = 1.0
+"""Metres: below, a tile is little more than its margin."""
+
 COMMAND = 'process_bag'
 
 
@@ -92,8 +95,8 @@ def process(options: argparse.Namespace) -> int:
     if options.learn < 0:
         raise ParameterError('--learn: the number of rounds must not be negative')
     part = chosen_part(options)
-    if options.tiles is not None and not (math.isfinite(options.tiles) and options.tiles > 0):
-        raise ParameterError(f'--tiles {options.tiles:g}: give the edge of a tile in metres, above 0')
+    if options.tiles is not None and not (math.isfinite(options.tiles) and options.tiles >= SMALLEST_TILE):
+        raise ParameterError(f'--tiles {options.tiles:g}: give the edge of a tile in metres, {SMALLEST_TILE:g} or more')
     mapper = Mapper if options.tiles is None else partial(TiledMapper, size=options.tiles)
     output = Path(options.output) if options.output else free_name(Path.cwd(), f'{_stem(options.bags)}_maps')
     begin = time.perf_counter()

@@ -68,5 +68,5 @@ def fit_warnings(maps: MapSet, names: Sequence[str]) -> list[str]:
     return [
         f'{who}: by itself, each explains its readings better by so many nats a reading. Is its odometry in the same '
         f'frame as that of the others (an odometry of wheels begins anew at every start), or was the place rearranged? '
-        f'Localise all drives in one map, or map this one alone'
+        f'Localise all drives in one map, or map such a drive alone'
     ]

@@ -77,7 +77,8 @@ def compose(
     ]
     if reference is not None:
         named.append(('Reference', reference[0], _probability(reference[1])))
-    view = view_of(maps, np.concatenate([path_xy, odometry_xy]))
+    # odometry may lead far away from the map, which would be drawn small
+    view = view_of(maps, path_xy)
     panels = [Panel(name, *_crop(grid, values, view)) for name, grid, values in named]
     return Picture(title, figures_of(maps), panels, view, 1, path_xy, _unexplained_ends(maps), odometry_xy)
 

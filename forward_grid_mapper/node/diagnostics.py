@@ -70,7 +70,6 @@ class Health:
             **{f'odometry rejected: {reason}': count for reason, count in sorted(associator.odometry_rejected.items())},
             'clock jumps back': associator.time_jumps,
             'frames without a pose': listed(associator.unknown_frames),
-            'map frame': associator.map_frame,
             'map size': f'{grid.width} x {grid.height} cells of {grid.resolution} m',
             **extra,
         }
@@ -99,9 +98,9 @@ class Health:
         if map_frame:
             return DiagnosticStatus.WARN, map_frame
         if silent_odometry > SILENCE:
-            return DiagnosticStatus.WARN, f'no odometry for {silent_odometry:.0f} s'
+            return DiagnosticStatus.WARN, f'no odometry for {silent_odometry:.0f} s{_and_no_pose(associator)}'
         if silent_ranges > SILENCE:
-            return DiagnosticStatus.WARN, f'no Range for {silent_ranges:.0f} s'
+            return DiagnosticStatus.WARN, f'no Range for {silent_ranges:.0f} s{_and_no_pose(associator)}'
         if associator.unknown_frames and new_rejected:
             return DiagnosticStatus.WARN, f'no pose on the robot for {listed(associator.unknown_frames)}'
         if new and new_rejected > 0.2 * new:
@@ -137,6 +136,11 @@ def add_faults(made: DiagnosticStatus, faults: list[str]) -> None:
         well = made.level == DiagnosticStatus.OK
         made.level = max(made.level, DiagnosticStatus.WARN)
         made.message = '; '.join(faults if well else [made.message, *faults])
+
+
+def _and_no_pose(associator: PoseAssociator) -> str:
+    """Say which sensors have no pose, which stays wrong when messages end."""
+    return f'; no pose on the robot for {listed(associator.unknown_frames)}' if associator.unknown_frames else ''
 
 
 def listed(frames: Collection[str]) -> str:

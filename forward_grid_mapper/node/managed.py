@@ -34,6 +34,9 @@ class ManagedNode(Base):
         super().__init__(name, **options)
         # what the node itself is made of stays
         self._created.clear()
+        for service in self.services:
+            if service.srv_name.endswith('/change_state'):
+                service.callback = self._answered(service.callback)
 
     # for subclasses
 
@@ -124,6 +127,19 @@ class ManagedNode(Base):
                 expected = isinstance(error, (MapperError, ValueError)) or type(error).__name__ == 'RCLError'
                 self.get_logger().error(of_ros(error) if expected else traceback.format_exc())
             return TransitionCallbackReturn.FAILURE
+
+    def _answered(self, change: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
+        """Have a transition that the state does not admit answered, which rclpy's service leaves without an answer."""
+
+        def answer(request: Any, response: Any) -> Any:
+            try:
+                return change(request, response)
+            except Exception as error:  # a class of rclpy's C extension
+                self.get_logger().warning(f'a transition was refused: {of_ros(error)}')
+                response.success = False
+                return response
+
+        return answer
 
     def _undo(self) -> None:
         """End the work, and destroy what was created for it."""

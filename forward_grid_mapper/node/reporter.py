@@ -57,9 +57,9 @@ class Reporter:
         """Publish the diagnostics of now."""
         self._name_frames()
         name = self._node.get_fully_qualified_name().lstrip('/')
-        extra = (
-            {'odometry without a transform to map_frame': self._map_frame.dropped} if self._map_frame.dropped else {}
-        )
+        extra: dict[str, Any] = {'map frame': self._trajectory.frame}
+        if self._map_frame.dropped:
+            extra['odometry without a transform to map_frame'] = self._map_frame.dropped
         statuses = self._health.statuses(
             name,
             self._intake,

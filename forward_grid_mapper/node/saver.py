@@ -48,6 +48,8 @@ class Saver:
 
     def save_maps(self, reply: Reply) -> None:
         """Answer the service; where EM has not run, run it first."""
+        if self._em.maps is None and self._em.current is not None:
+            self._logger.info('save_maps waits for the end of EM')
         self._em.when_there_are_maps(lambda outcome: self._save(outcome, reply))
 
     def _save(self, outcome: Outcome, reply: Reply) -> None:

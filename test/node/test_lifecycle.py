@@ -74,6 +74,15 @@ def later(robot: Robot) -> None:
     robot.until(lambda: 'readings' in robot.diagnostics)
 
 
+def test_a_transition_that_the_state_does_not_admit_is_answered(start: Any, robot: Robot, manager: Manager) -> None:
+    node = start(*WAITING, ready=False)
+    node.wait_for('unconfigured:')
+    for transition in (Transition.TRANSITION_ACTIVATE, 99):
+        assert not manager.change(transition)
+    node.wait_for('a transition was refused:')
+    manager.start_up()
+
+
 def test_a_manager_starts_pauses_and_ends_it(start: Any, robot: Robot, manager: Manager) -> None:
     node = start(*WAITING, ready=False)
     node.wait_for('unconfigured:')

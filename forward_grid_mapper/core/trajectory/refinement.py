@@ -98,7 +98,10 @@ LEAST_CERTAINTY = 0.9
 LEAST_MOVED = 0.15
 """Metres that odometry must be off, in the root mean square: about the error of what takes its place."""
 
-NO_WALLS = 'no walls at right angles to each other tell the heading: the drift of the yaw cannot be told'
+NO_WALLS = (
+    'echoes do not agree on the directions of walls, so the drift of the yaw cannot be told: it takes walls at right '
+    'angles to each other beside the robot, and odometry whose yaw holds for a few metres'
+)
 
 Watch = Callable[[str, float], None]
 """Receives what is going on, and how much of it is done, from 0 to 1."""
