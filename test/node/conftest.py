@@ -14,20 +14,25 @@ import pytest
 sys.path.insert(0, str(Path(__file__).parent))
 
 
-def _first_domain() -> int:
-    """A domain to begin with: another one in each run of the tests, and far from those of a worker beside this one."""
-    worker = os.environ.get('PYTEST_XDIST_WORKER', 'gw0').removeprefix('gw')
-    count = int(os.environ.get('PYTEST_XDIST_WORKER_COUNT', '1'))
-    run = os.getppid() if count > 1 else os.getpid()
-    return run % 60 + int(worker) * (100 // count)
+LAST_DOMAIN = 96
+"""Beyond are those of other rooms' tests; ports of domains above 101 may be in use."""
 
 
-_domains = itertools.count(_first_domain())
+def _domains_of_this_process() -> Iterator[int]:
+    """Yield domains that no process beside this one has, beginning with another one in each run of the tests."""
+    worker = int(os.environ.get('PYTEST_XDIST_WORKER', 'gw0').removeprefix('gw'))
+    count = max(int(os.environ.get('PYTEST_XDIST_WORKER_COUNT', '1')), 1)
+    own = max(LAST_DOMAIN // count, 1)
+    for k in itertools.count(os.getpid()):
+        yield 1 + (own * worker + k % own) % LAST_DOMAIN
+
+
+_domains = _domains_of_this_process()
 
 
 @pytest.fixture
 def domain() -> int:
-    return 1 + next(_domains) % 100
+    return next(_domains)
 
 
 @pytest.fixture
