@@ -148,6 +148,12 @@ class ManagedNode(Base):
             destroy, entity = self._created.pop()
             destroy(entity)
 
+    def destroy_node(self) -> None:
+        """Destroy the node; its state machine too, which would keep it in the middleware."""
+        super().destroy_node()
+        # rclpy has no call for that
+        self.__dict__.pop('_state_machine', None)
+
     # what is created is noted
 
     def create_publisher(self, *arguments: Any, **options: Any) -> Any:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import re
 import subprocess
 import sys
+from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +17,7 @@ pytest.importorskip('lifecycle_msgs', reason='the tests of the lifecycle need li
 
 import yaml
 from fault_samples import circle
+from inside import Inside
 from lifecycle_msgs.msg import State, Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 from robot import LATCHED, MAPS, Robot, environment
@@ -61,6 +64,8 @@ def manager(robot: Robot) -> Manager:
 
 
 def published(robot: Robot) -> set[str]:
+    # services answer before the graph is known
+    robot.until(lambda: ('forward_grid_mapper', '/') in robot.node.get_node_names_and_namespaces())
     return {name for name, _ in robot.node.get_publisher_names_and_types_by_node('forward_grid_mapper', '/')}
 
 
@@ -212,3 +217,20 @@ def test_the_page_gives_parameters_of_a_lifecycle_manager() -> None:
     # both cannot start it
     assert 'autostart:=false' in PAGE.read_text(encoding='utf-8')
     assert find('autostart').default is True
+
+
+def sockets() -> int:
+    found = 0
+    for descriptor in Path('/proc/self/fd').iterdir():
+        with suppress(OSError):
+            found += str(descriptor.readlink()).startswith('socket:')
+    return found
+
+
+@pytest.mark.skipif(not Path('/proc/self/fd').is_dir(), reason='there is no /proc')
+def test_a_node_that_was_destroyed_leaves_the_middleware(inside: Callable[..., Inside]) -> None:
+    # the first one of a process opens what all of them share
+    inside().start().close()
+    before = sockets()
+    inside().start().close()
+    assert sockets() <= before
