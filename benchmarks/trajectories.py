@@ -166,7 +166,7 @@ def main() -> None:
     parser.add_argument('--robot', choices=[*ROBOTS], action='append')
     parser.add_argument('--level', choices=['none', *LEVELS], action='append')
     parser.add_argument('--seeds', type=int, default=5)
-    parser.add_argument('--first-seed', type=int, default=0, help='0 to 9 were tuned on')
+    parser.add_argument('--first-seed', type=int, default=0, help='0 to 9, 20 and 21 were tuned on')
     parser.add_argument('--shared', type=Path, help='folder of recordings with corrected odometry, instead')
     options = parser.parse_args()
     if options.shared:

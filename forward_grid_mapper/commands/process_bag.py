@@ -77,8 +77,7 @@ def parser() -> argparse.ArgumentParser:
         '--tiles',
         type=float,
         metavar='M',
-        help='map in tiles of that edge in metres, one after the other, which takes less memory; 20 or more for sonars '
-        'that reach 5 m',
+        help='map in tiles of that edge in metres, one after the other; 20 or more for sonars that reach 5 m',
     )
     made.add_argument('--bag', dest='write_bag', action='store_true', help='also write the maps as a bag (mcap)')
     made.add_argument('-q', '--quiet', action='store_true', help='print nothing but errors and the folder')
