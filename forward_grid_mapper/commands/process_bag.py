@@ -11,21 +11,18 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from ..core.common.errors import InputError, ParameterError
-from ..core.common.parameters import Parameters
+from ..core.common.errors import ParameterError
 from ..core.joint_learning import map_and_learn
 from ..core.mapping import Mapper
 from ..core.maps.map_set import MapSet
 from ..core.tiled_mapping import TiledMapper
-from ..core.trajectory.refinement import Refinement, Refiner
-from ..core.trajectory.windows import Odometry
 from ..files.map_files import occupancy_values
 from ..files.output_folder import free_name, output_folder, readable
 from ..files.parameter_file import parse_sensor
 from ..files.report import json_text, report_text
 from ..files.results import write_results
-from ..files.trajectory_text import trajectory_data, tum_text
 from ..recordings.drives import Drives, read_drives
+from ..recordings.refined import refine_drives
 from .console import Ticker, run
 from .desktop import show
 from .options import (
@@ -114,27 +111,22 @@ def process(options: argparse.Namespace) -> int:
         source = drives.source
         source['warnings'] += ignored
         read = time.perf_counter() - begin
-        refined = refine(drives, parameters, ticker) if options.refine_poses else None
+        refined = refine_drives(drives, parameters, ticker.refining) if options.refine_poses else None
         seconds = {'reading the bag' if len(drives.drives) == 1 else 'reading the bags': read}
         if refined is not None:
             seconds['trajectory'] = time.perf_counter() - begin - read
-        moved = refined is not None and refined.accepted
-        readings = refined.readings if refined is not None else drives.readings
-        maps = map_and_learn(readings, parameters, options.learn, ticker.mapping, mapper)
-        if not moved:
-            maps = drives.with_live(maps)
+        along = drives if refined is None else refined
+        maps = along.with_live(map_and_learn(along.readings, parameters, options.learn, ticker.mapping, mapper))
         maps.statistics['seconds'] = {**seconds, **maps.statistics['seconds']}
         ticker.say('writing')
         if options.learn:
             source['warnings'].append(_learned(maps))
         if not maps.statistics['converged']:
             source['warnings'].append('the search ended at max_iterations before it converged; raise max_iterations')
-        path, extras, before = drives.path_xy, {}, None
-        if refined is not None and moved:
-            path, before = refined.trajectory.pose[:, :2], drives.path_xy
-            odometry = Odometry.of(*drives.drives[0].associator.odometry)
-            extras = {'trajectory.tum': tum_text(refined.trajectory), 'odometry.tum': tum_text(odometry)}
-        report = write_results(folder, maps, source, path, _title(drives), extras=extras, odometry_xy=before)
+        more: dict[str, Any] = {}
+        if refined is not None:
+            more = {'extras': refined.texts, 'odometry_xy': refined.odometry_xy}
+        report = write_results(folder, maps, source, along.path_xy, _title(drives), **more)
         if options.write_bag:
             _write_bag(folder / 'maps.mcap_bag', maps, drives)
     tell(options, report, output)
@@ -165,26 +157,6 @@ def _stem(words: Sequence[str]) -> str:
 def _title(drives: Drives) -> str:
     first = readable(Path(*Path(drives.drives[0].source['bag']).resolve().parts[-2:]))
     return first if len(drives.drives) == 1 else f'{first} and {len(drives.drives) - 1} more'
-
-
-def refine(drives: Drives, parameters: Parameters, ticker: Ticker) -> Refinement:
-    """Return what becomes of the drive's trajectory, and note it in the drive's report.
-
-    Raises
-    ------
-    InputError
-        If there are several drives.
-    """
-    if len(drives.drives) > 1:
-        raise InputError(
-            f'--refine-poses takes one drive, and there are {len(drives.drives)}: trajectories that are found one by '
-            f'one do not fit each other, since nothing ties one drive to the next. Localise them in one map first'
-        )
-    drive = drives.drives[0]
-    odometry = Odometry.of(*drive.associator.odometry)
-    refined = Refiner(parameters).run(drive.associator.readings, odometry, ticker.refining)
-    drive.source['trajectory'] = trajectory_data(refined)
-    return refined
 
 
 def _learned(maps: MapSet) -> str:

@@ -56,20 +56,34 @@ def _input(data: dict[str, Any]) -> Iterator[str]:
 
 
 def _trajectory(data: dict[str, Any]) -> Iterator[str]:
+    drives = [found for drive in data.get('drives') or [] if (found := drive.get('trajectory'))]
+    if drives:
+        moved = sum(bool(found.get('refined')) for found in drives)
+        yield from _line('Trajectory', f'{moved} of {len(drives)} refined, see the drives')
+        return
     found = (data.get('input') or {}).get('trajectory')
     if not found:
         return
+    yield from _line('Trajectory', _became(found))
+    if words := _wheels(found):
+        yield from _line('Wheels', words)
+
+
+def _became(found: dict[str, Any]) -> str:
+    """Return what became of a trajectory."""
     if not found.get('refined'):
-        yield from _line('Trajectory', f"odometry's, not refined: {found.get('reason')}")
-        return
+        return f"odometry's, not refined: {found.get('reason')}"
     places = found.get('places_recognised') or 0
-    yield from _line(
-        'Trajectory',
+    return (
         f'refined: odometry was off by {found["odometry_off_m"]:.2f} m and {found["odometry_off_deg"]:.1f}° in the '
-        f'root mean square; {places} {"place" if places == 1 else "places"} recognised; {found["reason"]}',
+        f'root mean square; {places} {"place" if places == 1 else "places"} recognised; '
+        + '; '.join(filter(None, [found['reason'], found.get('fitted')]))
     )
-    if words := found.get('odometry'):
-        yield from _line('Wheels', f'{words} (what fits this drive; measure before you set it)')
+
+
+def _wheels(found: dict[str, Any]) -> str:
+    words = found.get('odometry')
+    return f'{words} (what fits this drive; measure before you set it)' if words else ''
 
 
 def _counts(data: dict[str, Any]) -> Iterator[str]:
@@ -113,7 +127,15 @@ def _drives(data: dict[str, Any]) -> Iterator[str]:
         cells = f'{_number(counts.get("received")):>12}{_number(counts.get("accepted")):>12}{used:>12,}'
         length, duration = drive.get('path_m') or 0.0, drive.get('duration_s') or 0.0
         yield f'{"":<12}{cells}{_share(drive.get("unexplained"), used):>9}{length:>8.1f} m{duration:>8.1f} s'
-        yield from textwrap.wrap(_each(sensors), _WIDTH, initial_indent='    ', subsequent_indent='    ')
+        told = [_each(sensors)]
+        if found := drive.get('trajectory'):
+            file = found.get('file')
+            told.append(f'trajectory {_became(found)}' + (f' ({file})' if file else ''))
+            told += [f'wheels: {words}' for words in [_wheels(found)] if words]
+        for text in told:
+            yield from textwrap.wrap(
+                text, _WIDTH, initial_indent='    ', subsequent_indent='    ', break_on_hyphens=False
+            )
 
 
 def _each(sensors: dict[str, Any]) -> str:

@@ -22,11 +22,36 @@ def tum_text(trajectory: Odometry) -> str:
     return '\n'.join(lines) + '\n'
 
 
-def trajectory_data(outcome: Refinement) -> dict[str, Any]:
-    """Return what became of the trajectory, for the report: metres, degrees, nats, parts and radians."""
+def trajectory_files(outcome: Refinement, odometry: Odometry, number: int | None = None) -> dict[str, str]:
+    """Return the texts of trajectory and odometry by the names of their files; none where odometry stays.
+
+    Parameters
+    ----------
+    outcome : Refinement
+    odometry : Odometry
+    number : int, optional
+        Of the drive, from 1 on, where there are several.
+    """
+    if not outcome.accepted:
+        return {}
+    paths = {'trajectory': outcome.trajectory, 'odometry': odometry}
+    return {_tum_name(kind, number): tum_text(path) for kind, path in paths.items()}
+
+
+def _tum_name(kind: str, number: int | None) -> str:
+    return f'{kind}.tum' if number is None else f'{kind}_{number}.tum'
+
+
+def trajectory_data(outcome: Refinement, number: int | None = None, fitted: str = '') -> dict[str, Any]:
+    """Return what became of the trajectory, for the report: metres, degrees, nats, parts and radians.
+
+    `number` is as in `trajectory_files`; `fitted` says how it was moved to fit other drives.
+    """
     return {
         'refined': outcome.accepted,
+        'file': _tum_name('trajectory', number) if outcome.accepted else '',
         'reason': outcome.reason,
+        'fitted': fitted,
         'odometry_off_m': outcome.moved,
         'odometry_off_deg': math.degrees(outcome.turned),
         'places_recognised': outcome.loops,

@@ -14,7 +14,7 @@ from ..core.maps.map_set import MapSet
 from ..files.output_folder import expanded, free_name
 from ..files.quality_warning import thinned
 from ..files.results import write_results
-from ..files.trajectory_text import trajectory_data, tum_text
+from ..files.trajectory_text import trajectory_data, trajectory_files
 from .background import Worker
 from .deferred import Reply
 from .em import Outcome
@@ -86,8 +86,9 @@ class Saver:
         if found is not None and found.refinement is not None:
             account.source['trajectory'] = trajectory_data(found.refinement)
         if found is not None and found.correction is not None:
-            both = {'trajectory.tum': found.correction.trajectory, 'odometry.tum': found.correction.odometry}
-            options = {'extras': {name: tum_text(path) for name, path in both.items()}, 'odometry_xy': path_xy}
+            assert found.refinement is not None
+            texts = trajectory_files(found.refinement, found.correction.odometry)
+            options = {'extras': texts, 'odometry_xy': path_xy}
             path_xy = found.correction.path_of(*account.odometry)
         report = write_results(folder, maps, account.source, path_xy, account.title, **options)
         for warning in report['warnings']:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 from ..core.common.parameters import Parameters
 from ..core.maps.log_odds_map import LogOddsMap
 from ..core.maps.map_set import MapSet
-from ..core.messages.message_types import NANOSECONDS
+from ..core.messages.message_types import NANOSECONDS, Pose2
 from ..core.messages.pose_association import PoseAssociator
 from ..files.quality_warning import thinned
 
@@ -81,11 +82,14 @@ class Drive:
     source : dict
         What was read and rejected, for the report.
     live : LogOddsMapOfAll
+    mounts : mapping of str to Pose2, optional
+        Where no odometry was recorded, the poses of sensors on the robot that were given, by frame.
     """
 
     associator: PoseAssociator
     source: dict[str, Any]
     live: LogOddsMapOfAll
+    mounts: Mapping[str, Pose2] | None = None
 
     @property
     def path_xy(self) -> NDArray[np.float64]:

@@ -63,7 +63,8 @@ def read_journal(
     warnings = _warnings(path, contents, associator, parameters)
     if extrinsics:
         warnings.append(
-            'a journal holds readings in the map frame: the poses of sensors that were given change nothing'
+            'a journal holds readings in the map frame: the poses of sensors that were given change nothing, but with '
+            '--refine-poses they tell the odometry'
         )
     source = {
         'bag': readable(path),
@@ -81,7 +82,7 @@ def read_journal(
         },
         'warnings': warnings + thinning_note(associator),
     }
-    return Drive(associator, source, live)
+    return Drive(associator, source, live, {frame.lstrip('/'): pose for frame, pose in extrinsics.items()})
 
 
 def _cut(held: Sequence[Readings], path: Path, part: Part) -> list[Readings]:

@@ -352,11 +352,6 @@ def test_files_of_one_bag_without_metadata_are_no_drives(
     assert 'ros2 bag reindex' in said
 
 
-def test_refining_takes_one_drive(days: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    said = refusal(capsys, tmp_path, days, '-o', tmp_path / 'maps', '--refine-poses')
-    assert '--refine-poses takes one drive, and there are 3' in said
-
-
 # ---- parts
 
 

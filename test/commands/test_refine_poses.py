@@ -1,16 +1,24 @@
-"""`process_bag --refine-poses`, on a drive whose odometry drifts and on one that is too short."""
+"""`process_bag --refine-poses`: drives whose odometry drifts, drives that are too short, one of them and several."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
-from drive_samples import FILES, assert_same_maps, code_of, mapped, tape, write_tape
+from drive_samples import FILES, assert_same_maps, code_of, mapped, report_in, tape, write_tape
 
 from forward_grid_mapper.commands import process_bag
 from forward_grid_mapper.commands.simulate import write_recording
+from forward_grid_mapper.core.common.parameters import Parameters
+from forward_grid_mapper.core.common.readings import in_canonical_order
 from forward_grid_mapper.core.trajectory.poses import rms_after_alignment
+from forward_grid_mapper.files.journal import Journal
+from forward_grid_mapper.files.map_archive import read_npz
+from forward_grid_mapper.files.reading_archive import read_readings
+from forward_grid_mapper.recordings.drives import read_drives
 from forward_grid_mapper.simulation.drift import LEVELS, with_drift
 from forward_grid_mapper.simulation.drive import Recording, drive
 from forward_grid_mapper.simulation.sonar import NOISY, sonar_ring
@@ -54,3 +62,108 @@ def test_without_the_option_nothing_is_said(tmp_path: Path) -> None:
     write_tape(tmp_path / 'bag', tape())
     assert 'trajectory' not in mapped(tmp_path / 'bag', tmp_path / 'maps')['input']
     assert code_of(process_bag.main, tmp_path / 'bag', '-o', tmp_path / 'maps', '--refine-poses') != 0
+
+
+# ---- several drives
+
+
+def drive_of(folder: Path, number: int, points: int, seed: int, bent: int | None) -> tuple[Path, np.ndarray]:
+    """Write the bag of a drive on a day of its own; return it and the true poses."""
+    exact = drive(building_world(), building_tour()[:points], 0.15, sonar_ring(16), NOISY, seed=seed)
+    recording = exact if bent is None else with_drift(exact, LEVELS['high'], bent)
+    later = number * 86_400 * 10**9
+    recording = replace(
+        recording,
+        odometry=[m._replace(stamp=m.stamp + later) for m in recording.odometry],
+        ranges=[m._replace(stamp=m.stamp + later) for m in recording.ranges],
+    )
+    (folder / f'day_{number}').mkdir(parents=True)
+    return write_recording(folder / f'day_{number}', recording), np.array([m.pose for m in exact.odometry])
+
+
+@pytest.fixture(scope='module')
+def days(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    """Two drives that drift, and between them a short one that does not; and what becomes of them."""
+    folder = tmp_path_factory.mktemp('days')
+    drives = [drive_of(folder, 0, 10, 3, 6), drive_of(folder, 1, 3, 5, None), drive_of(folder, 2, 10, 4, 8)]
+    bags = [bag for bag, _ in drives]
+    assert code_of(process_bag.main, *bags, '-o', folder / 'maps', '--refine-poses', '-q') == 0
+    return {'bags': bags, 'true': [true for _, true in drives], 'maps': folder / 'maps'}
+
+
+def test_each_of_several_drives_is_judged_for_itself(days: dict[str, Any]) -> None:
+    report = report_in(days['maps'])
+    told = [drive['trajectory'] for drive in report['drives']]
+    assert [found['refined'] for found in told] == [True, False, True]
+    assert 'm long' in told[1]['reason']
+    files = {f'{kind}_{number}.tum' for kind in ('trajectory', 'odometry') for number in (1, 3)}
+    assert {path.name for path in days['maps'].iterdir()} == FILES | files
+    assert [found['file'] for found in told] == ['trajectory_1.tum', '', 'trajectory_3.tum']
+    text = ' '.join((days['maps'] / 'report.txt').read_text().split())
+    assert '2 of 3 refined, see the drives' in text
+    assert "trajectory odometry's, not refined: the drive is" in text
+    assert '(trajectory_3.tum)' in text
+
+
+def test_drives_that_are_refined_fit_those_that_are_not(days: dict[str, Any]) -> None:
+    found = [np.loadtxt(days['maps'] / f'trajectory_{number}.tum')[:, 1:3] for number in (1, 3)]
+    for poses, true in zip(found, (days['true'][0], days['true'][2]), strict=True):
+        # no alignment: the short drive says where the map is to be
+        off = np.hypot(*(poses - true[:, :2]).T)
+        assert np.sqrt((off**2).mean()) < 0.15
+    plain = read_drives(days['bags'], Parameters(), {}).readings
+    readings = read_readings(days['maps'] / 'readings.npz', read_npz(days['maps'] / 'maps.npz')).readings
+    for number, stay in ((0, False), (1, True), (2, False)):
+        one, other = (in_canonical_order(each.select(each.drive == number)) for each in (readings, plain))
+        assert np.array_equal(one.x, other.x) == stay
+        assert np.array_equal(one.z, other.z)
+
+
+def test_drives_that_all_stay_make_the_same_maps(days: dict[str, Any], tmp_path: Path) -> None:
+    other = drive_of(tmp_path, 4, 3, 8, None)[0]
+    bags = [days['bags'][1], other]
+    for name, options in (('plain', []), ('maps', ['--refine-poses'])):
+        assert code_of(process_bag.main, *bags, '-o', tmp_path / name, '-q', *options) == 0
+    assert_same_maps(tmp_path / 'maps', tmp_path / 'plain')
+    assert {path.name for path in (tmp_path / 'maps').iterdir()} == FILES
+    assert '0 of 2 refined' in (tmp_path / 'maps' / 'report.txt').read_text()
+
+
+# ---- journals
+
+
+@pytest.fixture(scope='module')
+def kept(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, Recording]:
+    """A drive that drifts, as a bag and as the journal of the node that was there."""
+    folder = tmp_path_factory.mktemp('kept')
+    recording = with_drift(
+        drive(building_world(), building_tour()[:10], 0.15, sonar_ring(16), NOISY, seed=3), LEVELS['high'], 6
+    )
+    journal = Journal(folder / 'journal', print)
+    assert not list(journal.restore())
+    journal.put(recording.readings, ('odom', 'base_link'), [m.pose[:2] for m in recording.odometry[::5]])
+    journal.close()
+    return write_recording(folder, recording), folder / 'journal', recording
+
+
+def test_a_journal_is_refined_as_the_bag_is(tmp_path: Path, kept: tuple[Path, Path, Recording]) -> None:
+    bag, journal, recording = kept
+    sensors = [f'--sensor={frame}={x},{y},{yaw}' for frame, (x, y, yaw) in recording.extrinsics]
+    reports = [
+        mapped(path, tmp_path / name, '--refine-poses', '-q', *options)
+        for path, name, options in ((bag, 'bag', []), (journal, 'journal', sensors))
+    ]
+    told = [report['input']['trajectory'] for report in reports]
+    assert all(found['refined'] for found in told)
+    assert told[1]['odometry_off_m'] == pytest.approx(told[0]['odometry_off_m'], abs=0.05)
+    a, b = (np.loadtxt(tmp_path / name / 'trajectory.tum') for name in ('bag', 'journal'))
+    assert len(a) > len(b) == len(np.unique(recording.readings.stamp))
+    at = np.stack([np.interp(b[:, 0], a[:, 0], a[:, k]) for k in (1, 2)], 1)
+    assert np.hypot(*(b[:, 1:3] - at).T).max() < 0.2
+    assert any('they tell the odometry' in warning for warning in reports[1]['warnings'])
+
+
+def test_a_journal_without_poses_of_the_sensors_stays(tmp_path: Path, kept: tuple[Path, Path, Recording]) -> None:
+    found = mapped(kept[1], tmp_path / 'maps', '--refine-poses', '-q')['input']['trajectory']
+    assert not found['refined']
+    assert 'give their poses with --sensor' in found['reason']

@@ -1,0 +1,126 @@
+"""Registration: where a drive lies on the map of other drives.
+
+A trajectory that was found for itself begins where its odometry does, and there the yaw of odometry has errors as
+everywhere: over the whole drive they swing it about its begin. Three figures for the whole drive, place and yaw of its
+begin, are those with which its readings are likeliest given the map of the others. They are searched from coarse to
+fine, with steps of the yaw that move the readings as far as those of the place do.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..common.parameters import Parameters
+from ..common.readings import Readings
+from ..messages.reading_buffer import bounded
+from ..sensor.density import hit_probability
+from .holding_out import Gain, gain
+from .likelihood import Scan, make_scan, scores
+from .local_map import UNKNOWN, LocalMap, at_poses, local_map
+from .matching import grid_around, search
+from .poses import Floats, compose, relative
+
+SIGMA = np.array([0.1, 0.1, math.radians(4.0)])
+"""σ of the begin a priori: metres, and radians."""
+
+SIGMAS = 2.5
+
+STEP, FINER, LEVELS = 0.15, 1 / 3, 3
+"""Metres between two places of the first search, what the next is finer by, and how many there are."""
+
+ASKED = (150, 600, 2000)
+"""Readings that each search asks."""
+
+ON_MAP = 20_000
+"""Readings that the map of the others is made of at the most."""
+
+BLOCKS = 40
+"""Pieces of the drive, in order of time, whose readings are compared before and after."""
+
+FEWEST = 5
+"""Readings of a piece that is compared."""
+
+LEAST_SIGMAS = 2.3
+"""Standard errors by which readings must be foreseen better, as for trajectories."""
+
+
+class Registration(NamedTuple):
+    """Where a drive lies.
+
+    Attributes
+    ----------
+    begin : float64, shape (3,)
+        The pose of its begin, on the map; as it was if nothing better was found.
+    gain : Gain
+        By how much its readings are foreseen better.
+    """
+
+    begin: Floats
+    gain: Gain
+
+
+def register(
+    readings: Readings, begin: Floats, others: Readings, parameters: Parameters, stop: NDArray[np.uint8]
+) -> Registration:
+    """Return where a drive lies on the map of others.
+
+    Parameters
+    ----------
+    readings : Readings
+        Of the drive, placed by its trajectory.
+    begin : float64, shape (3,)
+        The first pose of the trajectory.
+    others : Readings
+        Placed where they stay.
+    parameters : Parameters
+    stop : uint8, shape (1,)
+        Not 0 to end the work.
+
+    Raises
+    ------
+    Cancelled
+        If `stop` was set.
+    """
+    # as trajectories are found: on cells of one size, whatever size the maps are to have
+    parameters = replace(parameters, grid=replace(parameters.grid, resolution=0.1))
+    model, resolution = parameters.model, parameters.grid.resolution
+    around = local_map(bounded(others, ON_MAP), parameters, stop)
+    readings = readings.select(np.argsort(readings.stamp, kind='stable'))
+    sensors = relative(begin, np.stack([readings.x, readings.y, readings.yaw], axis=1))
+    scan = make_scan(readings, sensors, model, resolution, UNKNOWN * hit_probability(model, resolution))
+    far = max(float(np.sqrt((sensors[:, :2] ** 2).sum(1).mean())), 1.0)
+    found, reach, steps = begin, SIGMAS * SIGMA, np.array([STEP, STEP, STEP / far])
+    information = np.diag(SIGMA**-2.0)
+    for asked in ASKED[:LEVELS]:
+        poses = grid_around(found, reach, (steps[0], steps[1], steps[2]))
+        found = search(scan, around, poses, begin, information, asked)
+        reach, steps = steps, FINER * steps
+    better = gain(_foreseen(scan, around, begin), _foreseen(scan, around, found))
+    return Registration(found if better.sigmas >= LEAST_SIGMAS else begin, better)
+
+
+def moved_to(begin: Floats, poses: Floats) -> Floats:
+    """Return poses of a drive, shape (M, 3), with the first one at `begin` and the others moved along."""
+    out: Floats = compose(begin, relative(poses[0], poses))
+    out[:, 2] = begin[2] + poses[:, 2] - poses[0, 2]
+    return out
+
+
+def readings_moved(readings: Readings, before: Floats, begin: Floats) -> Readings:
+    """Return readings of a drive that began at `before`, shape (3,), as they are if it begins at `begin`."""
+    sensors = np.stack([readings.x, readings.y, readings.yaw], axis=1)
+    return at_poses(readings, compose(begin, relative(before, sensors)))
+
+
+def _foreseen(scan: Scan, around: LocalMap, pose: Floats) -> Floats:
+    """Return the mean log ratio of the readings of each piece of the drive, shape (BLOCKS,); NaN where few are."""
+    out = np.full(BLOCKS, np.nan)
+    for k, part in enumerate(np.array_split(scan.readings, BLOCKS)):
+        if len(part) >= FEWEST:
+            out[k] = scores(Scan(part, scan.weight), around, pose[None])[0] / len(part)
+    return out

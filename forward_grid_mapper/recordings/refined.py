@@ -1,0 +1,175 @@
+"""Drives along the trajectories that their readings speak for: each found and judged by itself, one map of all."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core.common.parameters import Parameters
+from ..core.common.readings import Readings, of_drives
+from ..core.maps.map_set import MapSet
+from ..core.messages.reading_buffer import bounded
+from ..core.trajectory.poses import relative
+from ..core.trajectory.recovering import recovered
+from ..core.trajectory.refinement import Refinement, Refiner, replaced
+from ..core.trajectory.registration import moved_to, readings_moved, register
+from ..core.trajectory.windows import Odometry
+from ..files.output_folder import readable
+from ..files.trajectory_text import trajectory_data, trajectory_files
+from .drive import Drive
+from .drives import Drives
+
+Watch = Callable[[str, float], None]
+"""Receives what is going on, and how much of it is done, from 0 to 1."""
+
+NO_MOUNTS = (
+    'a journal holds no odometry, which can be told from the readings of sensors that are fixed to the robot: give '
+    "their poses with --sensor, or the node's own file with --params"
+)
+
+
+@dataclass(frozen=True)
+class RefinedDrives:
+    """Drives, and what became of the trajectory of each, in their order.
+
+    Attributes
+    ----------
+    drives : Drives
+    odometry : tuple of Odometry
+        As it was recorded.
+    outcomes : tuple of Refinement
+    """
+
+    drives: Drives
+    odometry: tuple[Odometry, ...]
+    outcomes: tuple[Refinement, ...]
+
+    @property
+    def moved(self) -> bool:
+        """Whether any drive has another trajectory than odometry's."""
+        return any(outcome.accepted for outcome in self.outcomes)
+
+    @property
+    def readings(self) -> Readings:
+        """The readings to map from; those of `Drives.readings` where no drive moved."""
+        if not self.moved:
+            return self.drives.readings
+        if len(self.outcomes) == 1:
+            return self.outcomes[0].readings
+        parts = []
+        for drive, odometry, outcome in self._each:
+            held = drive.associator.buffer.snapshot()
+            parts.append(replaced(held, odometry, outcome.trajectory) if outcome.accepted else held)
+        return bounded(of_drives(parts), self.drives.parameters.association.max_readings)
+
+    @property
+    def path_xy(self) -> NDArray[np.float64]:
+        """Where the robots drove, shape (P, 2), metres; a row of NaN parts two drives."""
+        paths = [
+            outcome.trajectory.pose[:, :2] if outcome.accepted else drive.path_xy for drive, _, outcome in self._each
+        ]
+        return _parted(paths)
+
+    @property
+    def odometry_xy(self) -> NDArray[np.float64] | None:
+        """The same as odometry has it, of the drives that moved; None if none did."""
+        paths = [drive.path_xy for drive, _, outcome in self._each if outcome.accepted]
+        return _parted(paths) if paths else None
+
+    def with_live(self, maps: MapSet) -> MapSet:
+        """Return the maps with the live map of all readings, where these stay and `max_readings` lets EM have some."""
+        return maps if self.moved else self.drives.with_live(maps)
+
+    @property
+    def texts(self) -> dict[str, str]:
+        """The trajectories of the drives that moved, as files to be written, by name."""
+        found: dict[str, str] = {}
+        for number, (_, odometry, outcome) in enumerate(self._each, 1):
+            found |= trajectory_files(outcome, odometry, number if len(self.outcomes) > 1 else None)
+        return found
+
+    @property
+    def _each(self) -> list[tuple[Drive, Odometry, Refinement]]:
+        return list(zip(self.drives.drives, self.odometry, self.outcomes, strict=True))
+
+
+def refine_drives(drives: Drives, parameters: Parameters, watch: Watch = lambda stage, part: None) -> RefinedDrives:
+    """Return the drives along their trajectories, and note in their reports what became of these.
+
+    Each drive is refined for itself, and begins where odometry has it begin. Then those that moved are put, one after
+    the other, where they fit the map of the others best.
+
+    Parameters
+    ----------
+    drives : Drives
+    parameters : Parameters
+    watch : callable
+        Called as the work goes on.
+    """
+    several = len(drives.drives) > 1
+    odometry = [odometry_of(drive) for drive in drives.drives]
+    outcomes = []
+    for drive, poses in zip(drives.drives, odometry, strict=True):
+        name = f'{readable(drive.source["bag"])}, ' if several else ''
+        outcomes.append(_outcome(drive, poses, parameters, partial(_named, watch, name)))
+    fitted = [''] * len(outcomes)
+    if several and any(outcome.accepted for outcome in outcomes):
+        watch('fitting the drives to each other', 0.0)
+        outcomes, fitted = _fitted(outcomes, parameters)
+    for number, (drive, outcome, fits) in enumerate(zip(drives.drives, outcomes, fitted, strict=True), 1):
+        # of several drives, the report has copies
+        source = drives.source['drives'][number - 1] if several else drive.source
+        source['trajectory'] = trajectory_data(outcome, number if several else None, fits)
+    return RefinedDrives(drives, tuple(odometry), tuple(outcomes))
+
+
+def _fitted(outcomes: list[Refinement], parameters: Parameters) -> tuple[list[Refinement], list[str]]:
+    """Return the outcomes with the drives that moved where they fit the others, and in words by how much that is.
+
+    Those that odometry keeps are where the map is to be; without any, the first drive is.
+    """
+    out, words = list(outcomes), [''] * len(outcomes)
+    placed = [k for k, outcome in enumerate(outcomes) if not outcome.accepted] or [0]
+    for k, outcome in enumerate(outcomes):
+        if k in placed:
+            continue
+        others = of_drives([out[other].readings for other in placed])
+        begin = outcome.trajectory.pose[0]
+        found = register(outcome.readings, begin, others, parameters, np.zeros(1, np.uint8))
+        if found.begin is not begin:
+            trajectory = replace(outcome.trajectory, pose=moved_to(found.begin, outcome.trajectory.pose))
+            moved = readings_moved(outcome.readings, begin, found.begin)
+            out[k] = replace(outcome, trajectory=trajectory, readings=moved)
+            x, y, yaw = relative(begin, found.begin).tolist()
+            words[k] = f'turned by {math.degrees(yaw):+.1f}° and moved by {math.hypot(x, y):.2f} m to fit the others'
+        placed.append(k)
+    return out, words
+
+
+def odometry_of(drive: Drive) -> Odometry:
+    """Return the odometry of a drive: as recorded, or as readings of sensors tell it whose poses were given."""
+    odometry = Odometry.of(*drive.associator.odometry)
+    return odometry if drive.mounts is None else recovered(odometry, drive.associator.readings, drive.mounts)
+
+
+def _outcome(drive: Drive, odometry: Odometry, parameters: Parameters, watch: Watch) -> Refinement:
+    readings = drive.associator.readings
+    if drive.mounts is not None and not len(odometry.stamp):
+        return Refinement(False, NO_MOUNTS, readings, odometry, {})
+    return Refiner(parameters).run(readings, odometry, watch)
+
+
+def _named(watch: Watch, name: str, stage: str, part: float) -> None:
+    watch(name + stage, part)
+
+
+def _parted(paths: list[NDArray[np.float64]]) -> NDArray[np.float64]:
+    parts = [paths[0]]
+    for path in paths[1:]:
+        parts += [np.full((1, 2), np.nan), path]
+    return np.concatenate(parts)
