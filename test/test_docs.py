@@ -21,6 +21,7 @@ ALLOWED = {
     '.tum': 'the ending of trajectories in the TUM format',
     'trajectory.tum': 'a file that process_bag writes',
     'odometry.tum': 'a file that process_bag writes',
+    'trajectory_1.tum': 'a file that process_bag writes',
     'evo_ape tum': 'a command of evo',
     'mode: raw': 'a line of map_server files',
     'use_sim_time:=true': 'a parameter of every ROS node',

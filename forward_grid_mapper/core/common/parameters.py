@@ -87,6 +87,14 @@ class AssociationParameters:
         100_000_000,
         read_only=True,
     )
+    odometry_noise: float = _param(
+        0.0,
+        'How far the yaw of odometry strays at random in one metre of driving (standard deviation; it grows with the '
+        'square root of the way), for refine_poses. Usual wheels stray by 0.01 to 0.08; 0 estimates it from the drive.',
+        'rad',
+        0.0,
+        0.5,
+    )
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,7 @@ Buildings whose walls stand at any angle have votes that agree on nothing, and t
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -214,7 +215,9 @@ def _measured(votes: Floats, yaw: Floats, correction: Floats) -> tuple[Floats, F
     return correction + np.radians(mean), np.where(mass > 0, information, 0.0)
 
 
-def heading(windows: Windows, at: NDArray[np.int64], votes: Floats) -> Heading | None:
+def heading(
+    windows: Windows, at: NDArray[np.int64], votes: Floats, noises: Sequence[float] = NOISES
+) -> Heading | None:
     """Return what walls say about the yaw; None where they agree on nothing.
 
     Parameters
@@ -222,6 +225,8 @@ def heading(windows: Windows, at: NDArray[np.int64], votes: Floats) -> Heading |
     windows : Windows
     at, votes
         Those of `wall_votes`.
+    noises : sequence of float
+        Noise of yaw that is tried, radians a √metre.
     """
     if len(at) < FEWEST_VOTES:
         return None
@@ -231,8 +236,8 @@ def heading(windows: Windows, at: NDArray[np.int64], votes: Floats) -> Heading |
         prior = (drifts.bias / BIAS_SIGMA) ** 2 + (drifts.turn_scale / TURN_SCALE_SIGMA) ** 2
         return chain.forward(drifts)[0] - 0.5 * prior
 
-    best = Drifts(0.0, 0.0, NOISES[2])
-    for name, values in (('bias', BIASES), ('turn_scale', TURN_SCALES), ('noise', NOISES)):
+    best = Drifts(0.0, 0.0, noises[len(noises) // 2])
+    for name, values in (('bias', BIASES), ('turn_scale', TURN_SCALES), ('noise', noises)):
         best = max((best._replace(**{name: float(value)}) for value in values), key=likelihood)
     total = chain.forward(best)[0]
     if total < LEAST_GAIN * len(at):

@@ -21,7 +21,7 @@ from ..common.parameters import Parameters
 from ..common.readings import Readings
 from ..runtime.cancelling import check
 from .chain import Chain
-from .heading import Heading, heading
+from .heading import NOISES, Heading, heading
 from .holding_out import Gain, blocks_of, foreseen, gain, held_out, held_out_blocks
 from .local_map import at_poses
 from .loops import Loop, find_loops
@@ -218,14 +218,16 @@ class Refiner:
 
     def _heading(self, windows: Windows, scans: Scans) -> Heading | None:
         self._say('directions of walls')
-        found = heading(windows, *wall_votes(windows, scans.held_out))
+        told = self._parameters.association.odometry_noise
+        noises = (told,) if told else NOISES
+        found = heading(windows, *wall_votes(windows, scans.held_out), noises)
         if found is None:
             return None
         # sensors have directions of their own, which vote with whatever ranges
         readings, rng = windows.readings, np.random.default_rng(0)
         drawn = np.where(readings.echo, rng.random(len(readings)) * readings.z_max, readings.z)
         by_chance = replace(windows, readings=replace(readings, z=drawn))
-        chance = heading(by_chance, *wall_votes(by_chance, scans.held_out))
+        chance = heading(by_chance, *wall_votes(by_chance, scans.held_out), noises)
         return found if chance is None or found.gain > OVER_CHANCE * chance.gain else None
 
     def _calibrate(self, odometry: Odometry, windows: Windows, scans: Scans, walls: Heading) -> Floats:

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from forward_grid_mapper.core.trajectory.heading import LEAST_GAIN, heading
+from forward_grid_mapper.core.trajectory.heading import LEAST_GAIN, NOISES, heading
 from forward_grid_mapper.core.trajectory.odometry_model import calibrated, motions, sensitivity, with_yaw
 from forward_grid_mapper.core.trajectory.poses import wrapped
 from forward_grid_mapper.core.trajectory.walls import BIN, BINS, DIRECTIONS, count_votes, wall_votes
@@ -84,6 +84,15 @@ def test_the_heading_is_found_where_odometry_drifts(bent, true) -> None:
     assert np.sqrt(np.mean(off**2)) < np.sqrt(np.mean(was**2)) / 3
     assert found.certainty > 0.99
     assert found.over_odometry > 20
+
+
+def test_noise_that_is_told_is_not_looked_for(bent) -> None:
+    _, _, windows = bent
+    at, votes = wall_votes(windows, np.zeros(len(windows), bool))
+    found = heading(windows, at, votes, (0.055,))
+    assert found is not None
+    assert found.drifts.noise == 0.055
+    assert heading(windows, at, votes).drifts.noise in NOISES
 
 
 def test_exact_odometry_is_likelier_than_any_drift(tour, true) -> None:

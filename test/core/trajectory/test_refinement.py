@@ -13,6 +13,8 @@ from forward_grid_mapper.core.common.errors import Cancelled
 from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.common.readings import Readings
 from forward_grid_mapper.core.mapping import Mapper
+from forward_grid_mapper.core.trajectory import refinement
+from forward_grid_mapper.core.trajectory.heading import NOISES
 from forward_grid_mapper.core.trajectory.poses import compose, relative, rms_after_alignment
 from forward_grid_mapper.core.trajectory.refinement import Refinement, Refiner, highest, unfit
 from forward_grid_mapper.core.trajectory.windows import Odometry
@@ -175,6 +177,18 @@ def test_a_straight_drive_without_revisits_is_no_worse() -> None:
     true, odometry = odometry_of(recording).pose, odometry_of(bent)
     left = Refiner(Parameters()).run(bent.readings, odometry)
     assert rms_after_alignment(left.trajectory.pose, true) < rms_after_alignment(odometry.pose, true) + 0.02
+
+
+def test_the_noise_of_odometry_is_estimated_or_told(bent, monkeypatch) -> None:
+    seen = []
+
+    def look(windows, at, votes, noises) -> None:
+        seen.append(noises)
+
+    monkeypatch.setattr(refinement, 'heading', look)
+    for told in ({}, {'odometry_noise': 0.04}):
+        assert not Refiner(Parameters.from_flat(told)).run(*bent).accepted
+    assert seen == [NOISES, (0.04,)]
 
 
 def test_the_highest_value_is_found_beyond_the_ends_and_between() -> None:

@@ -1,0 +1,175 @@
+"""How certain a calibration is that a drive tells of its odometry.
+
+Yaw is known all along a refined trajectory, since walls measure it. So what odometry errs by in a metre and in a radian
+is a regression over pieces of the drive,
+
+    Δyaw of the trajectory − Δyaw of odometry  =  bias · ahead + turn_scale · turn + noise
+
+whose residuals say how certain it is.
+
+Scale and heading are not measured that way: where readings say nothing of how far the robot drove, as along a bare
+corridor, the trajectory follows the odometry and would agree with itself. They are asked from readings directly: f(c)
+is the mean log ratio of a block of readings, foreseen by the map of what lies around it, where all motions have the
+calibration c. Over blocks b with slopes g_b and curvatures h_b at c,
+
+    top − c  =  −Σ g_b / Σ h_b        σ²  =  Σ (g_b + h_b (top − c))² / (Σ h_b)²
+
+Loops say nothing of scale: a map that is larger everywhere closes as well.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..common.parameters import Parameters
+from ..common.readings import Readings
+from .holding_out import blocks_of, foreseen, held_out
+from .odometry_model import CALIBRATION, calibrated, with_yaw
+from .poses import Floats, wrapped
+from .scans import Scans
+from .windows import Odometry, cut
+
+PIECE = 2.0
+"""Metres of progress of a piece of the regression."""
+
+FEWEST_PIECES = 8
+
+STEPS = {'scale': 0.02, 'heading': math.radians(1.0)}
+"""By how much scale and heading are changed: parts, and radians."""
+
+ASKED, LENGTH, SPAN = 40, 4, 6.0
+"""Blocks that are asked, the windows of each, and metres of progress around it that its map is made of."""
+
+FEWEST_BLOCKS = 8
+
+FARTHEST = 2.0
+"""Steps that the top may lie away."""
+
+LEAST = {'scale': 0.004, 'heading': math.radians(0.3), 'bias': math.radians(0.05), 'turn_scale': 0.003}
+"""σ that is stated at the least."""
+
+MOST = {'scale': 0.012, 'heading': math.radians(0.6), 'bias': math.radians(0.5), 'turn_scale': 0.015}
+"""σ from which on nothing is told."""
+
+
+class Told(NamedTuple):
+    """A figure of the calibration, and its standard deviation."""
+
+    value: float
+    sigma: float
+
+
+def certain(
+    readings: Readings,
+    odometry: Odometry,
+    trajectory: Odometry,
+    calibration: dict[str, float],
+    parameters: Parameters,
+    stop: NDArray[np.uint8],
+) -> dict[str, Told]:
+    """Return what a drive tells of its odometry with certainty, by the names of `CALIBRATION`.
+
+    Parameters
+    ----------
+    readings : Readings
+        Placed by odometry.
+    odometry, trajectory : Odometry
+        Poses at the same stamps.
+    calibration : dict
+        What was found together with the trajectory.
+    parameters : Parameters
+    stop : uint8, shape (1,)
+        Not 0 to end the work.
+
+    Raises
+    ------
+    Cancelled
+        If `stop` was set.
+    """
+    found = of_yaw(odometry, trajectory)
+    found |= of_ways(readings, odometry, trajectory, calibration, parameters, stop)
+    stated = {name: Told(value, math.hypot(sigma, LEAST[name])) for name, (value, sigma) in found.items()}
+    return {name: stated[name] for name in CALIBRATION if name in stated and stated[name].sigma <= MOST[name]}
+
+
+def of_yaw(odometry: Odometry, trajectory: Odometry) -> dict[str, Told]:
+    """Return bias and scale of turns from the yaw of a trajectory; empty if the drive is too short."""
+    ends = np.arange(0.0, odometry.progress[-1], PIECE)
+    if len(ends) <= FEWEST_PIECES:
+        return {}
+    knots = odometry.progress
+    pose = odometry.pose
+    middle = pose[:-1, 2] + np.diff(pose[:, 2]) / 2
+    steps = np.diff(pose[:, :2], axis=0)
+    ahead = np.concatenate([[0.0], np.cumsum(np.cos(middle) * steps[:, 0] + np.sin(middle) * steps[:, 1])])
+    columns = [np.diff(np.interp(ends, knots, column)) for column in (ahead, pose[:, 2])]
+    more = np.diff(np.interp(ends, knots, np.unwrap(wrapped(trajectory.pose[:, 2] - pose[:, 2]))))
+    given = np.stack(columns, axis=1)
+    gram = given.T @ given
+    if np.linalg.matrix_rank(gram) < 2:
+        return {}
+    inverse = np.linalg.inv(gram)
+    values = inverse @ (given.T @ more)
+    left = more - given @ values
+    # each residual by itself: wheels slip now and then
+    spread = given * (left * math.sqrt(len(left) / (len(left) - 2)))[:, None]
+    sigma = np.sqrt(np.diag(inverse @ (spread.T @ spread) @ inverse))
+    return {name: Told(float(v), float(s)) for name, v, s in zip(('bias', 'turn_scale'), values, sigma, strict=True)}
+
+
+def of_ways(
+    readings: Readings,
+    odometry: Odometry,
+    trajectory: Odometry,
+    calibration: dict[str, float],
+    parameters: Parameters,
+    stop: NDArray[np.uint8],
+) -> dict[str, Told]:
+    """Return scale and heading as readings tell them; what they do not tell is left out."""
+    parameters = replace(parameters, grid=replace(parameters.grid, resolution=0.1))
+    windows = cut(readings, odometry)
+    scans = Scans(windows, parameters, stop, np.zeros_like(held_out(len(windows))))
+    turned = with_yaw(odometry, odometry.progress, np.unwrap(wrapped(trajectory.pose[:, 2] - odometry.pose[:, 2])))
+    blocks = blocks_of(len(windows), LENGTH, ASKED)
+
+    def value_at(trial: dict[str, float]) -> Floats:
+        ways = np.array([trial['scale'], trial['heading'], 0.0, 0.0])
+        return foreseen(scans, calibrated(turned, ways).at(windows.node_stamp), blocks, SPAN)
+
+    start = {name: calibration.get(name, 0.0) for name in STEPS}
+    middle = value_at(start)
+    found = {}
+    for name, step in STEPS.items():
+        low, high = (value_at({**start, name: start[name] + sign * step}) for sign in (-1, 1))
+        told = top_of(low, middle, high)
+        if told is not None:
+            found[name] = Told(start[name] + step * told.value, step * told.sigma)
+    return found
+
+
+def top_of(low: Floats, middle: Floats, high: Floats) -> Told | None:
+    """Return where the sum of blocks' values is highest, in steps from the middle; None if they do not say.
+
+    Parameters
+    ----------
+    low, middle, high : float64, shape (B,)
+        Of each block one step before, at, and one step behind the middle; NaN where nothing is known.
+    """
+    known = np.isfinite(low) & np.isfinite(middle) & np.isfinite(high)
+    if known.sum() < FEWEST_BLOCKS:
+        return None
+    slope = (high[known] - low[known]) / 2
+    curvature = high[known] - 2 * middle[known] + low[known]
+    total = float(curvature.sum())
+    if total >= 0.0:
+        return None
+    top = -float(slope.sum()) / total
+    if abs(top) > FARTHEST:
+        return None
+    off = slope + curvature * top
+    return Told(top, float(np.sqrt((off**2).sum())) / -total)
