@@ -16,13 +16,14 @@ from ..core.joint_learning import map_and_learn
 from ..core.mapping import Mapper
 from ..core.maps.map_set import MapSet
 from ..core.tiled_mapping import TiledMapper
+from ..files.calibration_file import load_calibration
 from ..files.map_files import occupancy_values
 from ..files.output_folder import free_name, output_folder, readable
 from ..files.parameter_file import parse_sensor
 from ..files.report import json_text, report_text
 from ..files.results import write_results
 from ..recordings.drives import Drives, read_drives
-from ..recordings.refined import refine_drives
+from ..recordings.refined import Given, refine_drives
 from .console import Ticker, run
 from .desktop import show
 from .options import (
@@ -71,6 +72,11 @@ def parser() -> argparse.ArgumentParser:
         'where readings that were held out do not speak for it',
     )
     made.add_argument(
+        '--odometry-calibration',
+        metavar='FILE',
+        help='apply a calibration to wheel odometry first: the YAML that --refine-poses wrote for this robot',
+    )
+    made.add_argument(
         '--tiles',
         type=float,
         metavar='M',
@@ -94,6 +100,7 @@ def process(options: argparse.Namespace) -> int:
     if options.tiles is not None and not (math.isfinite(options.tiles) and options.tiles >= SMALLEST_TILE):
         raise ParameterError(f'--tiles {options.tiles:g}: give the edge of a tile in metres, {SMALLEST_TILE:g} or more')
     mapper = Mapper if options.tiles is None else partial(TiledMapper, size=options.tiles)
+    given = _given(options.odometry_calibration)
     output = Path(options.output) if options.output else free_name(Path.cwd(), f'{_stem(options.bags)}_maps')
     begin = time.perf_counter()
     # the folder first: if it cannot be written, that should be known before the work
@@ -111,7 +118,9 @@ def process(options: argparse.Namespace) -> int:
         source = drives.source
         source['warnings'] += ignored
         read = time.perf_counter() - begin
-        refined = refine_drives(drives, parameters, ticker.refining) if options.refine_poses else None
+        refined = None
+        if options.refine_poses or given:
+            refined = refine_drives(drives, parameters, ticker.refining, given, options.refine_poses)
         seconds = {'reading the bag' if len(drives.drives) == 1 else 'reading the bags': read}
         if refined is not None:
             seconds['trajectory'] = time.perf_counter() - begin - read
@@ -133,6 +142,11 @@ def process(options: argparse.Namespace) -> int:
     if options.show:
         show(output / 'report.html')
     return 0
+
+
+def _given(file: str | None) -> Given | None:
+    """Return the calibration of a file, if one is given."""
+    return None if file is None else Given(load_calibration(file), readable(file))
 
 
 def tell(options: argparse.Namespace, report: Mapping[str, Any], output: Path) -> None:

@@ -71,19 +71,22 @@ def _trajectory(data: dict[str, Any]) -> Iterator[str]:
 
 def _became(found: dict[str, Any]) -> str:
     """Return what became of a trajectory."""
+    calibrated = f', with the calibration of {found["calibrated"]}' if found.get('calibrated') else ''
     if not found.get('refined'):
-        return f"odometry's, not refined: {found.get('reason')}"
+        reason = f', not refined: {found.get("reason")}' if found.get('reason') else ''
+        return f"odometry's{calibrated}{reason}"
     places = found.get('places_recognised') or 0
     return (
-        f'refined: odometry was off by {found["odometry_off_m"]:.2f} m and {found["odometry_off_deg"]:.1f}° in the '
-        f'root mean square; {places} {"place" if places == 1 else "places"} recognised; '
+        f'refined: odometry{calibrated} was off by {found["odometry_off_m"]:.2f} m and '
+        f'{found["odometry_off_deg"]:.1f}° in the root mean square; '
+        f'{places} {"place" if places == 1 else "places"} recognised; '
         + '; '.join(filter(None, [found['reason'], found.get('fitted')]))
     )
 
 
 def _wheels(found: dict[str, Any]) -> str:
     words = found.get('odometry')
-    return f'{words} (what fits this drive; measure before you set it)' if words else ''
+    return f'{words}; it is what fits this drive: measure before you set it' if words else ''
 
 
 def _counts(data: dict[str, Any]) -> Iterator[str]:

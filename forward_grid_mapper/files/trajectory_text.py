@@ -6,6 +6,8 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
+from ..core.trajectory.certainty import Told
+from ..core.trajectory.odometry_model import CALIBRATION
 from ..core.trajectory.refinement import Refinement
 from ..core.trajectory.windows import Odometry
 
@@ -42,12 +44,15 @@ def _tum_name(kind: str, number: int | None) -> str:
     return f'{kind}.tum' if number is None else f'{kind}_{number}.tum'
 
 
-def trajectory_data(outcome: Refinement, number: int | None = None, fitted: str = '') -> dict[str, Any]:
+def trajectory_data(
+    outcome: Refinement, number: int | None = None, fitted: str = '', told: Mapping[str, Told] | None = None
+) -> dict[str, Any]:
     """Return what became of the trajectory, for the report: metres, degrees, nats, parts and radians.
 
-    `number` is as in `trajectory_files`; `fitted` says how it was moved to fit other drives.
+    `number` is as in `trajectory_files`; `fitted` says how it was moved to fit other drives, `told` what the drive
+    tells of its odometry with certainty, if that was asked.
     """
-    return {
+    data: dict[str, Any] = {
         'refined': outcome.accepted,
         'file': _tum_name('trajectory', number) if outcome.accepted else '',
         'reason': outcome.reason,
@@ -59,6 +64,38 @@ def trajectory_data(outcome: Refinement, number: int | None = None, fitted: str 
         'calibration': dict(outcome.calibration),
         'odometry': calibration_words(outcome.calibration) if outcome.accepted else '',
     }
+    if told is not None and outcome.accepted:
+        data['told'] = {name: {'value': value, 'sigma': sigma} for name, (value, sigma) in told.items()}
+        data['odometry'] = told_words(told)
+    return data
+
+
+def told_words(told: Mapping[str, Told]) -> str:
+    """Return what the wheels do as far as the drive tells it, each figure with its standard deviation."""
+    words = []
+    for name, (value, sigma) in told.items():
+        said = calibration_words({name: value}) if abs(value) > sigma else ''
+        if not said:
+            said = f'{_EXACT[name]} within what can be told'
+        error = math.degrees(sigma) if name in ('bias', 'heading') else 100 * sigma
+        words.append(f'{said} (± {error:.1f}{"°" if name in ("bias", "heading") else " %"})')
+    if unknown := [_ASKED[name] for name in CALIBRATION if name not in told]:
+        words.append(f'the drive does not tell {" or ".join(unknown)}')
+    return '; '.join(words)
+
+
+_EXACT = {
+    'scale': 'ways are measured right',
+    'heading': 'the robot drives where it is said to look',
+    'bias': 'going straight is measured as going straight',
+    'turn_scale': 'turns are measured right',
+}
+_ASKED = {
+    'scale': 'whether ways are measured too long',
+    'heading': 'whether the robot drives where it is said to look',
+    'bias': 'whether going straight is measured as turning',
+    'turn_scale': 'whether turns are measured too large',
+}
 
 
 def calibration_words(calibration: Mapping[str, float]) -> str:

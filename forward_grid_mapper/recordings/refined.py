@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,11 +15,14 @@ from ..core.common.parameters import Parameters
 from ..core.common.readings import Readings, of_drives
 from ..core.maps.map_set import MapSet
 from ..core.messages.reading_buffer import bounded
+from ..core.trajectory.certainty import Told, after, certain
+from ..core.trajectory.odometry_model import CALIBRATION, calibrated
 from ..core.trajectory.poses import relative
 from ..core.trajectory.recovering import recovered
 from ..core.trajectory.refinement import Refinement, Refiner, replaced
 from ..core.trajectory.registration import moved_to, readings_moved, register
 from ..core.trajectory.windows import Odometry
+from ..files.calibration_file import calibration_text
 from ..files.output_folder import readable
 from ..files.trajectory_text import trajectory_data, trajectory_files
 from .drive import Drive
@@ -32,6 +36,8 @@ NO_MOUNTS = (
     "their poses with --sensor, or the node's own file with --params"
 )
 
+NO_TIMES = "no calibration is applied: there are readings of a time without odometry, as where odometry's clock jumped"
+
 
 @dataclass(frozen=True)
 class RefinedDrives:
@@ -43,16 +49,19 @@ class RefinedDrives:
     odometry : tuple of Odometry
         As it was recorded.
     outcomes : tuple of Refinement
+    told : tuple of dict
+        What each drive that moved tells of its odometry with certainty.
     """
 
     drives: Drives
     odometry: tuple[Odometry, ...]
     outcomes: tuple[Refinement, ...]
+    told: tuple[dict[str, Told], ...]
 
     @property
     def moved(self) -> bool:
         """Whether any drive has another trajectory than odometry's."""
-        return any(outcome.accepted for outcome in self.outcomes)
+        return any(_moved(odometry, outcome) for _, odometry, outcome in self._each)
 
     @property
     def readings(self) -> Readings:
@@ -64,21 +73,22 @@ class RefinedDrives:
         parts = []
         for drive, odometry, outcome in self._each:
             held = drive.associator.buffer.snapshot()
-            parts.append(replaced(held, odometry, outcome.trajectory) if outcome.accepted else held)
+            parts.append(replaced(held, odometry, outcome.trajectory) if _moved(odometry, outcome) else held)
         return bounded(of_drives(parts), self.drives.parameters.association.max_readings)
 
     @property
     def path_xy(self) -> NDArray[np.float64]:
         """Where the robots drove, shape (P, 2), metres; a row of NaN parts two drives."""
         paths = [
-            outcome.trajectory.pose[:, :2] if outcome.accepted else drive.path_xy for drive, _, outcome in self._each
+            outcome.trajectory.pose[:, :2] if _moved(odometry, outcome) else drive.path_xy
+            for drive, odometry, outcome in self._each
         ]
         return _parted(paths)
 
     @property
     def odometry_xy(self) -> NDArray[np.float64] | None:
         """The same as odometry has it, of the drives that moved; None if none did."""
-        paths = [drive.path_xy for drive, _, outcome in self._each if outcome.accepted]
+        paths = [drive.path_xy for drive, odometry, outcome in self._each if _moved(odometry, outcome)]
         return _parted(paths) if paths else None
 
     def with_live(self, maps: MapSet) -> MapSet:
@@ -87,10 +97,13 @@ class RefinedDrives:
 
     @property
     def texts(self) -> dict[str, str]:
-        """The trajectories of the drives that moved, as files to be written, by name."""
+        """Trajectories and calibrations of the drives that moved, as files to be written, by name."""
         found: dict[str, str] = {}
-        for number, (_, odometry, outcome) in enumerate(self._each, 1):
-            found |= trajectory_files(outcome, odometry, number if len(self.outcomes) > 1 else None)
+        for number, ((drive, odometry, outcome), told) in enumerate(zip(self._each, self.told, strict=True), 1):
+            several = len(self.outcomes) > 1
+            found |= trajectory_files(outcome, odometry, number if several else None)
+            if text := calibration_text(told, readable(drive.source['bag'])):
+                found[f'odometry_calibration{f"_{number}" if several else ""}.yaml'] = text
         return found
 
     @property
@@ -98,7 +111,20 @@ class RefinedDrives:
         return list(zip(self.drives.drives, self.odometry, self.outcomes, strict=True))
 
 
-def refine_drives(drives: Drives, parameters: Parameters, watch: Watch = lambda stage, part: None) -> RefinedDrives:
+class Given(NamedTuple):
+    """A calibration of the odometry, by the names of `core.trajectory.odometry_model`, and the file that it is from."""
+
+    calibration: Mapping[str, float]
+    file: str
+
+
+def refine_drives(
+    drives: Drives,
+    parameters: Parameters,
+    watch: Watch = lambda stage, part: None,
+    given: Given | None = None,
+    refine: bool = True,
+) -> RefinedDrives:
     """Return the drives along their trajectories, and note in their reports what became of these.
 
     Each drive is refined for itself, and begins where odometry has it begin. Then those that moved are put, one after
@@ -110,22 +136,51 @@ def refine_drives(drives: Drives, parameters: Parameters, watch: Watch = lambda 
     parameters : Parameters
     watch : callable
         Called as the work goes on.
+    given : Given, optional
+        A calibration to apply to the odometry of all drives first.
+    refine : bool
+        Whether to look for trajectories; without, odometry with its calibration is the trajectory.
     """
     several = len(drives.drives) > 1
     odometry = [odometry_of(drive) for drive in drives.drives]
     outcomes = []
     for drive, poses in zip(drives.drives, odometry, strict=True):
         name = f'{readable(drive.source["bag"])}, ' if several else ''
-        outcomes.append(_outcome(drive, poses, parameters, partial(_named, watch, name)))
+        outcomes.append(_outcome(drive, poses, parameters, partial(_named, watch, name), given, refine))
+    told = []
+    for drive, poses, outcome in zip(drives.drives, odometry, outcomes, strict=True):
+        told.append(_told(drive, poses, outcome, parameters, watch, given))
     fitted = [''] * len(outcomes)
     if several and any(outcome.accepted for outcome in outcomes):
         watch('fitting the drives to each other', 0.0)
         outcomes, fitted = _fitted(outcomes, parameters)
-    for number, (drive, outcome, fits) in enumerate(zip(drives.drives, outcomes, fitted, strict=True), 1):
+    rows = zip(drives.drives, odometry, outcomes, fitted, told, strict=True)
+    for number, (drive, poses, outcome, fits, known) in enumerate(rows, 1):
         # of several drives, the report has copies
         source = drives.source['drives'][number - 1] if several else drive.source
-        source['trajectory'] = trajectory_data(outcome, number if several else None, fits)
-    return RefinedDrives(drives, tuple(odometry), tuple(outcomes))
+        source['trajectory'] = trajectory_data(outcome, number if several else None, fits, known)
+        source['trajectory']['calibrated'] = given.file if given and _moved(poses, outcome) else ''
+    return RefinedDrives(drives, tuple(odometry), tuple(outcomes), tuple(told))
+
+
+def _told(
+    drive: Drive,
+    odometry: Odometry,
+    outcome: Refinement,
+    parameters: Parameters,
+    watch: Watch,
+    given: Given | None,
+) -> dict[str, Told]:
+    if not outcome.accepted:
+        return {}
+    watch('what the drive tells of its odometry', 0.0)
+    readings, stop = drive.associator.readings, np.zeros(1, np.uint8)
+    if given is None:
+        return certain(readings, odometry, outcome.trajectory, outcome.calibration, parameters, stop)
+    applied = _calibrated(odometry, given)
+    readings = replaced(readings, odometry, applied)
+    told = certain(readings, applied, outcome.trajectory, outcome.calibration, parameters, stop)
+    return after(given.calibration, told)
 
 
 def _fitted(outcomes: list[Refinement], parameters: Parameters) -> tuple[list[Refinement], list[str]]:
@@ -157,11 +212,34 @@ def odometry_of(drive: Drive) -> Odometry:
     return odometry if drive.mounts is None else recovered(odometry, drive.associator.readings, drive.mounts)
 
 
-def _outcome(drive: Drive, odometry: Odometry, parameters: Parameters, watch: Watch) -> Refinement:
+def _outcome(
+    drive: Drive, odometry: Odometry, parameters: Parameters, watch: Watch, given: Given | None, refine: bool
+) -> Refinement:
     readings = drive.associator.readings
     if drive.mounts is not None and not len(odometry.stamp):
         return Refinement(False, NO_MOUNTS, readings, odometry, {})
-    return Refiner(parameters).run(readings, odometry, watch)
+    if given is not None:
+        if not _within(readings, odometry):
+            return Refinement(False, NO_TIMES, readings, odometry, {})
+        trajectory = _calibrated(odometry, given)
+        readings, odometry = replaced(readings, odometry, trajectory), trajectory
+    return (
+        Refiner(parameters).run(readings, odometry, watch) if refine else Refinement(False, '', readings, odometry, {})
+    )
+
+
+def _calibrated(odometry: Odometry, given: Given) -> Odometry:
+    return calibrated(odometry, np.array([given.calibration.get(name, 0.0) for name in CALIBRATION]))
+
+
+def _within(readings: Readings, odometry: Odometry) -> bool:
+    return bool(
+        len(odometry.stamp) and odometry.stamp[0] <= readings.stamp.min() <= readings.stamp.max() <= odometry.stamp[-1]
+    )
+
+
+def _moved(odometry: Odometry, outcome: Refinement) -> bool:
+    return outcome.trajectory is not odometry
 
 
 def _named(watch: Watch, name: str, stage: str, part: float) -> None:

@@ -8,13 +8,18 @@ from typing import Any
 
 import numpy as np
 import pytest
-from drive_samples import FILES, assert_same_maps, code_of, mapped, report_in, tape, write_tape
+from drive_samples import FILES, assert_same_maps, code_of, mapped, refusal, report_in, tape, write_tape
 
 from forward_grid_mapper.commands import process_bag
 from forward_grid_mapper.commands.simulate import write_recording
 from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.common.readings import in_canonical_order
+from forward_grid_mapper.core.messages.message_types import Pose2
+from forward_grid_mapper.core.trajectory.certainty import Told
+from forward_grid_mapper.core.trajectory.odometry_model import calibrated
 from forward_grid_mapper.core.trajectory.poses import rms_after_alignment
+from forward_grid_mapper.core.trajectory.windows import Odometry
+from forward_grid_mapper.files.calibration_file import calibration_text
 from forward_grid_mapper.files.journal import Journal
 from forward_grid_mapper.files.map_archive import read_npz
 from forward_grid_mapper.files.reading_archive import read_readings
@@ -24,7 +29,7 @@ from forward_grid_mapper.simulation.drive import Recording, drive
 from forward_grid_mapper.simulation.sonar import NOISY, sonar_ring
 from forward_grid_mapper.simulation.world import building_tour, building_world
 
-REFINED = FILES | {'trajectory.tum', 'odometry.tum'}
+REFINED = FILES | {'trajectory.tum', 'odometry.tum', 'odometry_calibration.yaml'}
 
 
 @pytest.fixture(scope='module')
@@ -64,6 +69,31 @@ def test_without_the_option_nothing_is_said(tmp_path: Path) -> None:
     assert code_of(process_bag.main, tmp_path / 'bag', '-o', tmp_path / 'maps', '--refine-poses') != 0
 
 
+def test_a_calibration_is_applied(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    exact = tape()
+    wrong = {'scale': 0.03, 'heading': -0.02, 'bias': 0.03, 'turn_scale': 0.0}
+    messages = exact.odometry
+    true = Odometry.of(np.array([m.stamp for m in messages]), np.array([m.pose for m in messages], float))
+    measured = calibrated(true, -np.array(list(wrong.values())))
+    bent = [m._replace(pose=Pose2(*pose)) for m, pose in zip(messages, measured.pose.tolist(), strict=True)]
+    write_tape(tmp_path / 'bag', exact)
+    write_tape(tmp_path / 'bent', exact._replace(odometry=bent))
+    file = tmp_path / 'calibration.yaml'
+    file.write_text(calibration_text({name: Told(value, 0.001) for name, value in wrong.items()}, 'another drive'))
+    mapped(tmp_path / 'bag', tmp_path / 'plain', '-q')
+    report = mapped(tmp_path / 'bent', tmp_path / 'maps', '-q', '--odometry-calibration', file)
+    assert report['input']['trajectory']['calibrated'] == str(file)
+    a, b = (
+        in_canonical_order(read_readings(f / 'readings.npz', read_npz(f / 'maps.npz')).readings)
+        for f in (tmp_path / 'plain', tmp_path / 'maps')
+    )
+    assert np.hypot(a.x - b.x, a.y - b.y).max() < 0.06
+    assert 'with the calibration of' in ' '.join((tmp_path / 'maps' / 'report.txt').read_text().split())
+    capsys.readouterr()
+    said = refusal(capsys, tmp_path, tmp_path / 'bag', '-o', tmp_path / 'no', '--odometry-calibration', 'absent')
+    assert 'absent cannot be read' in said
+
+
 # ---- several drives
 
 
@@ -97,6 +127,7 @@ def test_each_of_several_drives_is_judged_for_itself(days: dict[str, Any]) -> No
     assert [found['refined'] for found in told] == [True, False, True]
     assert 'm long' in told[1]['reason']
     files = {f'{kind}_{number}.tum' for kind in ('trajectory', 'odometry') for number in (1, 3)}
+    files |= {f'odometry_calibration_{number}.yaml' for number in (1, 3)}
     assert {path.name for path in days['maps'].iterdir()} == FILES | files
     assert [found['file'] for found in told] == ['trajectory_1.tum', '', 'trajectory_3.tum']
     text = ' '.join((days['maps'] / 'report.txt').read_text().split())

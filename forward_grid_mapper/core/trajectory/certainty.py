@@ -20,6 +20,7 @@ Loops say nothing of scale: a map that is larger everywhere closes as well.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -42,8 +43,11 @@ FEWEST_PIECES = 8
 STEPS = {'scale': 0.02, 'heading': math.radians(1.0)}
 """By how much scale and heading are changed: parts, and radians."""
 
-ASKED, LENGTH, SPAN = 40, 4, 6.0
+ASKED, LENGTH, SPAN = 40, 3, 5.0
 """Blocks that are asked, the windows of each, and metres of progress around it that its map is made of."""
+
+DENSITY = 80.0
+"""Readings a metre that are asked, of drives that have more: it takes time."""
 
 FEWEST_BLOCKS = 8
 
@@ -97,6 +101,22 @@ def certain(
     return {name: stated[name] for name in CALIBRATION if name in stated and stated[name].sigma <= MOST[name]}
 
 
+def after(first: Mapping[str, float], told: Mapping[str, Told]) -> dict[str, Told]:
+    """Return what a drive tells of its odometry, where `told` is of odometry that `first` was applied to."""
+    one = {name: first.get(name, 0.0) for name in CALIBRATION}
+    found = {}
+    for name, (value, sigma) in told.items():
+        if name == 'heading':
+            both = one[name] + value
+        elif name == 'bias':
+            turns = told['turn_scale'].value if 'turn_scale' in told else 0.0
+            both = (1 + turns) * one[name] + value * (1 + one['scale'])
+        else:
+            both = (1 + one[name]) * (1 + value) - 1
+        found[name] = Told(both, sigma)
+    return found
+
+
 def of_yaw(odometry: Odometry, trajectory: Odometry) -> dict[str, Told]:
     """Return bias and scale of turns from the yaw of a trajectory; empty if the drive is too short."""
     ends = np.arange(0.0, odometry.progress[-1], PIECE)
@@ -132,7 +152,8 @@ def of_ways(
 ) -> dict[str, Told]:
     """Return scale and heading as readings tell them; what they do not tell is left out."""
     parameters = replace(parameters, grid=replace(parameters.grid, resolution=0.1))
-    windows = cut(readings, odometry)
+    every = max(int(len(readings) / max(DENSITY * odometry.travel[-1], 1.0)), 1)
+    windows = cut(thinned(readings, every), odometry)
     scans = Scans(windows, parameters, stop, np.zeros_like(held_out(len(windows))))
     turned = with_yaw(odometry, odometry.progress, np.unwrap(wrapped(trajectory.pose[:, 2] - odometry.pose[:, 2])))
     blocks = blocks_of(len(windows), LENGTH, ASKED)
@@ -150,6 +171,16 @@ def of_ways(
         if told is not None:
             found[name] = Told(start[name] + step * told.value, step * told.sigma)
     return found
+
+
+def thinned(readings: Readings, every: int) -> Readings:
+    """Return every so-manieth reading of each sensor, each sensor beginning with another one."""
+    readings = readings.select(np.argsort(readings.stamp, kind='stable'))
+    stay = np.zeros(len(readings), np.bool_)
+    for number in np.unique(readings.sensor):
+        mine = np.flatnonzero(readings.sensor == number)
+        stay[mine[number % every :: every]] = True
+    return readings.select(stay)
 
 
 def top_of(low: Floats, middle: Floats, high: Floats) -> Told | None:

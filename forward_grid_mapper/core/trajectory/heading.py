@@ -215,9 +215,7 @@ def _measured(votes: Floats, yaw: Floats, correction: Floats) -> tuple[Floats, F
     return correction + np.radians(mean), np.where(mass > 0, information, 0.0)
 
 
-def heading(
-    windows: Windows, at: NDArray[np.int64], votes: Floats, noises: Sequence[float] = NOISES
-) -> Heading | None:
+def heading(windows: Windows, at: NDArray[np.int64], votes: Floats, noises: Sequence[float] = NOISES) -> Heading | None:
     """Return what walls say about the yaw; None where they agree on nothing.
 
     Parameters

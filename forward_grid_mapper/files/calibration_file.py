@@ -1,0 +1,96 @@
+"""A calibration of wheel odometry as a file: what a drive told, how certain, and how to apply it by hand."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+
+import yaml
+
+from ..core.common.errors import ParameterError
+from ..core.trajectory.certainty import Told
+from .small_text import read_text
+
+NAMES = {
+    'scale': 'travel_factor',
+    'turn_scale': 'turn_factor',
+    'bias': 'turn_per_metre_deg',
+    'heading': 'direction_deg',
+}
+"""What the figures of the core's calibration are called in the file."""
+
+MOST = {'scale': 0.5, 'turn_scale': 0.5, 'bias': math.radians(30.0), 'heading': math.radians(45.0)}
+"""The largest figures that a file may have, either way: more is no calibration but another robot."""
+
+HOW = {
+    'scale': 'multiply every way that is measured, or the radius of both wheels, by this',
+    'turn_scale': 'multiply every turn that is measured by this, or divide the distance of the wheels by it',
+    'bias': 'degrees to add to the yaw for each metre driven forwards (to the left is positive); of a robot with two '
+    'wheels, b metres apart, the right one is larger than the left one by this times b times 0.0175',
+    'heading': 'degrees to the left of where it is said to look, into which the robot drives; the odometry frame, or '
+    'the mounting of the sensors on it, is turned by so much',
+}
+
+
+def calibration_text(told: Mapping[str, Told], drive: str) -> str:
+    """Return the file of a calibration, by the names of `core.trajectory.odometry_model`; empty if nothing is told."""
+    if not told:
+        return ''
+    lines = [
+        f'# Calibration of the wheel odometry of {_plain(drive)}, as told by its sonar readings.',
+        '# Each figure has its standard deviation. They fit this drive: measure a straight line and a full turn before',
+        '# you change a wheel. process_bag applies them to other drives of this robot with --odometry-calibration.',
+    ]
+    for name, key in NAMES.items():
+        lines.append('')
+        if name not in told:
+            lines.append(f'# {key}: not known; this drive does not tell it')
+            continue
+        value, sigma = _shown(name, *told[name])
+        lines += [f'# {HOW[name]}', f'{key}: {value:.4f}  # ± {sigma:.4f}']
+    return '\n'.join(lines) + '\n'
+
+
+def load_calibration(path: Path | str) -> dict[str, float]:
+    """Return the calibration that a file has, by the names of `core.trajectory.odometry_model`.
+
+    Raises
+    ------
+    ParameterError
+        Naming the file, if it cannot be read, or holds anything else than such figures.
+    """
+    path = Path(path)
+    try:
+        document = yaml.safe_load(read_text(path, ParameterError))
+    except OSError as error:
+        raise ParameterError(f'{path} cannot be read: {error.strerror}') from error
+    except (UnicodeDecodeError, yaml.YAMLError, RecursionError, ValueError) as error:
+        raise ParameterError(f'{path} is not valid YAML: {error}') from error
+    if not isinstance(document, dict) or not document:
+        raise ParameterError(f'{path} holds no calibration, such as "travel_factor: 1.012"')
+    names = {key: name for name, key in NAMES.items()}
+    found = {}
+    for key, value in document.items():
+        if key not in names:
+            raise ParameterError(f'{path}: {key!r} is none of {", ".join(names)}')
+        name = names[key]
+        if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
+            raise ParameterError(f'{path}: {key} is {value!r}, not a finite number')
+        figure = value - 1.0 if key.endswith('factor') else math.radians(value)
+        if abs(figure) > MOST[name]:
+            raise ParameterError(f'{path}: {key} is {value:g}, which no calibration of wheels is')
+        found[name] = figure
+    return found
+
+
+def _shown(name: str, value: float, sigma: float) -> tuple[float, float]:
+    """Return a figure as the file has it."""
+    if NAMES[name].endswith('factor'):
+        return 1.0 + value, sigma
+    return math.degrees(value), math.degrees(sigma)
+
+
+def _plain(text: str) -> str:
+    """Return a name without what would end a comment."""
+    return text if text.isprintable() else text.encode('unicode_escape').decode()

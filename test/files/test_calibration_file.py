@@ -1,0 +1,63 @@
+"""The file of a calibration: what is told comes back, and what is not stays out."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import pytest
+import yaml
+
+from forward_grid_mapper.core.common.errors import ParameterError
+from forward_grid_mapper.core.trajectory.certainty import Told
+from forward_grid_mapper.files.calibration_file import calibration_text, load_calibration
+
+TOLD = {
+    'scale': Told(0.012, 0.004),
+    'heading': Told(-0.01, 0.003),
+    'bias': Told(math.radians(0.5), math.radians(0.1)),
+    'turn_scale': Told(-0.02, 0.005),
+}
+
+
+def test_what_is_told_comes_back(tmp_path: Path) -> None:
+    text = calibration_text(TOLD, 'monday')
+    (tmp_path / 'calibration.yaml').write_text(text)
+    found = load_calibration(tmp_path / 'calibration.yaml')
+    assert found == pytest.approx({name: value for name, (value, _) in TOLD.items()}, abs=2e-4)
+    figures = yaml.safe_load(text)
+    assert figures['travel_factor'] == 1.012
+    assert figures['turn_per_metre_deg'] == 0.5
+    assert '1.0120  # ± 0.0040' in text
+    assert 'of monday' in text
+
+
+def test_what_is_not_told_is_left_out_in_words() -> None:
+    text = calibration_text({'bias': TOLD['bias']}, 'two\nlines')
+    assert list(yaml.safe_load(text)) == ['turn_per_metre_deg']
+    assert '# travel_factor: not known; this drive does not tell it' in text
+    assert calibration_text({}, 'monday') == ''
+
+
+@pytest.mark.parametrize(
+    ('text', 'said'),
+    [
+        ('', 'holds no calibration'),
+        ('- 1.0', 'holds no calibration'),
+        ('travel_factor: [', 'is not valid YAML'),
+        ('travel: 1.0', "'travel' is none of travel_factor"),
+        ('travel_factor: fast', "'fast', not a finite number"),
+        ('travel_factor: true', 'not a finite number'),
+        ('travel_factor: .nan', 'not a finite number'),
+        ('travel_factor: 0.3', 'which no calibration of wheels is'),
+        ('turn_per_metre_deg: 90', 'which no calibration of wheels is'),
+    ],
+)
+def test_what_is_wrong_is_told_with_the_file(tmp_path: Path, text: str, said: str) -> None:
+    file = tmp_path / 'calibration.yaml'
+    file.write_text(text)
+    with pytest.raises(ParameterError, match='calibration') as caught:
+        load_calibration(file)
+    assert said in str(caught.value)
+    with pytest.raises(ParameterError, match='absent'):
+        load_calibration(tmp_path / 'absent.yaml')
