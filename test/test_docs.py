@@ -22,6 +22,8 @@ ALLOWED = {
     'trajectory.tum': 'a file that process_bag writes',
     'odometry.tum': 'a file that process_bag writes',
     'trajectory_1.tum': 'a file that process_bag writes',
+    'odometry_calibration.yaml': 'a file that process_bag writes',
+    'reference.tum': 'a file that simulate writes',
     'evo_ape tum': 'a command of evo',
     'mode: raw': 'a line of map_server files',
     'use_sim_time:=true': 'a parameter of every ROS node',

@@ -12,14 +12,17 @@ from ..bags.writer import BagWriter, check_bag_path
 from ..core.common.errors import ParameterError
 from ..core.common.shell import command_line
 from ..core.messages.message_types import OdometryMessage, RangeMessage
+from ..core.trajectory.windows import Odometry
 from ..files.map_files import write_trinary
 from ..files.output_folder import output_errors, output_folder
+from ..files.trajectory_text import tum_text
 from ..simulation.drift import LEVELS, with_drift
 from ..simulation.drive import BASE_FRAME, START, Recording, corridor_drive, door_drive
 from ..simulation.sonar import NOISE_FREE, NOISY, SonarArray, front_array, sonar_ring
 from .console import Ticker, run
 
 COMMAND = 'simulate'
+REFERENCE = 'reference.tum'
 FORMATS = {'mcap': 'bag', 'sqlite3': 'bag', 'ros1': 'drive.bag'}
 SONARS: dict[str, Callable[[], SonarArray]] = {'ring': sonar_ring, 'front': front_array}
 
@@ -107,6 +110,15 @@ def write_recording(folder: Path, recording: Recording, format: str = 'mcap', ea
     return path
 
 
+def write_reference(folder: Path, recording: Recording) -> None:
+    """Write the true pose at each odometry message into an existing folder; `recording` is the one without drift."""
+    messages = recording.odometry
+    poses = np.array([message.pose for message in messages], np.float64)
+    true = Odometry.of(np.array([message.stamp for message in messages], np.int64), poses)
+    with output_errors(folder):
+        (folder / REFERENCE).write_text(tum_text(true), encoding='utf-8')
+
+
 def simulate(options: argparse.Namespace) -> int:
     """Do what the command line asks for."""
     with Ticker(options.quiet) as ticker:
@@ -123,13 +135,18 @@ def simulate(options: argparse.Namespace) -> int:
                 options.seed,
                 SONARS[options.sonars](),
             )
+            true = recording
             if options.drift:
                 recording = with_drift(recording, LEVELS[options.drift], options.seed)
             ticker.say('writing')
             bag = write_recording(folder, recording, options.format, options.topics == 'each').name
+            if options.drift:
+                write_reference(folder, true)
     if not options.quiet:
         print(f'{len(recording.ranges):,} readings and {len(recording.odometry):,} odometry messages')
-        print(f'bag, reference.yaml and trajectory.csv are in {options.output}; map it with')
+        files = 'bag, reference.yaml, trajectory.csv and' if options.drift else 'bag, reference.yaml and'
+        files += f' {REFERENCE}, the true trajectory for evo,' if options.drift else ' trajectory.csv'
+        print(f'{files} are in {options.output}; map it with')
         refine = ['--refine-poses'] if options.drift else []
         print(f'  {command_line("process_bag", Path(options.output) / bag, *refine)}')
     return 0

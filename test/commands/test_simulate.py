@@ -10,6 +10,7 @@ from drive_samples import code_of, everything_in, in_turn, mapped, tape
 
 from forward_grid_mapper.bags.reader import Bag
 from forward_grid_mapper.commands import simulate
+from forward_grid_mapper.core.messages.message_types import OdometryMessage
 from forward_grid_mapper.files.map_files import read_map
 from forward_grid_mapper.simulation.drive import door_drive
 from forward_grid_mapper.simulation.sonar import NOISY, front_array
@@ -37,6 +38,21 @@ def test_the_recording(tmp_path: Path, kind: str, name: str, capsys: pytest.Capt
     path_xy = np.loadtxt(folder / 'trajectory.csv', delimiter=',')
     robot = door_drive(1, NOISY, 0, front_array()).robot
     np.testing.assert_allclose(path_xy, robot[:, :2], atol=1e-4)
+
+
+def test_drift_leaves_the_true_trajectory_beside_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = tmp_path / 'drive'
+    assert code_of(simulate.main, *SMALL, '--drift', 'high', '-o', folder) == 0
+    assert 'reference.tum, the true trajectory for evo' in capsys.readouterr().out
+    true = np.loadtxt(folder / 'reference.tum')
+    with Bag(folder / 'bag') as bag:
+        messages = [m for m in bag.messages(bag.choose_topics()) if isinstance(m, OdometryMessage)]
+    assert len(true) == len(messages)
+    np.testing.assert_allclose(true[:, 0], [m.stamp * 1e-9 for m in messages], atol=1e-6)
+    exact = np.array([m.pose for m in tape().odometry])
+    np.testing.assert_allclose(true[:, 1:3], exact[:, :2], atol=1e-6)
+    off = np.hypot(*(true[:, 1:3] - np.array([m.pose[:2] for m in messages])).T)
+    assert off[0] < 1e-6 and off.max() > 0.02
 
 
 def test_options_change_the_recording(tmp_path: Path) -> None:

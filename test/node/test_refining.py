@@ -86,7 +86,11 @@ def test_the_maps_of_a_bent_drive_are_those_of_the_offline_tool(
     for name in ('trajectory.tum', 'odometry.tum'):
         assert (saved / name).read_bytes() == (tmp_path / 'maps' / name).read_bytes()
     reports = [json.loads((folder / 'report.json').read_text()) for folder in (saved, tmp_path / 'maps')]
-    assert reports[0]['input']['trajectory'] == reports[1]['input']['trajectory']
+    node, offline = (report['input']['trajectory'] for report in reports)
+    # what the drive tells of its wheels for certain is asked offline alone
+    asked = {'told', 'odometry', 'calibrated'}
+    assert offline.keys() - node.keys() == {'told', 'calibrated'}
+    assert {k: v for k, v in node.items() if k not in asked} == {k: v for k, v in offline.items() if k not in asked}
     assert reports[0]['input']['trajectory']['refined']
     assert (reports[0]['input']['odom_frame'], reports[0]['input']['map_frame']) == ('odom', 'map')
     assert {name: robot.maps[name][-1].header.frame_id for name in robot.maps} == dict.fromkeys(robot.maps, 'map')
