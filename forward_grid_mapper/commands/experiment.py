@@ -1,4 +1,4 @@
-"""`experiment`: the paper's figures 3 to 6, each as a table and a figure."""
+"""`experiment`: the paper's figures 3 to 6, and maps from odometry that drifts, each as a table and a figure."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from ..files.figure import write_density, write_figure
 from ..files.output_folder import free_name, output_errors, output_folder
 from .console import Ticker, run
 from .experiment_density import density_of_ranges, density_table
+from .experiment_drift import drift
 from .experiment_maps import corridor, door, passer_by
 from .options import add_mapping_options, chosen_parameters
 
@@ -35,9 +36,10 @@ def parser() -> argparse.ArgumentParser:
     )
     made.add_argument(
         'which',
-        choices=('density', *MAPS),
+        choices=('density', *MAPS, 'drift'),
         help='Fig. 3: the density of a range; Fig. 4: a door seen n times; Fig. 5: two doors on either side, and a '
-        'person who walks by; Fig. 6: a long corridor',
+        "person who walks by; Fig. 6: a long corridor; drift: wheel odometry that drifts, with the paper's corridor "
+        'and a building of ours',
     )
     made.add_argument('-o', '--output', metavar='DIR', help='new folder (default: experiment_WHICH)')
     made.add_argument('--seeds', type=int, default=5, metavar='N', help='noises to average over (default 5)')
@@ -54,8 +56,12 @@ def experiment(options: argparse.Namespace) -> int:
         print(f'{COMMAND}: warning: {warning}', file=sys.stderr)
     output = Path(options.output) if options.output else free_name(Path.cwd(), f'experiment_{options.which}')
     with Ticker() as ticker, output_folder(output) as folder:
-        drawn = options.which == 'density'
-        table = density(folder, parameters) if drawn else maps(folder, options, parameters, ticker)
+        if options.which == 'density':
+            table = density(folder, parameters)
+        elif options.which == 'drift':
+            table = drifting(folder, options, parameters, ticker)
+        else:
+            table = maps(folder, options, parameters, ticker)
         with output_errors(folder):
             (folder / 'table.txt').write_text(table + '\n', encoding='utf-8')
     print(table)
@@ -77,6 +83,15 @@ def maps(folder: Path, options: argparse.Namespace, parameters: Parameters, tick
     ticker.say('drawing')
     left, right, bottom, top = rows[0][0].grid.extent
     write_figure(folder / 'figure.png', title, rows, (left, right, bottom, top))
+    return table
+
+
+def drifting(folder: Path, options: argparse.Namespace, parameters: Parameters, ticker: Ticker) -> str:
+    """Draw maps from odometry that drifts, a figure for each world; return the table."""
+    table, figures = drift(options, parameters, ticker)
+    ticker.say('drawing')
+    for name, (rows, view) in figures.items():
+        write_figure(folder / f'figure_{name}.png', f'Wheel odometry that drifts, {name}', rows, view)
     return table
 
 

@@ -27,7 +27,7 @@ from .panels import Box, Picture, coarse
 # uncertain cell looks like neither. Path, dots and the path by odometry are blue, vermilion and purple of
 # the Okabe-Ito palette.
 _FREE, _OCCUPIED, UNKNOWN = '#ffffff', '#14171c', '#cfd9e4'
-PATH, DOT, _BEFORE = '#0072b2', '#d55e00', '#cc79a7'
+PATH, DOT, BEFORE = '#0072b2', '#d55e00', '#cc79a7'
 INK, FRAME = '#22262b', '#8b96a3'
 _PROBABILITY = LinearSegmentedColormap.from_list(
     'occupancy', [(0.0, _FREE), (0.2, '#fdf0d2'), (0.5, '#eeb04d'), (0.78, '#8a4a1c'), (1.0, _OCCUPIED)]
@@ -154,7 +154,7 @@ def _draw_overlay(axes: Axes, picture: Picture) -> None:
         return
     before = picture.odometry_xy
     if len(before):
-        axes.plot(before[:, 0], before[:, 1], color=_BEFORE, linewidth=1.1, linestyle=(0, (4, 2)), zorder=3.5)
+        axes.plot(before[:, 0], before[:, 1], color=BEFORE, linewidth=1.1, linestyle=(0, (4, 2)), zorder=3.5)
     halo = [patheffects.withStroke(linewidth=2.4, foreground='white', alpha=0.9)]
     for path in paths:
         x, y = path.T
@@ -221,7 +221,7 @@ def _foot(figure: Figure, picture: Picture) -> None:
         if count <= _MOST_MARKED:
             handles += [_marker_line(start, 0, 0, label='start'), _marker_line(end, 0, 0, label='end')]
     if len(picture.odometry_xy):
-        handles.append(Line2D([], [], color=_BEFORE, linewidth=1.3, linestyle=(0, (4, 2)), label='by odometry'))
+        handles.append(Line2D([], [], color=BEFORE, linewidth=1.3, linestyle=(0, (4, 2)), label='by odometry'))
     if count := len(picture.unexplained_xy):
         label = f'unexplained reading ({count:,})'
         handles.append(Line2D([], [], linestyle='none', marker='o', markersize=4, color=DOT, mew=0, label=label))

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Wedge
 
 from ..core.common.readings import Readings
-from .drawing import CAPTION, DOT, DPI, EDGE, FRAME, GAP, HEAD, INK, PATH, UNKNOWN, WIDE, draw_map, draw_scale
+from .drawing import BEFORE, CAPTION, DOT, DPI, EDGE, FRAME, GAP, HEAD, INK, PATH, UNKNOWN, WIDE, draw_map, draw_scale
 from .panels import Curve, Tile
 
 
@@ -41,6 +41,7 @@ def draw_table(path: Path, title: str, rows: Sequence[Sequence[Tile]], view: tup
             draw_scale(axes, view)
             if tile.readings is not None:
                 _draw_cones(axes, tile.readings)
+            _draw_ways(axes, tile)
             axes.set_title(tile.title, loc='left', fontsize=9.5, color=INK, pad=4)
             for spine in axes.spines.values():
                 spine.set(color=FRAME, linewidth=0.7)
@@ -73,6 +74,15 @@ def draw_density(path: Path, title: str, tile: Tile, curve: Curve) -> None:
             spine.set(color=FRAME, linewidth=0.7)
     above.tick_params(labelbottom=False)
     figure.savefig(path)
+
+
+def _draw_ways(axes: Axes, tile: Tile) -> None:
+    if tile.odometry_xy is not None:
+        axes.plot(*tile.odometry_xy.T, color=BEFORE, linewidth=1.1, linestyle=(0, (4, 2)), label='odometry')
+    if tile.path_xy is not None:
+        axes.plot(*tile.path_xy.T, color=PATH, linewidth=1.1, label='path')
+    if tile.path_xy is not None and tile.odometry_xy is not None:
+        axes.legend(loc='lower right', fontsize=7.5, framealpha=0.9, borderpad=0.3)
 
 
 def _draw_cones(axes: Axes, readings: Readings) -> None:

@@ -17,7 +17,8 @@ Box = tuple[float, float, float, float]
 class Tile(NamedTuple):
     """One map of the table: `values` are probabilities, or cells 0 and 1, with NaN or -1 where unknown.
 
-    The cones of `readings` are drawn over it, and the cells that are True in `marked` in the colour of dots.
+    The cones of `readings` are drawn over it, and the cells that are True in `marked` in the colour of dots. `path_xy`
+    and `odometry_xy` are ways of a robot, float64 of shape (P, 2) in metres: a line, and a dashed one.
     """
 
     title: str
@@ -25,6 +26,8 @@ class Tile(NamedTuple):
     values: NDArray[Any]
     readings: Readings | None = None
     marked: NDArray[np.bool_] | None = None
+    path_xy: NDArray[np.float64] | None = None
+    odometry_xy: NDArray[np.float64] | None = None
 
 
 class Curve(NamedTuple):

@@ -117,6 +117,13 @@ class EmService:
         else:
             self._start(done)
 
+    def run_by_itself(self) -> bool:
+        """Begin a run that nobody asked for; return whether it began: not while one goes on, nor without readings."""
+        if self.current is not None or not len(self._associator.buffer):
+            return False
+        self._start(lambda outcome: None)
+        return True
+
     def cancel(self, reply: Reply) -> None:
         """Cancel the run that goes on, forget nothing, and answer when it has ended."""
         run = self.current

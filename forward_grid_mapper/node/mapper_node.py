@@ -118,6 +118,7 @@ class MapperNode(ManagedNode):
         trajectory.begin()
         self.live = LiveMap(self.parameters, self._show_live, log.error, lambda: kernels.wait('live map'))
         self.em = EmService(lambda: self.parameters, self.associator, trajectory, self.maps, inbox, kernels, log)
+        trajectory.refine = lambda: self.mapping and self.em.run_by_itself()
         self._extrinsics = extrinsics
         self.em.extrinsics, self.em.mounts = lambda: extrinsics.fixed, lambda: extrinsics.known
         self.online = self.em.online = self._online_worker(kernels) if node.online else None

@@ -17,8 +17,10 @@ from ..core.common.parameters import Parameters
 from ..core.common.readings import Readings
 from ..core.mapping import Mapper
 from ..core.maps.log_odds_map import LogOddsMap
+from ..core.messages.message_types import Pose2
 from ..core.messages.pose_association import PoseAssociator
 from ..core.trajectory.correction import Correction
+from ..core.trajectory.windows import Odometry
 from ..files.trajectory_text import calibration_words
 from .background import Worker
 from .diagnostics import status
@@ -27,6 +29,17 @@ from .refining import Drive, Found, RefiningMapper, outcome_words
 
 MAP = 'map'
 """Name of the map frame where `map_frame` gives none (REP 105)."""
+
+
+GROWS = 0.5
+"""Metres of driving after which the path is published again."""
+
+LONGEST_STEP = 1.0
+"""Metres between two looks at odometry that are driving; more is a jump."""
+
+GROWN = 0.1
+"""Part of the drive that must be new for the node to refine by itself: a run looks at all of it, so that runs after
+equal ways would cost more and more."""
 
 
 class Trajectory:
@@ -45,6 +58,10 @@ class Trajectory:
     changed : callable
         Called when maps are to be made anew: with the live map, None if only the frame changed, and with the number of
         readings in it.
+    refine : callable
+        Called when the drive has grown by `refine_every`; returns whether a run was begun.
+    driven : float
+        Metres since the drive began, as far as they were looked at.
     """
 
     def __init__(self, node: Any, associator: PoseAssociator, clock: Any) -> None:
@@ -57,6 +74,11 @@ class Trajectory:
         self.correction: Correction | None = None
         self.found: Found | None = None
         self.changed: Callable[[LogOddsMap | None, int], object] = lambda live, count: None
+        self.refine: Callable[[], bool] = lambda: False
+        self.driven = self._refined_at = self._shown_at = 0.0
+        self._at: Pose2 | None = None
+        self._since = -1
+        self._showing = False
 
     @property
     def obstacle(self) -> str:
@@ -92,7 +114,10 @@ class Trajectory:
     def begin(self) -> None:
         """Begin a drive, with the trajectory of odometry."""
         self.correction = self.found = None
-        self.correction = self.found = None
+        self.driven = self._refined_at = self._shown_at = 0.0
+        self._at, newest = None, self._associator.record.newest
+        # the path begins with the drive
+        self._since = -1 if newest is None else newest[0]
         self._switch(self._parameters.node.refine_poses)
         if self._out is not None:
             self._out.forget()
@@ -100,6 +125,7 @@ class Trajectory:
 
     def mapper(self, parameters: Parameters, drive: Callable[[], Drive]) -> RefiningMapper | Mapper:
         """Return what makes the maps of a run; `drive` returns what it was begun with."""
+        self._refined_at = self.driven
         refine, bent = parameters.node.refine_poses and not self.obstacle, self.correction is not None
         return RefiningMapper(parameters, drive, refine, bent) if refine or bent else Mapper(parameters)
 
@@ -128,6 +154,7 @@ class Trajectory:
             'map frame': self.frame,
             'transform': 'on TF' if self._out is None or self._out.by_tf else 'none: tf2_ros is not installed',
             'poses of odometry kept': len(self._associator.record),
+            'driven since the latest run (m)': f'{self.driven - self._refined_at:.1f}',
         }
         refinement = self.found.refinement if self.found else None
         if refinement is not None and self.correction is not None:
@@ -160,10 +187,43 @@ class Trajectory:
             self._out.forget()
         correction = np.zeros(3) if self.correction is None else self.correction.last
         self._out.send((self.frame, associator.map_frame, associator.base_frame), correction, newest)
+        self._drive_on(newest[1])
+
+    def _drive_on(self, pose: Pose2) -> None:
+        """Count the way, and do what is due after it."""
+        step = 0.0 if self._at is None else math.dist(self._at[:2], pose[:2])
+        self._at = pose
+        self.driven += step if step <= LONGEST_STEP else 0.0
+        if self.driven - self._shown_at >= GROWS and not self._showing:
+            self._show_path()
+        every = self._parameters.node.refine_every
+        if not every or not self._parameters.node.refine_poses:
+            return
+        if self.driven - self._refined_at >= max(every, GROWN * self.driven) and self.refine():
+            self._refined_at = self.driven
 
     def _show_path(self) -> None:
-        out, frame, found = self._out, self.frame, self.found
-        trajectory = found.refinement.trajectory if found and found.refinement else None
+        """Have the trajectory published, and behind its end the poses of odometry as they are on the map."""
+        out, frame, correction, since = self._out, self.frame, self.correction, self._since
+        if out is None or self.publishing is None:
+            return
         stamp = self._node.get_clock().now().to_msg()
-        if out is not None and self.publishing is not None:
-            self.publishing.put(lambda: out.publish_path(frame, trajectory, stamp))
+        if not self.on:
+            self.publishing.put(lambda: out.publish_path(frame, None, stamp))
+            return
+        # snapshots never change
+        stamps, poses = self._associator.record.snapshot()
+        self._shown_at, self._showing = self.driven, True
+
+        def publish() -> None:
+            self._showing = False
+            first = int(np.searchsorted(stamps, since, side='right'))
+            path = Odometry(stamps[first:], poses[first:])
+            if correction is not None:
+                path = correction.extended(path.stamp, path.pose)
+            out.publish_path(frame, path, stamp)
+
+        self.publishing.put(publish, self._not_shown)
+
+    def _not_shown(self, why: str) -> None:
+        self._showing = False

@@ -312,6 +312,14 @@ class NodeParameters:
         'Take the drift out of odometry when run_em is called, and publish the transform from map to odom. Needs walls '
         "at right angles; odometry's poses stay where readings that were held out do not speak for others.",
     )
+    refine_every: float = _param(
+        0.0,
+        'With refine_poses, metres driven after which the node runs EM by itself, so that the transform from map to '
+        'odom follows the drift; later runs wait until the drive has grown by a tenth. 0: only when run_em is called.',
+        'm',
+        0.0,
+        1e6,
+    )
     online: bool = _param(
         False,
         'Keep the maximum likelihood map and the uncertainty map up to date with every reading, and start EM from '

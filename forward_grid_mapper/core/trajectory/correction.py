@@ -60,7 +60,11 @@ class Correction:
         return at_poses(readings, placed)
 
     def path_of(self, stamp: np.ndarray, pose: Floats) -> Floats:
-        """Return the robot's path, shape (P, 2), metres: the trajectory, and poses of odometry after its end.
+        """Return the robot's path, shape (P, 2), metres; the parameters are those of `extended`."""
+        return self.extended(stamp, pose).pose[:, :2]
+
+    def extended(self, stamp: np.ndarray, pose: Floats) -> Odometry:
+        """Return the trajectory, and after its end poses of odometry as they are on the map.
 
         Parameters
         ----------
@@ -69,5 +73,7 @@ class Correction:
         pose : float64, shape (M, 3)
             As odometry gives them.
         """
-        later = compose(self.last, pose[np.searchsorted(stamp, self.end, side='right') :])
-        return np.concatenate([self.trajectory.pose[:, :2], later[:, :2]])
+        after = int(np.searchsorted(stamp, self.end, side='right'))
+        later = compose(self.last, pose[after:])
+        path = self.trajectory
+        return Odometry(np.concatenate([path.stamp, stamp[after:]]), np.concatenate([path.pose, later]))
