@@ -72,7 +72,11 @@ class Picture(NamedTuple):
     @property
     def paths(self) -> list[NDArray[np.float64]]:
         """The path of each drive, none of them empty."""
-        known = np.isfinite(self.path_xy).all(axis=1)
-        parts = np.split(self.path_xy, np.flatnonzero(~known))
-        parts = [part[np.isfinite(part).all(axis=1)] for part in parts]
-        return [part for part in parts if len(part)]
+        return paths_of(self.path_xy)
+
+
+def paths_of(xy: NDArray[np.float64]) -> list[NDArray[np.float64]]:
+    """Return paths that rows of NaN part, none of them empty."""
+    parts = np.split(xy, np.flatnonzero(~np.isfinite(xy).all(axis=1)))
+    parts = [part[np.isfinite(part).all(axis=1)] for part in parts]
+    return [part for part in parts if len(part)]

@@ -30,7 +30,7 @@ def write_results(
     title: str,
     reference: tuple[Grid, NDArray[np.int8]] | None = None,
     extras: Mapping[str, str] | None = None,
-    odometry_xy: NDArray[np.float64] | None = None,
+    odometry_xy: NDArray[np.float64] = NOWHERE,
     judged: Sequence[str] | None = None,
 ) -> dict[str, Any]:
     """Write maps, archive, picture, page and report into a new folder; nothing is left if any of them fails.
@@ -50,7 +50,7 @@ def write_results(
         The true map, for the picture.
     extras : mapping of str to str, optional
         More text files, by name.
-    odometry_xy : float64, shape (Q, 2), optional
+    odometry_xy : float64, shape (Q, 2)
         The path that odometry gives, metres, where the robot was elsewhere.
     judged : sequence of str, optional
         What `data_warnings` says of the maps, if that is known.
@@ -75,14 +75,13 @@ def write_results(
             *(source.get('warnings') or []),
             *(data_warnings(maps, source) if judged is None else judged),
         ]
-        before = NOWHERE if odometry_xy is None else odometry_xy
         try:
-            write_picture(folder / 'maps.png', maps, path_xy, title, reference, before)
+            write_picture(folder / 'maps.png', maps, path_xy, title, reference, odometry_xy)
         except OutputError as error:
             warnings.append(f'no picture was drawn: {error}')
         report = report_data(maps, {**source, 'warnings': warnings})
         try:
-            write_page(folder / 'report.html', maps, report, title, path_xy, before, reference)
+            write_page(folder / 'report.html', maps, report, title, path_xy, odometry_xy, reference)
         except OutputError as error:
             report['warnings'].append(f'report.html was not written: {error}')
         write_report(folder, report)

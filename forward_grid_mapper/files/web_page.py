@@ -25,6 +25,7 @@ from ..core.common.errors import OutputError
 from ..core.common.grid import UNKNOWN, Grid
 from ..core.maps.cell_evidence import HERE, NOTHING, prior_odds
 from ..core.maps.map_set import MapSet
+from ..core.maps.reading_causes import likeliest_causes
 from ..core.maps.traversed import traversed_cells
 from ..core.messages.message_types import NANOSECONDS
 from ..core.sensor.density import CUT, causes_of
@@ -47,9 +48,6 @@ MOST_POINTS = 4000
 UNKNOWN_SHARE = 65535
 STEPS = 10_000
 """Steps of probabilities on the page."""
-
-CAUSES = ('hit', 'random', 'lost', 'no_echo')
-"""Causes of a reading as `Expectations` has them, in the order of the page."""
 
 _CONE = ('x', 'y', 'axis_x', 'axis_y', 'sine', 'cosine', 'z', 'z_max', 'sigma', 'reach')
 
@@ -166,15 +164,11 @@ def page_data(
 def _readings(maps: MapSet) -> dict[str, NDArray[Any]]:
     """Return the columns from which the page computes what each reading says of a cell."""
     forward, readings = maps.forward_model(), maps.readings
-    expected = forward.expectations(maps.ml)
-    likely = np.stack([getattr(expected, name) for name in CAUSES])
-    # as in the report: random where that is likelier than all else together
-    likely[CAUSES.index('random')] = np.where(maps.unexplained, 2.0, 0.0)
     causes = causes_of(readings, forward.cones['sigma'] * maps.grid.resolution, forward.model, maps.grid.resolution)
     columns: dict[str, NDArray[Any]] = {name: forward.cones[name] for name in _CONE}
     columns |= {'random': causes.random, 'lost': causes.lost, 'max_range': causes.max_range}
     columns |= {'stamp': readings.stamp / NANOSECONDS}
-    columns |= {'sensor': readings.sensor.astype(np.uint16), 'cause': likely.argmax(axis=0).astype(np.uint8)}
+    columns |= {'sensor': readings.sensor.astype(np.uint16), 'cause': likeliest_causes(maps)}
     if len(maps.normals.known):
         columns |= {'normal_x': maps.normals.x, 'normal_y': maps.normals.y}
     return columns

@@ -102,6 +102,28 @@ def test_without_a_desktop_show_says_what_to_open(
     assert page.as_uri() in capsys.readouterr().err
 
 
+def test_rerun_writes_the_drive_and_says_how_to_play_it(
+    tmp_path: Path, bag: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip('rerun', reason='the extra rerun is not installed')
+    assert code_of(process_bag.main, bag, '-o', tmp_path / 'my maps', '--rerun') == 0
+    line = capsys.readouterr().out.splitlines()[-1]
+    words = shlex.split(line)
+    assert words[1:] == ['-m', 'rerun', str(tmp_path / 'my maps' / 'drive.rrd')]
+    # its viewer needs a screen, what checks a file does not
+    done = subprocess.run([*words[:3], 'rrd', 'verify', words[3]], capture_output=True, check=False)
+    assert done.returncode == 0, done.stderr
+
+
+def test_without_rerun_nothing_is_begun(
+    tmp_path: Path, bag: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, 'rerun', None)
+    assert code_of(process_bag.main, bag, '-o', tmp_path / 'maps', '--rerun') == 1
+    assert 'forward_grid_mapper[rerun]' in capsys.readouterr().err
+    assert not (tmp_path / 'maps').exists()
+
+
 def test_commands_and_their_options_are_completed() -> None:
     made = completion.parser_of_all(COMMANDS, 'forward_grid_mapper', ['forward_grid_mapper', 'learn', '--ro'])
     (below,) = [action for action in made._actions if isinstance(action, argparse._SubParsersAction)]

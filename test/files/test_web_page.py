@@ -19,6 +19,7 @@ from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.mapping import Mapper
 from forward_grid_mapper.core.maps.cell_evidence import cell_evidence
 from forward_grid_mapper.core.maps.map_set import MapSet
+from forward_grid_mapper.core.maps.reading_causes import CAUSES, RANDOM
 from forward_grid_mapper.files import web_page
 from forward_grid_mapper.files.report import report_data
 from forward_grid_mapper.files.results import write_results
@@ -179,9 +180,9 @@ def test_the_page_holds_the_maps(tmp_path: Path) -> None:
         assert ((steps == web_page.UNKNOWN_SHARE) == np.isnan(values)).all()
         assert np.nanmax(np.abs(np.where(np.isnan(values), np.nan, steps / web_page.STEPS) - values)) < 1e-4
     causes = array(data, 'cause')
-    assert np.count_nonzero(causes == web_page.CAUSES.index('random')) == np.count_nonzero(maps.unexplained)
+    assert np.count_nonzero(causes == RANDOM) == np.count_nonzero(maps.unexplained)
     # p_lost is part of the model, so silence is one or the other
-    silent = np.isin(causes, [web_page.CAUSES.index('lost'), web_page.CAUSES.index('no_echo')])
+    silent = np.isin(causes, [CAUSES.index('lost'), CAUSES.index('no_echo')])
     assert not (silent & maps.readings.echo & (maps.readings.z < maps.readings.z_max - 1.0)).any()
     assert array(data, 'path').tolist() == PATH.ravel().tolist()
 
