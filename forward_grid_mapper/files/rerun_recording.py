@@ -20,7 +20,7 @@ from ..core.maps.moments import moments
 from ..core.maps.reading_causes import CAUSES, likeliest_causes
 from .map_files import occupancy_values
 from .output_folder import output_errors
-from .panels import Box, paths_of
+from .panels import DRIVES, Box, paths_of
 from .picture import NOWHERE, view_of
 
 NAME = 'drive.rrd'
@@ -54,7 +54,7 @@ COLOURS = {'hit': (0, 158, 115), 'random': (213, 94, 0), 'lost': (204, 121, 167)
 DOTS = {'hit': -1.2}
 """Radii of dots in pixels, negative as Rerun has them; echoes of walls must not hide them."""
 
-PATH, ODOMETRY, CONE = (0, 114, 178), (204, 121, 167), (0, 158, 115)
+ODOMETRY, CONE = '#cc79a7', (0, 158, 115)
 
 Points = NDArray[np.float32]
 
@@ -165,9 +165,14 @@ def _grid_map(grid: Grid, values: NDArray[Any]) -> Any:
 def _log_paths(recording: Any, path_xy: NDArray[np.float64], odometry_xy: NDArray[np.float64]) -> None:
     import rerun as rr
 
-    for name, xy, colour in (('path', path_xy, PATH), ('odometry', odometry_xy, ODOMETRY)):
-        if lines := [_lifted(part) for part in paths_of(xy) if len(part) > 1]:
-            recording.log(f'robot/{name}', rr.LineStrips3D(lines, colors=[colour], radii=[-1.5]), static=True)
+    kinds = (('path', path_xy, DRIVES), ('odometry', odometry_xy, (ODOMETRY,)))
+    for name, xy, colours in kinds:
+        kept = [(_lifted(part), colours[k % len(colours)]) for k, part in enumerate(paths_of(xy)) if len(part) > 1]
+        if kept:
+            lines = rr.LineStrips3D(
+                [line for line, _ in kept], colors=[list(bytes.fromhex(colour[1:])) for _, colour in kept], radii=[-1.5]
+            )
+            recording.log(f'robot/{name}', lines, static=True)
 
 
 def _log_readings(recording: Any, readings: Readings, causes: NDArray[np.uint8]) -> list[str]:

@@ -75,8 +75,9 @@ def write_results(
             *(source.get('warnings') or []),
             *(data_warnings(maps, source) if judged is None else judged),
         ]
+        drives = [str(drive.get('bag')) for drive in source.get('drives') or ()]
         try:
-            write_picture(folder / 'maps.png', maps, path_xy, title, reference, odometry_xy)
+            write_picture(folder / 'maps.png', maps, path_xy, title, reference, odometry_xy, drives)
         except OutputError as error:
             warnings.append(f'no picture was drawn: {error}')
         report = report_data(maps, {**source, 'warnings': warnings})

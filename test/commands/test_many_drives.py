@@ -22,6 +22,7 @@ from forward_grid_mapper.core.maps.traversed import traversed_cells
 from forward_grid_mapper.core.messages.message_types import NANOSECONDS, Pose2
 from forward_grid_mapper.files import drawing
 from forward_grid_mapper.files.map_archive import read_npz
+from forward_grid_mapper.files.panels import paths_of
 from forward_grid_mapper.files.reading_archive import read_readings
 from forward_grid_mapper.recordings.drive import Part
 from forward_grid_mapper.recordings.drives import Drives, read_drives
@@ -182,7 +183,7 @@ def test_the_picture_has_a_path_for_each_drive(days: Path, tmp_path: Path, monke
     pictures = []
     monkeypatch.setattr(drawing, 'draw', lambda path, picture: (pictures.append(picture), path.write_bytes(b'')))
     mapped(days, tmp_path / 'maps')
-    paths = pictures[0].paths
+    paths = paths_of(pictures[0].path_xy)
     assert len(paths) == 3
     for path, bag in zip(paths, sorted(days.iterdir()), strict=True):
         np.testing.assert_array_equal(path, read(bag).path_xy)
