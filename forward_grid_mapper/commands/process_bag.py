@@ -38,8 +38,10 @@ from .options import (
     add_json_option,
     add_mapping_options,
     add_part_options,
+    add_show_option,
     chosen_parameters,
     chosen_part,
+    chosen_poses,
 )
 
 SMALLEST_TILE = 1.0
@@ -89,7 +91,7 @@ def parser() -> argparse.ArgumentParser:
     )
     made.add_argument('-q', '--quiet', action='store_true', help='print nothing but errors and the folder')
     add_json_option(made)
-    made.add_argument('--show', action='store_true', help="open the report with the desktop's browser")
+    add_show_option(made, 'the report')
     add_mapping_options(made)
     return made
 
@@ -100,7 +102,7 @@ def process(options: argparse.Namespace) -> int:
     extrinsics |= dict(parse_sensor(text) for text in options.sensor)
     if options.learn < 0:
         raise ParameterError('--learn: the number of rounds must not be negative')
-    part = chosen_part(options)
+    part, poses = chosen_part(options), chosen_poses(options)
     if options.tiles is not None and not (math.isfinite(options.tiles) and options.tiles >= SMALLEST_TILE):
         raise ParameterError(f'--tiles {options.tiles:g}: give the edge of a tile in metres, {SMALLEST_TILE:g} or more')
     if options.rerun:
@@ -119,6 +121,7 @@ def process(options: argparse.Namespace) -> int:
             part,
             ticker.reading,
             ticker.say,
+            poses,
         )
         source = drives.source
         source['warnings'] += ignored

@@ -23,6 +23,7 @@ from ..files.quality_warning import thinned
 from .contradictions import Described, check_frames, contradictions, listed, shared_echoes
 from .drive import WHOLE, Drive, Part, thinning_note
 from .finding import SUFFIXES, find_recordings
+from .given_poses import GivenPoses
 from .read_drive import read_drive
 
 MOST_ERRORS = 5
@@ -93,6 +94,7 @@ def read_drives(
     part: Part = WHOLE,
     progress: Callable[[int, int], None] | None = None,
     say: Watch = lambda text: None,
+    poses: GivenPoses | None = None,
 ) -> Drives:
     """Read all drives that `words` mean (`find_recordings`).
 
@@ -107,6 +109,8 @@ def read_drives(
         Called with (done, total) messages of a drive.
     say : callable, optional
         Called with the name of each drive as it is read, where there are several.
+    poses : GivenPoses, optional
+        Of all drives, as `read_drive` takes them.
 
     Raises
     ------
@@ -115,14 +119,14 @@ def read_drives(
     """
     paths, repeated = _without_repetition(find_recordings(words))
     if len(paths) == 1:
-        drive = read_drive(paths[0], parameters, extrinsics, range_topics, odom_topic, progress, part)
+        drive = read_drive(paths[0], parameters, extrinsics, range_topics, odom_topic, progress, part, poses)
         drive.source['warnings'] += repeated
         return Drives((drive,), drive.source, parameters)
     drives, errors = [], []
     for number, path in enumerate(paths, 1):
         say(f'reading {number} of {len(paths)}: {readable(path)}')
         try:
-            drives.append(read_drive(path, parameters, extrinsics, range_topics, odom_topic, None, part))
+            drives.append(read_drive(path, parameters, extrinsics, range_topics, odom_topic, None, part, poses))
         except (BagError, InputError) as error:
             errors.append((path, error))
     if errors:

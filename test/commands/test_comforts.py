@@ -12,12 +12,13 @@ import stat
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 from drive_samples import code_of, report_in, tape, write_tape
 
 from forward_grid_mapper.__main__ import COMMANDS
-from forward_grid_mapper.commands import completion, desktop, process_bag
+from forward_grid_mapper.commands import completion, demo, desktop, experiment, process_bag
 from forward_grid_mapper.files import drawing
 from forward_grid_mapper.node.main import USAGE
 
@@ -89,6 +90,23 @@ def test_show_opens_the_report(
     # the pipe waits for the viewer to write
     assert notes.read_text() == f'{tmp_path / "maps" / "report.html"}\n'
     assert 'no desktop' not in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ('main', 'words', 'picture'),
+    [
+        (experiment.main, ['density', '--show'], 'figure.png'),
+        (demo.main, ['--offline', '--seen', 1, '--show'], 'demo.png'),
+    ],
+)
+def test_show_opens_pictures(
+    tmp_path: Path, main: Any, words: list[str], picture: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shown = []
+    for module in (experiment, demo):
+        monkeypatch.setattr(module, 'show', shown.append)
+    assert code_of(main, *words, '-o', tmp_path / 'out') == 0
+    assert shown == [tmp_path / 'out' / picture] and shown[0].exists()
 
 
 def test_without_a_desktop_show_says_what_to_open(
