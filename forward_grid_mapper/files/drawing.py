@@ -22,12 +22,12 @@ from matplotlib.ticker import MaxNLocator
 from matplotlib.transforms import Affine2D
 from numpy.typing import NDArray
 
-from .panels import DRIVES, PATH, Box, Picture, coarse, paths_of
+from .panels import DRIVES, PATH, UNKNOWN_COLOUR, Box, Picture, coarse, paths_of
 
 # Free is white and unknown a cool tint, so that they differ to every eye; in between runs a warm scale, so that an
 # uncertain cell looks like neither. Path, dots and the path by odometry are blue, vermilion and purple of
 # the Okabe-Ito palette.
-_FREE, _OCCUPIED, UNKNOWN = '#ffffff', '#14171c', '#cfd9e4'
+_FREE, _OCCUPIED, UNKNOWN = '#ffffff', '#14171c', UNKNOWN_COLOUR
 DOT, _BEFORE = '#d55e00', '#cc79a7'
 INK, FRAME = '#22262b', '#8b96a3'
 _PROBABILITY = LinearSegmentedColormap.from_list(

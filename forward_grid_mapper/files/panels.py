@@ -14,7 +14,7 @@ Box = tuple[float, float, float, float]
 """Left, right, bottom, top in metres."""
 
 
-PATH = '#0072b2'
+UNKNOWN_COLOUR, PATH = '#cfd9e4', '#0072b2'
 DRIVES = (PATH, '#009e73', '#e69f00', '#7b3294', '#56b4e9', '#8c510a', '#666666', '#1b5e20')
 """Colours of the paths of several drives, the first one that of a single drive; those of chart.js."""
 

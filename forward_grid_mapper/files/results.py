@@ -16,6 +16,7 @@ from .map_archive import write_npz
 from .map_files import write_raw, write_trinary
 from .output_folder import output_errors, output_folder
 from .picture import NOWHERE, write_picture
+from .png import write_png
 from .quality_warning import data_warnings
 from .reading_archive import write_readings
 from .report import report_data, write_report
@@ -69,6 +70,8 @@ def write_results(
         write_raw(folder / 'live_map', maps.grid, maps.live)
         write_trinary(folder / 'ml_map', maps.grid, maps.ml)
         write_raw(folder / 'uncertainty_map', maps.grid, maps.uncertainty)
+        for name, values in (('live_map', maps.live), ('uncertainty_map', maps.uncertainty)):
+            write_png(folder / f'{name}.png', values)
         write_npz(folder / 'maps.npz', maps)
         write_readings(folder / 'readings.npz', maps)
         warnings = [

@@ -191,19 +191,8 @@ def _together(drives: Sequence[Drive], repeated: list[str], parameters: Paramete
     order = sorted(range(len(drives)), key=lambda k: (keys[k], drives[k].source['bag']))
     described = [_described(drives[k], held[k]) for k in order]
     check_frames(described)
-    left_out: set[int] = set()
-    warnings = list(repeated)
-    for pair in shared_echoes([drive.readings for drive in described]):
-        one, other = described[pair.one].name, described[pair.other].name
-        if pair.same:
-            left_out.add(pair.other)
-            warnings.append(f'{other} is the same drive as {one} (same sensors, stamps and ranges); it is left out')
-        elif not {pair.one, pair.other} & left_out:
-            part, whole = (one, other) if pair.echoes[0] <= pair.echoes[1] else (other, one)
-            warnings.append(
-                f'{pair.shared} of {min(pair.echoes)} echoes of {part} are in {whole} as well: it is a part of it, and '
-                f'what counts twice is wrong evidence; leave out {part}'
-            )
+    left_out, told = _copies(described)
+    warnings = [*repeated, *told]
     kept = [k for k in range(len(order)) if k not in left_out]
     warnings += contradictions([described[k] for k in kept])
     chosen = tuple(drives[order[k]] for k in kept)
@@ -211,6 +200,34 @@ def _together(drives: Sequence[Drive], repeated: list[str], parameters: Paramete
         chosen[0].source['warnings'] += warnings
         return Drives(chosen, chosen[0].source, parameters)
     return Drives(chosen, _source(chosen, warnings, parameters), parameters)
+
+
+def _copies(drives: Sequence[Described]) -> tuple[set[int], list[str]]:
+    """Return which drives are left out as copies of an earlier one, and what to say of them and of parts of others."""
+    pairs = shared_echoes([drive.readings for drive in drives])
+    copies: dict[int, list[int]] = {}
+    left_out: set[int] = set()
+    # in order of their numbers, so that of several copies all are of the first one
+    for pair in pairs:
+        if pair.same and pair.one not in left_out:
+            copies.setdefault(pair.one, []).append(pair.other)
+            left_out.add(pair.other)
+    told = []
+    for one, others in copies.items():
+        verb, it = ('is', 'it is') if len(others) == 1 else ('are', 'they are')
+        told.append(
+            f'{listed([drives[k].name for k in others])} {verb} the same drive as {drives[one].name} (same sensors, '
+            f'stamps and ranges); {it} left out'
+        )
+    for pair in pairs:
+        if not {pair.one, pair.other} & left_out:
+            names = drives[pair.one].name, drives[pair.other].name
+            part, whole = names if pair.echoes[0] <= pair.echoes[1] else names[::-1]
+            told.append(
+                f'{pair.shared} of {min(pair.echoes)} echoes of {part} are in {whole} as well: it is a part of it, and '
+                f'what counts twice is wrong evidence; leave out {part}'
+            )
+    return left_out, told
 
 
 def _described(drive: Drive, readings: Readings) -> Described:

@@ -234,6 +234,17 @@ def test_a_copy_in_another_format_is_left_out(days: Path, tmp_path: Path, kind: 
     assert len(alone.drives) == 1 and 'is the same drive' in alone.source['warnings'][0]
 
 
+def test_copies_are_told_in_one_warning(days: Path, tmp_path: Path) -> None:
+    copies = [write_tape(tmp_path / f'copy_{k}', day(0), 'sqlite3') for k in range(3)]
+    part = write_tape(tmp_path / 'part', day(0)._replace(ranges=day(0).ranges[:200]))
+    drives = read(days / 'day_0', days / 'day_1', *copies)
+    (warning,) = drives.source['warnings']
+    assert warning.count(' the same drive as ') == 1 and 'they are left out' in warning
+    assert len(drives.drives) == 2
+    both = read(days / 'day_0', days / 'day_1', *copies, part).source['warnings']
+    assert len(both) == 2 and f'leave out {part}' in both[1]
+
+
 def test_a_part_of_a_drive_beside_it_is_told(days: Path, tmp_path: Path) -> None:
     whole = day(0)
     half = whole._replace(ranges=whole.ranges[: len(whole.ranges) // 2])
