@@ -153,7 +153,7 @@ class Trajectory:
         values: dict[str, Any] = {
             'map frame': self.frame,
             'transform': 'on TF' if self._out is None or self._out.by_tf else 'none: tf2_ros is not installed',
-            'poses of odometry kept': len(self._associator.record),
+            'poses of odometry kept': self._associator.record.since_anew,
             'driven since the latest run (m)': f'{self.driven - self._refined_at:.1f}',
         }
         refinement = self.found.refinement if self.found else None

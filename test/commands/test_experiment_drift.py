@@ -57,9 +57,8 @@ def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: py
     monkeypatch.setattr(experiment_drift, 'WORLDS', short)
     assert code_of(experiment.main, 'drift', '--seeds', 1, '-o', tmp_path / 'drift') == 0
     out = capsys.readouterr().out
-    rows = re.findall(
-        r'^building +(true|odometry|refined) +(\d+\.\d\d) +\d+\.\d\d +(\d\.\d{3}) +(\d\.\d{3})', out, re.M
-    )
+    figures = r'(\d+\.\d\d) +\d+\.\d\d +(\d\.\d{3}) +(\d\.\d{3})'
+    rows = re.findall(rf'^building +(true|odometry|refined) +{figures}', out, re.MULTILINE)
     assert [row[0] for row in rows] == ['true', 'odometry', 'refined']
     ate, f1, iou = (np.array([float(row[k]) for row in rows]) for k in (1, 2, 3))
     assert ate[0] == 0.0

@@ -22,7 +22,7 @@ from ..sensor.density import hit_probability
 from .holding_out import Gain, gain
 from .likelihood import Scan, make_scan, scores
 from .local_map import UNKNOWN, LocalMap, at_poses, local_map
-from .matching import grid_around, search
+from .matching import grid_around
 from .poses import Floats, compose, relative
 
 SIGMA = np.array([0.1, 0.1, math.radians(4.0)])
@@ -98,10 +98,19 @@ def register(
     information = np.diag(SIGMA**-2.0)
     for asked in ASKED[:LEVELS]:
         poses = grid_around(found, reach, (steps[0], steps[1], steps[2]))
-        found = search(scan, around, poses, begin, information, asked)
+        found = _best(scan, around, poses, begin, information, asked)
         reach, steps = steps, FINER * steps
     better = gain(_foreseen(scan, around, begin), _foreseen(scan, around, found))
     return Registration(found if better.sigmas >= LEAST_SIGMAS else begin, better)
+
+
+def _best(scan: Scan, around: LocalMap, poses: Floats, begin: Floats, information: Floats, asked: int) -> Floats:
+    """Return the best of `poses`, given where the drive begins a priori, by about so many readings."""
+    off = relative(begin, poses)
+    value = scores(scan, around, poses, max(len(scan.readings) // asked, 1))
+    value -= 0.5 * np.einsum('pi,ij,pj->p', off, information, off)
+    best: Floats = poses[int(value.argmax())]
+    return best
 
 
 def moved_to(begin: Floats, poses: Floats) -> Floats:

@@ -16,7 +16,7 @@ from forward_grid_mapper.core.mapping import Mapper
 from forward_grid_mapper.core.trajectory import refinement
 from forward_grid_mapper.core.trajectory.heading import NOISES
 from forward_grid_mapper.core.trajectory.poses import compose, relative, rms_after_alignment
-from forward_grid_mapper.core.trajectory.refinement import Refinement, Refiner, highest, unfit
+from forward_grid_mapper.core.trajectory.refinement import Refinement, Refiner, unfit
 from forward_grid_mapper.core.trajectory.windows import Odometry
 from forward_grid_mapper.simulation.drift import LEVELS, with_drift
 from forward_grid_mapper.simulation.drive import Recording, drive
@@ -102,12 +102,12 @@ def test_cancelling_ends_the_work(bent) -> None:
 
     def watch(stage: str, part: float) -> None:
         stages.append(stage)
-        if stage == 'first pass':
+        if stage == 'matching':
             threading.Thread(target=refiner.cancel).run()
 
     with pytest.raises(Cancelled):
         refiner.run(*bent, watch)
-    assert stages[-1] == 'first pass'
+    assert stages[-1] == 'matching'
 
 
 def still(readings: Readings, odometry: Odometry) -> tuple[Readings, Odometry]:
@@ -189,10 +189,3 @@ def test_the_noise_of_odometry_is_estimated_or_told(bent, monkeypatch) -> None:
     for told in ({}, {'odometry_noise': 0.04}):
         assert not Refiner(Parameters.from_flat(told)).run(*bent).accepted
     assert seen == [NOISES, (0.04,)]
-
-
-def test_the_highest_value_is_found_beyond_the_ends_and_between() -> None:
-    tried = np.array([-1.0, 0.0, 1.0])
-    assert highest(lambda x: -((x - 0.3) ** 2), tried) == pytest.approx(0.3)
-    assert highest(lambda x: -((x - 2.4) ** 2), tried) == pytest.approx(2.4)
-    assert highest(lambda x: x, tried) == pytest.approx(4.0)
