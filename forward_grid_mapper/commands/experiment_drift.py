@@ -40,6 +40,14 @@ RADIUS = 0.2
 
 MARGIN = 0.5
 
+WIDE = 2.6
+"""Width of a map, by its height, from which on it has a row for itself."""
+
+POSES = {'true': 'true poses', 'odometry': 'odometry', 'refined': 'refined'}
+
+Figure = tuple[list[list[Tile]], Box]
+"""Rows of maps, and the box that they show."""
+
 
 class Row(NamedTuple):
     """What is made of one drive along one trajectory: absolute trajectory error in metres, F1, and navigable IoU."""
@@ -98,7 +106,7 @@ def drift(options: argparse.Namespace, parameters: Parameters, ticker: Ticker) -
     ]
     figures = {}
     for name, made in WORLDS.items():
-        rows: dict[str, list[Row]] = {'true': [], 'odometry': [], 'refined': []}
+        rows: dict[str, list[Row]] = {kind: [] for kind in POSES}
         taken = 0
         for seed in range(options.seeds):
             ticker.say(f'{name}, drive {seed + 1} of {options.seeds}')
@@ -116,10 +124,6 @@ def drift(options: argparse.Namespace, parameters: Parameters, ticker: Ticker) -
     return '\n'.join(lines), figures
 
 
-Figure = tuple[list[list[Tile]], Box]
-"""Rows of maps, and the box that they show."""
-
-
 def one(exact: Recording, seed: int, parameters: Parameters) -> tuple[Figure, dict[str, Row], bool]:
     """Return the maps of a drive, what they are worth, and whether the trajectory was refined."""
     bent, true = with_drift(exact, LEVELS[LEVEL], seed), odometry_of(exact)
@@ -131,7 +135,6 @@ def one(exact: Recording, seed: int, parameters: Parameters) -> tuple[Figure, di
         'refined': (outcome.readings, outcome.trajectory),
     }
     visible = visible_surface(world, exact.readings, SURFACE_DEPTH)
-    titles = {'true': 'true poses', 'odometry': 'as odometry has it', 'refined': 'trajectory and map together'}
     rows, tiles, ways = {}, [], {}
     floor = np.zeros(world.grid.shape, np.bool_)
     for kind, (readings, path) in cases.items():
@@ -147,12 +150,13 @@ def one(exact: Recording, seed: int, parameters: Parameters) -> tuple[Figure, di
         iou = float((free & floor).sum() / max((free | floor).sum(), 1))
         rows[kind] = Row(ate, score_map(maps.ml, maps.grid, world, visible).f1, iou)
         ways[kind] = compose(home, path.pose)[:, :2]
-        title = f'{titles[kind]}: ATE {ate:.2f} m, F1 {rows[kind].f1:.2f}, IoU {iou:.2f}'
+        title = f'{POSES[kind]}: ATE {ate:.2f} m, F1 {rows[kind].f1:.2f}, IoU {iou:.2f}'
         tiles.append(Tile(title, maps.grid, maps.ml, path_xy=ways[kind]))
     tiles[2] = tiles[2]._replace(odometry_xy=ways['odometry'])
     truth = Tile('truth', world.grid, world.reference, path_xy=ways['true'])
     view = box_of([*ways.values()], world.grid.extent)
-    wide = (view[1] - view[0]) > 2 * (view[3] - view[2])
+    # as figures are laid out: wide maps one below the other
+    wide = (view[1] - view[0]) > WIDE * (view[3] - view[2])
     shown = [truth, *tiles]
     return ([[tile] for tile in shown] if wide else [shown[:2], shown[2:]], view), rows, outcome.accepted
 
