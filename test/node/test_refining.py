@@ -365,10 +365,17 @@ def test_who_gives_the_transform_does_not_change_while_the_node_runs(inside: Cal
     robot.set(refine_poses=True, p_hit=0.6)
 
 
+def begin(robot: Inside) -> None:
+    """Have the node see where the robot begins to drive."""
+    robot.drive(0, 1)
+    robot.until(lambda: robot.node.trajectory._at is not None)
+
+
 def test_it_refines_by_itself_after_some_way(inside: Callable[..., Inside], quick: Any) -> None:
     robot = inside(refine_poses=True, refine_every=0.1).start()
     node = robot.node
-    robot.drive(0, 60)
+    begin(robot)
+    robot.drive(1, 59)
     robot.until(lambda: node.trajectory.driven > 0.05)
     assert node.em.current is None and node.em.maps is None, 'it has not driven far enough'
     robot.drive(60, 80)
@@ -390,7 +397,9 @@ def test_it_refines_by_itself_after_some_way(inside: Callable[..., Inside], quic
 @pytest.mark.parametrize('options', [{}, {'refine_every': 0.05}])
 def test_without_being_told_it_does_not(inside: Callable[..., Inside], quick: Any, options: dict[str, Any]) -> None:
     robot = inside(refine_poses=not options, **options).start()
-    robot.drive(0, 100)
+    if not options:
+        begin(robot)
+    robot.drive(1, 100)
     if not options:
         robot.until(lambda: robot.node.trajectory.driven > 0.095)
     assert robot.node.em.current is None and robot.node.em.maps is None
@@ -405,7 +414,8 @@ def test_the_path_grows_as_the_robot_drives(
     out = robot.node.trajectory._out
     assert out is not None
     monkeypatch.setattr(out, 'publish_path', lambda frame, path, stamp: shown.append(path))
-    robot.drive(0, 100)
+    begin(robot)
+    robot.drive(1, 99)
     robot.until(lambda: shown and shown[-1].pose[-1, 0] > 0.075)
     assert np.array_equal(shown[-1].pose[:, 1:], 0 * shown[-1].pose[:, 1:]), 'as odometry has it'
     assert robot.call(robot.node.em.run_em)[0]
