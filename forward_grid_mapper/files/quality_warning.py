@@ -36,8 +36,8 @@ def data_warnings(maps: MapSet, source: Mapping[str, Any]) -> list[str]:
     names = [str(drive['bag']) for drive in source.get('drives') or ()]
     return [
         *reading_warnings(maps.readings, source, maps.parameters),
-        *fit_warnings(maps, names),
-        *change_warnings(maps, names),
+        # a drive that fits nowhere contradicts the others everywhere
+        *(fit_warnings(maps, names) or change_warnings(maps, names)),
         *filter(None, [quality_warning(maps)]),
     ]
 
