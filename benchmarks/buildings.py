@@ -49,7 +49,7 @@ def maps_of(case: Case, tool: ModuleType) -> Iterator[Map]:
     yield Map('maximum likelihood map', maps.grid, np.where(maps.ml < 0, np.nan, maps.ml), maps.uncertainty)
     yield Map('live map', maps.grid, maps.live, maps.live)
     plain = Mapper(Parameters.from_flat(load_parameters(PAPER).values)).run(case.readings)
-    yield Map('paper, plain ML', plain.grid, np.where(plain.ml < 0, np.nan, plain.ml), plain.uncertainty)
+    yield Map('paper, plain ML', plain.grid, np.where(plain.ml < 0, np.nan, plain.ml))
     standard = Standard(case, tool)
     for title, goal in (('standard, best F1', standard.f1), ('standard, best nav_iou', standard.nav_iou)):
         grid, ml = standard.map(max(GAINS, key=goal))

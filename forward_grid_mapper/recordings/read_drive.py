@@ -11,6 +11,7 @@ from ..bags.reader import Bag
 from ..bags.static_transforms import StaticTransforms, SteepSensorError
 from ..core.common.errors import BagError, InputError, ParameterError
 from ..core.common.parameters import Parameters
+from ..core.common.shell import quoted
 from ..core.messages.extrinsics import STEEP
 from ..core.messages.message_types import NANOSECONDS, Pose2, RangeMessage
 from ..core.messages.pose_association import PoseAssociator
@@ -22,6 +23,9 @@ from .given_poses import GivenPoses
 from .journal_drive import read_journal
 
 __all__ = ['Drive', 'Extrinsics', 'read_drive']
+
+MOST_OPTIONS = 24
+"""Sensors whose options a message spells out, to be copied."""
 
 
 class Extrinsics:
@@ -74,9 +78,11 @@ class Extrinsics:
         known = self._transforms.frames
         joined = f'/tf_static joins {", ".join(known[:12])}' if known else 'the bag has no /tf_static'
         reasons = ''.join(f' {self.unusable[frame]}' for frame in frames if frame in self.unusable)
+        options = ' '.join(f'--sensor {quoted(f"{frame}=x,y,yaw")}' for frame in frames[:MOST_OPTIONS])
+        more = ', and so on' if len(frames) > MOST_OPTIONS else ''
         return (
             f'no pose on the robot (frame {base_frame or "?"}) is known for {", ".join(frames)}: {joined}.{reasons} '
-            f'Give --sensor {frames[0]}=x,y,yaw for each, or sensors.{frames[0]}.pose in --params'
+            f'Give {options}{more}, in metres and radians (or 90deg), or sensors.{frames[0]}.pose in --params'
         )
 
 
