@@ -65,6 +65,13 @@ setup(
     ],
     extras_require={
         'offline': ['rosbags>=0.11.9,<0.12', 'matplotlib>=3.6,<3.12'],
+        # those for Python 3.10 and numpy 1.26 are among them
+        'scale': [
+            'dask>=2024.8,<2027',
+            'distributed>=2024.8,<2027',
+            'pyarrow>=15,<27',
+            'zarr>=2.18,<4',
+        ],
         'ros': [
             'ros-jazzy-rclpy>=7,<8',
             'ros-jazzy-rmw-fastrtps-cpp>=8,<9',

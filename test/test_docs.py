@@ -65,6 +65,14 @@ ALLOWED = {
     '/robot1/forward_grid_mapper/run_em': 'a service of a node in a namespace',
     'mkdocs serve': 'a command of mkdocs',
     'pip install --break-system-packages rosbags': 'a command of pip',
+    'tasks.csv': 'a file that process_bag writes',
+    'maps.zarr': 'a folder that process_bag writes',
+    'index.json': 'a file that process_bag writes',
+    'levels': 'an attribute in that folder',
+    '0/': 'a folder in that folder',
+    'maps.work': 'a folder that process_bag makes',
+    'bokeh': 'a package that Dask draws its dashboard with',
+    'kill -9': 'a command of every shell',
 }
 """Words in code spans that name nothing in the repository, and why they may stand there."""
 

@@ -17,8 +17,9 @@ BELOW = {
     'simulation': {'core'},
     'recordings': {'core', 'files', 'bags'},
     'replay': {'core', 'bags'},
+    'scale': {'core', 'files', 'recordings'},
     'node': {'core', 'files'},
-    'commands': {'core', 'files', 'bags', 'simulation', 'recordings', 'replay', 'node'},
+    'commands': {'core', 'files', 'bags', 'simulation', 'recordings', 'replay', 'node', 'scale'},
 }
 """The packages that each package may import from, beside itself."""
 
@@ -32,6 +33,7 @@ OUTSIDE = {
     'bags': {'numpy', 'rosbags', 'lz4', 'backports'},
     'simulation': {'numpy'},
     'recordings': {'numpy'},
+    'scale': {'numpy', 'numba', 'dask', 'distributed', 'pyarrow', 'zarr'},
 }
 """What is imported from outside of the standard library; where nothing is named, anything may be."""
 

@@ -30,6 +30,7 @@ from ..recordings.drives import Drives, read_drives
 from ..recordings.refined import Given, refine_drives
 from .console import Ticker, run
 from .desktop import show
+from .many_workers import add_worker_options, with_workers
 from .options import (
     BagParser,
     add_bag_options,
@@ -88,6 +89,7 @@ def parser() -> argparse.ArgumentParser:
         metavar='M',
         help='map in tiles of that edge in metres, one after the other; 20 or more for sonars that reach 5 m',
     )
+    add_worker_options(made)
     made.add_argument('--bag', dest='write_bag', action='store_true', help='also write the maps as a bag (mcap)')
     made.add_argument(
         '--rerun', action='store_true', help='also write the drive for the viewer Rerun, which plays it (drive.rrd)'
@@ -108,6 +110,10 @@ def process(options: argparse.Namespace) -> int:
     part, poses = chosen_part(options), chosen_poses(options)
     if options.tiles is not None and not (math.isfinite(options.tiles) and options.tiles >= SMALLEST_TILE):
         raise ParameterError(f'--tiles {options.tiles:g}: give the edge of a tile in metres, {SMALLEST_TILE:g} or more')
+    if options.workers is not None or options.scheduler is not None:
+        return with_workers(options, parameters, extrinsics, ignored, part, f'{_stem(options.bags)}_maps', tell)
+    if options.work is not None or options.memory_per_worker is not None:
+        raise ParameterError('--work and --memory-per-worker are for --workers or --scheduler, which are not given')
     if options.rerun:
         check_rerun()
     mapper = Mapper if options.tiles is None else partial(TiledMapper, size=options.tiles)

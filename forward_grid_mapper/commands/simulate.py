@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass
+from multiprocessing import get_context
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
@@ -12,17 +16,22 @@ from ..bags.writer import BagWriter, check_bag_path
 from ..core.common.errors import ParameterError
 from ..core.common.shell import command_line
 from ..core.messages.message_types import OdometryMessage, RangeMessage
+from ..core.runtime.threads import cores
 from ..core.trajectory.windows import Odometry
 from ..files.map_files import write_trinary
 from ..files.output_folder import output_errors, output_folder
 from ..files.trajectory_text import tum_text
+from ..simulation.campus import campus_drive, campus_world
 from ..simulation.drift import LEVELS, with_drift
-from ..simulation.drive import BASE_FRAME, START, Recording, corridor_drive, door_drive
+from ..simulation.drive import BASE_FRAME, Recording, corridor_drive, door_drive
 from ..simulation.sonar import NOISE_FREE, NOISY, SonarArray, front_array, sonar_ring
 from .console import Ticker, run
 
 COMMAND = 'simulate'
 REFERENCE = 'reference.tum'
+
+T = TypeVar('T')
+
 FORMATS = {'mcap': 'bag', 'sqlite3': 'bag', 'ros1': 'drive.bag'}
 SONARS: dict[str, Callable[[], SonarArray]] = {'ring': sonar_ring, 'front': front_array}
 
@@ -37,13 +46,21 @@ def parser() -> argparse.ArgumentParser:
     )
     made.add_argument(
         'world',
-        choices=('door', 'corridor'),
+        choices=('door', 'corridor', 'campus'),
         help="door: a robot passes an open door (the paper's Fig. 4); corridor: 64 m with six doors, a smooth wall "
-        'and a person walking behind the robot (Fig. 6)',
+        'and a person walking behind the robot (Fig. 6); campus: many drives through many buildings',
     )
     made.add_argument('-o', '--output', required=True, metavar='DIR', help='new folder for the recording')
     made.add_argument('--seen', type=int, default=3, metavar='N', help='door: sweeps taken in front of it (default 3)')
     made.add_argument('--passes', type=int, default=1, metavar='N', help='corridor: times along it (default 1)')
+    made.add_argument('--drives', type=int, default=4, metavar='N', help='campus: drives (default 4)')
+    made.add_argument('--buildings', type=int, default=4, metavar='N', help='campus: buildings (default 4)')
+    made.add_argument(
+        '--readings', type=int, default=40_000, metavar='N', help='campus: readings of each drive (default 40000)'
+    )
+    made.add_argument(
+        '--jobs', type=int, default=cores(), metavar='N', help='campus: drives made at once (default: as many as cores)'
+    )
     made.add_argument('--noise-free', action='store_true', help='no random readings, no noise, nobody walking')
     made.add_argument(
         '--drift',
@@ -88,14 +105,14 @@ def record(world: str, seen: int, passes: int, noise_free: bool, seed: int, sona
     return corridor_drive(seed, passes, noise, not noise_free, sonars)
 
 
-def write_recording(folder: Path, recording: Recording, format: str = 'mcap', each: bool = False) -> Path:
-    """Write bag, true map and path into an existing folder; return the bag's path.
+def write_bag(path: Path, recording: Recording, format: str, each: bool) -> None:
+    """Write the bag of a recording, whose messages are logged by stamp, as a robot would.
 
-    Messages are logged by stamp, as a robot would; a Range follows the odometry of its stamp.
+    A Range follows the odometry of its stamp; with `each`, every sonar has a topic of its own.
     """
-    path = folder / FORMATS[format]
     with BagWriter(path, format) as writer:
-        writer.write_static_transforms([(BASE_FRAME, frame, pose) for frame, pose in recording.extrinsics], START)
+        first = recording.odometry[0].stamp
+        writer.write_static_transforms([(BASE_FRAME, frame, pose) for frame, pose in recording.extrinsics], first)
         # both lists are in order of time, and the sort is stable
         messages: list[OdometryMessage | RangeMessage] = [*recording.odometry, *recording.ranges]
         for message in sorted(messages, key=lambda message: message.stamp):
@@ -103,10 +120,20 @@ def write_recording(folder: Path, recording: Recording, format: str = 'mcap', ea
                 writer.write_odometry('/odom', message)
             else:
                 writer.write_range(f'/{message.frame_id}' if each else '/sonar', message)
-    world = recording.world
-    write_trinary(folder / 'reference', world.grid, world.reference)
-    with output_errors(folder):
-        np.savetxt(folder / 'trajectory.csv', recording.robot[:, :2], fmt='%.4f', delimiter=',')
+
+
+def write_path(path: Path, recording: Recording) -> None:
+    """Write where the robot drove: x, y in metres, a row for each sweep."""
+    with output_errors(path):
+        np.savetxt(path, recording.robot[:, :2], fmt='%.4f', delimiter=',')
+
+
+def write_recording(folder: Path, recording: Recording, format: str = 'mcap', each: bool = False) -> Path:
+    """Write bag, true map and path into an existing folder; return the bag's path."""
+    path = folder / FORMATS[format]
+    write_bag(path, recording, format, each)
+    write_trinary(folder / 'reference', recording.world.grid, recording.world.reference)
+    write_path(folder / 'trajectory.csv', recording)
     return path
 
 
@@ -119,10 +146,88 @@ def write_reference(folder: Path, recording: Recording) -> None:
         (folder / REFERENCE).write_text(tum_text(true), encoding='utf-8')
 
 
+@dataclass(frozen=True)
+class Campus:
+    """What the drives through a campus have in common; the fields are options of the command."""
+
+    folder: Path
+    buildings: int
+    readings: int
+    noise_free: bool
+    seed: int
+    sonars: str
+    format: str
+    each: bool
+
+    def write(self, number: int) -> tuple[int, int]:
+        """Make and write one drive; return how many readings and odometry messages it has."""
+        noise = NOISE_FREE if self.noise_free else NOISY
+        made = campus_drive(number, self.buildings, self.readings, noise, self.seed, SONARS[self.sonars]())
+        name = f'drive_{number:04d}'
+        write_bag(
+            self.folder / 'drives' / (f'{name}.bag' if self.format == 'ros1' else name), made, self.format, self.each
+        )
+        write_path(self.folder / 'trajectories' / f'{name}.csv', made)
+        return len(made.ranges), len(made.odometry)
+
+
+def simulate_campus(options: argparse.Namespace, ticker: Ticker) -> None:
+    """Make many drives, several at once, and the true map that they share."""
+    if options.drift:
+        raise ParameterError('campus: drives that drift are not in one map frame; leave out --drift')
+    with output_folder(options.output) as folder:
+        for name in ('drives', 'trajectories'):
+            with output_errors(folder):
+                (folder / name).mkdir()
+        world = campus_world(options.buildings)
+        write_trinary(folder / 'reference', world.grid, world.reference)
+        each = options.topics == 'each'
+        campus = Campus(
+            folder,
+            options.buildings,
+            options.readings,
+            options.noise_free,
+            options.seed,
+            options.sonars,
+            options.format,
+            each,
+        )
+        done = []
+        for counts in at_once(campus.write, range(options.drives), options.jobs):
+            done.append(counts)
+            ticker.say(f'simulating: {len(done)} of {options.drives} drives')
+    if not options.quiet:
+        readings, odometry = (sum(column) for column in zip(*done, strict=True))
+        print(f'{options.drives} drives: {readings:,} readings and {odometry:,} odometry messages')
+        print(f'drives, trajectories and reference.yaml are in {options.output}; map them with')
+        print(f'  {command_line("process_bag", Path(options.output) / "drives", "--tiles", "30")}')
+
+
+def at_once(work: Callable[[int], T], numbers: Iterable[int], jobs: int) -> Iterator[T]:
+    """Yield what `work` returns for each number, in any order, from so many processes."""
+    if jobs == 1:
+        yield from map(work, numbers)
+        return
+    # a fork would copy locks that threads of this process hold
+    with ProcessPoolExecutor(jobs, get_context('spawn')) as pool:
+        begun = [pool.submit(work, number) for number in numbers]
+        try:
+            for future in as_completed(begun):
+                yield future.result()
+        finally:
+            pool.shutdown(wait=True, cancel_futures=True)
+
+
 def simulate(options: argparse.Namespace) -> int:
     """Do what the command line asks for."""
     with Ticker(options.quiet) as ticker:
         check_numbers(options.seen, options.passes, options.seed)
+        for name in ('drives', 'buildings', 'readings', 'jobs'):
+            if getattr(options, name) < 1:
+                raise ParameterError(f'--{name} must be a positive number')
+        if options.world == 'campus':
+            simulate_campus(options, ticker)
+            return 0
         # the folder first: if it cannot be written, that should be known before the work
         with output_folder(options.output) as folder:
             check_bag_path(folder / FORMATS[options.format], options.format)

@@ -143,9 +143,9 @@ class TiledMapper:
             count(found.progress, found.converged)
 
         self._visit('search', mosaic, mosaic.filled, first_map, first, mosaic.given_first)
-        while mosaic.stale:
+        while mosaic.schedule.stale:
             for colour in mosaic.tiling.colours:
-                if numbers := [number for number in colour if number in mosaic.stale]:
+                if numbers := mosaic.schedule.of(colour):
                     self._visit('search', mosaic, numbers, improved, again)
         return not open_ends
 

@@ -52,6 +52,50 @@ def write_picture(
     OutputError
         If matplotlib is not installed, or the file cannot be written.
     """
+    # what the picture shows costs little beside drawing it
+    path_xy = np.asarray(path_xy, np.float64).reshape(-1, 2)
+    _draw(Path(path), compose(maps, path_xy, title, reference, odometry_xy, drives))
+
+
+def write_overview(
+    path: Path,
+    layers: Sequence[tuple[str, NDArray[np.float32], float]],
+    origin: tuple[float, float],
+    path_xy: NDArray[np.float64],
+    title: str,
+    readings: int,
+    log_likelihood: float,
+) -> None:
+    """Draw maps that are too large for their cells to be seen, or whose readings nobody holds.
+
+    Parameters
+    ----------
+    path : Path
+    layers : sequence of (str, float32 array, float)
+        Name, probabilities with NaN where unknown, and the edge of a cell of each map, metres.
+    origin : (float, float)
+        Corner of all of them, metres.
+    path_xy, title
+        As in `write_picture`.
+    readings : int
+        How many the maps were made from.
+    log_likelihood : float
+
+    Raises
+    ------
+    OutputError
+        As `write_picture`.
+    """
+    x, y = origin
+    panels = [
+        Panel(name, values, (x, x + values.shape[1] * edge, y, y + values.shape[0] * edge))
+        for name, values, edge in layers
+    ]
+    figures = figures_text(readings, layers[0][2], log_likelihood)
+    _draw(path, Picture(title, figures, panels, panels[0].extent, 1, path_xy, NOWHERE))
+
+
+def _draw(path: Path, picture: Picture) -> None:
     try:
         from . import drawing
     except (ImportError, AttributeError) as error:  # AttributeError: a matplotlib built for another numpy
@@ -59,8 +103,6 @@ def write_picture(
             f'no picture: matplotlib is missing or broken ({error}); install it with "pip install matplotlib" or '
             '"apt install python3-matplotlib"'
         ) from error
-    path = Path(path)
-    picture = compose(maps, np.asarray(path_xy, np.float64).reshape(-1, 2), title, reference, odometry_xy, drives)
     with output_errors(path):
         drawing.draw(path, picture)
 
@@ -95,12 +137,14 @@ def _probability(cells: NDArray[np.int8]) -> NDArray[np.float32]:
 
 def figures_of(maps: MapSet) -> str:
     """Return the line of figures below the title."""
-    readings = len(maps.readings)
-    parts = [f'{readings:,} readings', f'{100 * maps.grid.resolution:g} cm cells']
-    if np.isfinite(maps.log_likelihood):
-        total, mean = (
-            f'{v:,.2f}'.replace('-', '−') for v in (maps.log_likelihood, maps.log_likelihood / max(1, readings))
-        )
+    return figures_text(len(maps.readings), maps.grid.resolution, maps.log_likelihood)
+
+
+def figures_text(readings: int, resolution: float, log_likelihood: float) -> str:
+    """Return the line of figures below the title."""
+    parts = [f'{readings:,} readings', f'{100 * resolution:g} cm cells']
+    if np.isfinite(log_likelihood):
+        total, mean = (f'{v:,.2f}'.replace('-', '−') for v in (log_likelihood, log_likelihood / max(1, readings)))
         parts.append(f'log-likelihood {total} nats ({mean} a reading)')
     return '   ·   '.join(parts)
 

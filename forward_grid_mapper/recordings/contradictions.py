@@ -29,13 +29,13 @@ T = TypeVar('T')
 
 
 class Described(NamedTuple):
-    """What is compared of a drive: its name for the user, frames, sensor poses by frame and readings."""
+    """What is compared of a drive: its name for the user, frames, sensor poses by frame, and limits by sensor."""
 
     name: str
     map_frame: str
     base_frame: str
     extrinsics: Mapping[str, Pose2]
-    readings: Readings
+    limits: Mapping[str, tuple[float, float]]
 
 
 class Shared(NamedTuple):
@@ -75,7 +75,7 @@ def check_frames(drives: Sequence[Described]) -> None:
 
 def shared_echoes(drives: Sequence[Readings]) -> list[Shared]:
     """Return the pairs of drives of which one has at least the part `SHARED` of its echoes from the other."""
-    echoes = [np.unique(_echo_hashes(readings)) for readings in drives]
+    echoes = [echoes_of(readings) for readings in drives]
     count = [len(hashes) for hashes in echoes]
     every = np.concatenate(echoes) if echoes else np.zeros(0, np.uint64)
     owner = np.repeat(np.arange(len(drives)), count)
@@ -101,6 +101,24 @@ def _echo_hashes(readings: Readings) -> NDArray[np.uint64]:
     """Return a hash of sensor, stamp and range of every echo."""
     heard = readings.select(readings.echo)
     return mixed(name_hashes(heard)[heard.sensor] ^ heard.stamp.view(np.uint64), heard.z)
+
+
+def limits_of(readings: Readings) -> dict[str, tuple[float, float]]:
+    """Return the largest range, metres, and the field of view, radians, of each sensor that has readings."""
+    found = {}
+    for number, name in enumerate(readings.sensor_names):
+        mine = readings.sensor == number
+        if mine.any():
+            found[name.lstrip('/')] = (
+                float(np.median(readings.z_max[mine])),
+                2 * float(np.median(readings.half_angle[mine])),
+            )
+    return found
+
+
+def echoes_of(readings: Readings) -> NDArray[np.uint64]:
+    """Return the hashes of sensor, stamp and range of all echoes, in order, each once."""
+    return np.unique(_echo_hashes(readings))
 
 
 def contradictions(drives: Sequence[Described]) -> list[str]:
@@ -131,24 +149,13 @@ def _poses(drives: Sequence[Described]) -> Iterator[str]:
 
 
 def _limits(drives: Sequence[Described]) -> Iterator[str]:
-    def limits(readings: Readings) -> dict[str, tuple[float, float]]:
-        found = {}
-        for number, name in enumerate(readings.sensor_names):
-            mine = readings.sensor == number
-            if mine.any():
-                found[name.lstrip('/')] = (
-                    float(np.median(readings.z_max[mine])),
-                    2 * float(np.median(readings.half_angle[mine])),
-                )
-        return found
-
     def key(value: tuple[float, float]) -> Hashable:
         return round(value[0] / METRES), round(value[1] / RADIANS)
 
     def same(one: tuple[float, float], other: tuple[float, float]) -> bool:
         return abs(one[0] - other[0]) <= METRES and abs(one[1] - other[1]) <= RADIANS
 
-    for names, frames, usual, value in _differing(drives, [limits(drive.readings) for drive in drives], key, same):
+    for names, frames, usual, value in _differing(drives, [drive.limits for drive in drives], key, same):
         yield (
             f'{frames[0]} reaches {value[0]:.2f} m and sees {math.degrees(value[1]):.0f} degrees in {listed(names)}, '
             f'and {usual[0]:.2f} m and {math.degrees(usual[1]):.0f} degrees in the other drives of this robot'
@@ -158,7 +165,7 @@ def _limits(drives: Sequence[Described]) -> Iterator[str]:
 
 
 def _missing(drives: Sequence[Described]) -> Iterator[str]:
-    have = [{drive.readings.sensor_names[k].lstrip('/') for k in np.unique(drive.readings.sensor)} for drive in drives]
+    have = [set(drive.limits) for drive in drives]
     usual = Counter(frame for frames in have for frame in frames)
     expected = {frame for frame, count in usual.items() if 2 * count > len(drives)}
     for drive, frames in zip(drives, have, strict=True):

@@ -20,7 +20,7 @@ from ..core.messages.message_types import Pose2
 from ..core.messages.reading_buffer import bounded
 from ..files.output_folder import readable
 from ..files.quality_warning import thinned
-from .contradictions import Described, check_frames, contradictions, listed, shared_echoes
+from .contradictions import Described, check_frames, contradictions, limits_of, listed, shared_echoes
 from .drive import WHOLE, Drive, Part, thinning_note
 from .finding import SUFFIXES, find_recordings
 from .given_poses import GivenPoses
@@ -117,7 +117,7 @@ def read_drives(
     BagError, InputError
         If one of them cannot be read or mapped, or they are not in one map frame; names it.
     """
-    paths, repeated = _without_repetition(find_recordings(words))
+    paths, repeated = without_repetition(find_recordings(words))
     if len(paths) == 1:
         drive = read_drive(paths[0], parameters, extrinsics, range_topics, odom_topic, progress, part, poses)
         drive.source['warnings'] += repeated
@@ -130,11 +130,12 @@ def read_drives(
         except (BagError, InputError) as error:
             errors.append((path, error))
     if errors:
-        raise _unreadable(errors, len(paths))
+        raise unreadable(errors, len(paths))
     return _together(drives, repeated, parameters)
 
 
-def _unreadable(errors: Sequence[tuple[Path, MapperError]], count: int) -> MapperError:
+def unreadable(errors: Sequence[tuple[Path, MapperError]], count: int) -> MapperError:
+    """Return the error about those of `count` drives that cannot be mapped."""
     lines = [
         f'\n  {readable(path)}: {error}' if readable(path) not in str(error) else f'\n  {error}'
         for path, error in errors[:MOST_ERRORS]
@@ -146,7 +147,7 @@ def _unreadable(errors: Sequence[tuple[Path, MapperError]], count: int) -> Mappe
     )
 
 
-def _without_repetition(paths: Sequence[Path]) -> tuple[list[Path], list[str]]:
+def without_repetition(paths: Sequence[Path]) -> tuple[list[Path], list[str]]:
     """Return the recordings, each once, and a warning for those that are given more often, by whatever name."""
     found: dict[object, Path] = {}
     told = []
@@ -175,7 +176,7 @@ def _files(path: Path) -> list[object]:
         return [path]
 
 
-def _digest(readings: Readings) -> bytes:
+def digest_of(readings: Readings) -> bytes:
     """Return a digest of readings that does not depend on their order."""
     r = in_canonical_order(readings)
     digest = hashlib.blake2b(repr(sorted(r.sensor_names)).encode('utf-8', 'surrogatepass'), digest_size=16)
@@ -187,11 +188,11 @@ def _digest(readings: Readings) -> bytes:
 def _together(drives: Sequence[Drive], repeated: list[str], parameters: Parameters) -> Drives:
     """Put drives into canonical order, leave out copies, and say what they contradict each other in."""
     held = [drive.associator.buffer.snapshot() for drive in drives]
-    keys = [(int(readings.stamp.min()), _digest(readings)) for readings in held]
+    keys = [(int(readings.stamp.min()), digest_of(readings)) for readings in held]
     order = sorted(range(len(drives)), key=lambda k: (keys[k], drives[k].source['bag']))
     described = [_described(drives[k], held[k]) for k in order]
     check_frames(described)
-    left_out, told = _copies(described)
+    left_out, told = _copies(described, [held[k] for k in order])
     warnings = [*repeated, *told]
     kept = [k for k in range(len(order)) if k not in left_out]
     warnings += contradictions([described[k] for k in kept])
@@ -199,12 +200,26 @@ def _together(drives: Sequence[Drive], repeated: list[str], parameters: Paramete
     if len(chosen) == 1:
         chosen[0].source['warnings'] += warnings
         return Drives(chosen, chosen[0].source, parameters)
-    return Drives(chosen, _source(chosen, warnings, parameters), parameters)
+    for drive in chosen:
+        # all drives together are thinned anew
+        own = [text for text in drive.source['warnings'] if text not in thinning_note(drive.associator)]
+        warnings += [f'{drive.source["bag"]}: {text}' for text in own]
+    source = source_of_all([drive.source for drive in chosen], warnings)
+    accepted = source['counts']['accepted']
+    used = min(accepted, parameters.association.max_readings or accepted)
+    source['warnings'] += filter(None, [thinned(used, accepted)])
+    return Drives(chosen, source, parameters)
 
 
-def _copies(drives: Sequence[Described]) -> tuple[set[int], list[str]]:
+def same_drive(others: Sequence[str], one: str) -> str:
+    """Return the warning about copies of a drive."""
+    verb, it = ('is', 'it is') if len(others) == 1 else ('are', 'they are')
+    return f'{listed(others)} {verb} the same drive as {one} (same sensors, stamps and ranges); {it} left out'
+
+
+def _copies(drives: Sequence[Described], readings: Sequence[Readings]) -> tuple[set[int], list[str]]:
     """Return which drives are left out as copies of an earlier one, and what to say of them and of parts of others."""
-    pairs = shared_echoes([drive.readings for drive in drives])
+    pairs = shared_echoes(readings)
     copies: dict[int, list[int]] = {}
     left_out: set[int] = set()
     # in order of their numbers, so that of several copies all are of the first one
@@ -214,11 +229,7 @@ def _copies(drives: Sequence[Described]) -> tuple[set[int], list[str]]:
             left_out.add(pair.other)
     told = []
     for one, others in copies.items():
-        verb, it = ('is', 'it is') if len(others) == 1 else ('are', 'they are')
-        told.append(
-            f'{listed([drives[k].name for k in others])} {verb} the same drive as {drives[one].name} (same sensors, '
-            f'stamps and ranges); {it} left out'
-        )
+        told.append(same_drive([drives[k].name for k in others], drives[one].name))
     for pair in pairs:
         if not {pair.one, pair.other} & left_out:
             names = drives[pair.one].name, drives[pair.other].name
@@ -232,23 +243,17 @@ def _copies(drives: Sequence[Described]) -> tuple[set[int], list[str]]:
 
 def _described(drive: Drive, readings: Readings) -> Described:
     source = drive.source
-    return Described(source['bag'], source['map_frame'], source['base_frame'], source.get('extrinsics') or {}, readings)
+    poses = source.get('extrinsics') or {}
+    return Described(source['bag'], source['map_frame'], source['base_frame'], poses, limits_of(readings))
 
 
-def _source(drives: Sequence[Drive], warnings: list[str], parameters: Parameters) -> dict[str, Any]:
-    """Return what was read of all drives together, and of each."""
-    sources = [drive.source for drive in drives]
-    for drive in drives:
-        # all drives together are thinned anew
-        own = [text for text in drive.source['warnings'] if text not in thinning_note(drive.associator)]
-        warnings = warnings + [f'{drive.source["bag"]}: {text}' for text in own]
-    accepted = sum(source['counts']['accepted'] for source in sources)
-    used = min(accepted, parameters.association.max_readings or accepted)
+def source_of_all(sources: Sequence[Mapping[str, Any]], warnings: list[str]) -> dict[str, Any]:
+    """Return what was read of several drives together, and of each, for the report; `sources` are those of drives."""
     stamps = [source['stamps'] for source in sources]
     topics = sorted({topic for source in sources for topic in source.get('range_topics') or ()})
     odometry = sorted({source['odom_topic'] for source in sources if source.get('odom_topic')})
     return {
-        'bag': f'{len(drives)} drives',
+        'bag': f'{len(sources)} drives',
         'drives': [{key: value for key, value in source.items() if key != 'warnings'} for source in sources],
         'range_topics': topics,
         'odom_topic': listed(odometry),
@@ -260,7 +265,7 @@ def _source(drives: Sequence[Drive], warnings: list[str], parameters: Parameters
         'path_m': sum(source['path_m'] for source in sources),
         'counts': _summed([source['counts'] for source in sources]),
         'rejected_by_frame': _summed([source.get('rejected_by_frame') or {} for source in sources]),
-        'warnings': [*warnings, *filter(None, [thinned(used, accepted)])],
+        'warnings': list(warnings),
     }
 
 

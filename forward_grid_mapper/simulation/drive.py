@@ -89,10 +89,13 @@ def drive_sweeps(
     seed: int = 0,
     person: bool = False,
     walker: Floats | None = None,
+    start: int = START,
+    rate: float = ODOMETRY_RATE,
 ) -> Recording:
     """Drive as `drive` does, with a sweep at each of the increasing distances `sweeps` along the path, in metres.
 
-    `walker`, shape (T, 2), is where somebody else walks at each sweep, metres; NaN for nowhere.
+    `walker`, shape (T, 2), is where somebody else walks at each sweep, metres; NaN for nowhere. `start` is the stamp at
+    which the robot sets out, nanoseconds, and `rate` that of odometry between the sweeps, Hz.
     """
     waypoints = np.asarray(waypoints, np.float64)
     if blocked(waypoints, world.segments):
@@ -104,11 +107,11 @@ def drive_sweeps(
     robot = trajectory.pose_at(ticks / NANOSECONDS)
     people = _people(world, robot, rng) if person else walker
     ranges = measure(world, sonars, robot, noise, rng, people)
-    stamps = START + ticks
+    stamps = start + ticks
     return Recording(
         world,
         sonars.extrinsics,
-        _odometry(trajectory, ticks),
+        _odometry(trajectory, ticks, start, rate),
         _range_messages(sonars, stamps, ranges),
         _readings(sonars, stamps, robot, ranges),
         robot,
@@ -192,13 +195,13 @@ def _people(world: World, robot: Floats, rng: np.random.Generator) -> Floats:
     return people
 
 
-def _odometry(trajectory: Trajectory, sweeps: NDArray[np.int64]) -> list[OdometryMessage]:
-    regular = np.arange(0.0, trajectory.time[-1], 1.0 / ODOMETRY_RATE)
+def _odometry(trajectory: Trajectory, sweeps: NDArray[np.int64], start: int, rate: float) -> list[OdometryMessage]:
+    regular = np.arange(0.0, trajectory.time[-1], 1.0 / rate)
     # motion is linear between corners: with these among the messages, interpolating the rest makes no error
     seconds = np.concatenate([regular, trajectory.time])
     ticks = np.union1d(np.round(seconds * NANOSECONDS).astype(np.int64), sweeps)
     poses = trajectory.pose_at(ticks / NANOSECONDS)
-    stamps = (START + ticks).tolist()
+    stamps = (start + ticks).tolist()
     return [
         OdometryMessage(stamp, ODOM_FRAME, BASE_FRAME, Pose2(*pose))
         for stamp, pose in zip(stamps, poses.tolist(), strict=True)

@@ -243,13 +243,17 @@ _NORTH = (
 )
 
 
-def building_world() -> World:
+def building_world(entrance: bool = False) -> World:
     """Return a building of 40 x 16 m: a corridor, four rooms on each side of it, and a hall with nine pillars.
 
-    Its doors are 0.7 to 0.9 m wide; tables, shelves and a slanting screen stand in the rooms.
+    Its doors are 0.7 to 0.9 m wide; tables, shelves and a slanting screen stand in the rooms. With `entrance`, a door
+    leads from the west into the corridor.
     """
     plan = Floorplan('building', 420, 180)
-    plan.box((10, 10), (410, 170))
+    for row in (10, 170):
+        plan.wall('x', row, (10, 410))
+    plan.wall('y', 10, (10, 170), doors=((83, 93),) if entrance else ())
+    plan.wall('y', 410, (10, 170))
     plan.wall('x', 78, (10, 300), doors=tuple(door for _, _, door, _ in _SOUTH))
     plan.wall('x', 98, (10, 300), doors=tuple(door for _, _, door, _ in _NORTH))
     plan.wall('y', 300, (10, 170), doors=((84, 92),))

@@ -114,3 +114,27 @@ def test_a_sqlite3_bag_that_cannot_be_there(tmp_path: Path, capsys: pytest.Captu
     assert code_of(simulate.main, *SMALL, '--format', 'sqlite3', '-o', tmp_path / 'what?') == 1
     assert 'cannot have ?, # or %' in capsys.readouterr().err
     assert everything_in(tmp_path) == []
+
+
+CAMPUS = ('campus', '--buildings', 1, '--drives', 2, '--readings', 160, '--sonars', 'front', '-q')
+
+
+def test_a_campus_is_a_folder_of_drives_however_many_are_made_at_once(tmp_path: Path) -> None:
+    for jobs in (1, 2):
+        assert code_of(simulate.main, *CAMPUS, '--jobs', jobs, '-o', tmp_path / str(jobs)) == 0
+    assert sorted(path.name for path in (tmp_path / '1' / 'drives').iterdir()) == ['drive_0000', 'drive_0001']
+    for number in range(2):
+        bags = []
+        for jobs in '12':
+            with Bag(tmp_path / jobs / 'drives' / f'drive_{number:04d}') as bag:
+                bags.append(list(bag.messages(bag.choose_topics())))
+        assert bags[0] == bags[1]
+    report = mapped(tmp_path / '1' / 'drives', tmp_path / 'maps')
+    assert [drive['counts']['accepted'] for drive in report['drives']] == [160, 160]
+    assert report['warnings'] == []
+
+
+@pytest.mark.parametrize('option', [('--drives', 0), ('--buildings', 0), ('--readings', -1), ('--jobs', 0)])
+def test_a_campus_without_anything_in_it(tmp_path: Path, option: tuple[str, int]) -> None:
+    assert code_of(simulate.main, *CAMPUS, *option, '-o', tmp_path / 'campus') == 1
+    assert not (tmp_path / 'campus').exists()

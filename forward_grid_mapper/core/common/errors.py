@@ -23,3 +23,7 @@ class OutputError(MapperError):
 
 class Cancelled(MapperError):
     """The work was stopped on request; nothing was changed."""
+
+
+class ClusterError(MapperError):
+    """Workers cannot be reached, do not fit each other, or ended too often."""

@@ -40,12 +40,14 @@ STRIDES = (0, 1, 2, 4, 8, 16)
 
 
 @kernel
-def _mark(x: Any, y: Any, stamp: Any, longest: float, out: Any) -> None:
+def _mark(x: Any, y: Any, stamp: Any, longest: float, corner: Any, out: Any) -> None:
     """Set the cells of each point, and those on the lines from it to the points `STRIDES` later that are near enough.
 
-    `x`, `y` and `longest` are in cells, `stamp` is in order.
+    `x`, `y` and `longest` are in cells of the lattice, `stamp` is in order, and `corner` is the row and the column of
+    the lattice with which `out` begins: so what is marked does not depend on it.
     """
     height, width = out.shape
+    bottom, left = corner
     for i in range(len(x)):
         for stride in STRIDES:
             j = i + stride
@@ -58,7 +60,7 @@ def _mark(x: Any, y: Any, stamp: Any, longest: float, out: Any) -> None:
             for k in range(steps + 1):
                 u = x[i] + (x[j] - x[i]) * k / steps
                 v = y[i] + (y[j] - y[i]) * k / steps
-                column, row = int(math.floor(u)), int(math.floor(v))
+                column, row = int(math.floor(u)) - left, int(math.floor(v)) - bottom
                 if 0 <= row < height and 0 <= column < width:
                     out[row, column] = 1
 
@@ -110,8 +112,9 @@ def mark_traversed(
         That of `longest_step`, metres.
     """
     order = np.argsort(stamp, kind='stable')
-    u, v = x[order] / grid.resolution - grid.column, y[order] / grid.resolution - grid.row
-    _mark(u, v, stamp[order], longest / grid.resolution, traversed.view(np.uint8))
+    u, v = x[order] / grid.resolution, y[order] / grid.resolution
+    corner = int(grid.row), int(grid.column)
+    _mark(u, v, stamp[order], longest / grid.resolution, corner, traversed.view(np.uint8))
 
 
 def traversed_cells(readings: Readings, grid: Grid) -> NDArray[np.bool_]:

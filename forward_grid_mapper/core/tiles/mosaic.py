@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable, Iterable
 from typing import TypeVar
 
@@ -13,9 +12,9 @@ from ..common.grid import UNKNOWN, Grid
 from ..common.parameters import Parameters
 from ..common.readings import Readings
 from ..maps.traversed import traversed_cells
-from ..sensor.cone_table import grid_of
 from ..sensor.surface_normals import SurfaceNormals
-from .tiling import Tiling
+from .schedule import Schedule
+from .tiling import Tiling, boxes_of, widest_of
 from .windows import Finished, Given, Judged, Searched, normals_from
 
 T = TypeVar('T')
@@ -38,6 +37,8 @@ class Mosaic:
         In canonical order.
     grid : Grid
     tiling : Tiling
+    schedule : Schedule
+        Of the tiles that have to be searched.
     traversed : bool, shape `grid.shape`
     occupied : uint8, shape `grid.shape`
     normals : float32, shape (2, *grid.shape)
@@ -50,9 +51,10 @@ class Mosaic:
     def __init__(self, readings: Readings, grid: Grid, parameters: Parameters, size: float) -> None:
         """Begin with an empty map in tiles of `size` metres."""
         self.readings, self.grid = readings, grid
-        self.tiling = Tiling(grid, readings, parameters, size)
+        boxes = boxes_of(readings, parameters)
+        self.tiling = Tiling(grid, size, widest_of(boxes))
         self._parameters = parameters
-        self._readings_of, self._owner = self.tiling.readings_of(), self.tiling.owners(readings)
+        self._readings_of, self._owner = self.tiling.readings_of(boxes), self.tiling.owners(readings)
         self.traversed = traversed_cells(readings, grid)
         self.occupied = np.zeros(grid.shape, np.uint8)
         self.normals = np.zeros((2, *grid.shape), np.float32)
@@ -60,9 +62,9 @@ class Mosaic:
         self.uncertainty = np.full(grid.shape, np.nan, np.float32)
         self.dynamic = np.zeros(grid.shape, np.float32)
         self.log_likelihood, self.unexplained = np.zeros(len(readings)), np.zeros(len(readings), np.bool_)
-        self._first_readings = self.tiling.readings_of(FIRST_AROUND)
+        self._first_readings = self.tiling.readings_of(boxes, FIRST_AROUND)
         self._boxes = [self._box(k, indices) for k, indices in enumerate(self._readings_of)]
-        self.stale = {k for k, indices in enumerate(self._readings_of) if len(indices)}
+        self.schedule = Schedule({k: self._boxes[k] for k in self.filled})
 
     @property
     def halo(self) -> float:
@@ -75,13 +77,7 @@ class Mosaic:
         return [k for k, indices in enumerate(self._readings_of) if len(indices)]
 
     def _box(self, number: int, indices: NDArray[np.int64]) -> Grid:
-        around = self.tiling.around(self.tiling.tiles[number])
-        readings = self.readings.select(indices)
-        if not len(readings):
-            return around
-        # no box is larger than the whole
-        unlimited = dataclasses.replace(self._parameters.grid, max_cells=self.grid.size)
-        return grid_of(readings, self._parameters.model, unlimited, within=around)
+        return self.tiling.box(number, self.readings.select(indices), self._parameters)
 
     def given(self, number: int) -> Given:
         """Return what is known around a tile."""
@@ -123,20 +119,8 @@ class Mosaic:
 
     def take(self, number: int, found: Searched) -> None:
         """Keep the map of a window; tiles that see what changed are stale."""
-        self.stale.discard(number)
-        if not found.changed:
-            return
-        window = self.tiling.tiles[number].window
-        kept = self.occupied[self.grid.window(window)]
-        rows, columns = np.nonzero(kept != found.occupied)
-        kept[:] = found.occupied
-        first = window.row + int(rows.min()), window.column + int(columns.min())
-        last = window.row + int(rows.max()), window.column + int(columns.max())
-        for other in self.filled:
-            box = self._boxes[other]
-            above = box.row <= last[0] and first[0] < box.row + box.height
-            if other != number and above and box.column <= last[1] and first[1] < box.column + box.width:
-                self.stale.add(other)
+        self.occupied[self.grid.window(self.tiling.tiles[number].window)] = found.occupied
+        self.schedule.searched(number, found.changed)
 
     def take_finished(self, number: int, found: Finished) -> None:
         """Keep the maps of a core."""

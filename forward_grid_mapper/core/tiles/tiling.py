@@ -10,6 +10,7 @@ rest of the box is held. Tiles of one *colour* have no reading in common, so the
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from typing import NamedTuple
 
@@ -20,7 +21,7 @@ from ..common.constants import LONGEST_GAP, SHORT_WALL
 from ..common.grid import Grid, cone_boxes
 from ..common.parameters import Parameters
 from ..common.readings import Readings
-from ..sensor.cone_table import effective_sigma, reach_of
+from ..sensor.cone_table import effective_sigma, grid_of, reach_of
 
 ROUND = max(LONGEST_GAP, SHORT_WALL)
 """Metres around a window that its moves look at, whatever the readings reach: the other end of a gap, the rest of a
@@ -50,20 +51,20 @@ class Tiling:
         The numbers of the tiles of each colour.
     """
 
-    def __init__(self, grid: Grid, readings: Readings, parameters: Parameters, size: float) -> None:
+    def __init__(self, grid: Grid, size: float, widest: float) -> None:
         """Cut a grid into tiles.
 
         Parameters
         ----------
         grid : Grid
             Of the whole map; holds the cones of all readings.
-        readings : Readings
-        parameters : Parameters
         size : float
             Edge of a tile, metres; a cell at the least. Edges lie on the lattice, wherever the grid begins.
+        widest : float
+            That of `widest_of`, of the boxes of all readings, metres.
         """
         self.grid = grid
-        self._edge = max(round(size / grid.resolution), 1)
+        self._edge = edge_of(size, grid.resolution)
         self._margin = margin(grid.resolution)
         self._around = math.ceil(ROUND / grid.resolution) + NEIGHBOURS_AWAY
         rows = range(grid.row // self._edge, (grid.row + grid.height - 1) // self._edge + 1)
@@ -71,24 +72,13 @@ class Tiling:
         self._corner, self._across = (rows[0], columns[0]), len(columns)
         self._up = len(rows)
         self.tiles = tuple(self._tile(row, column) for row in rows for column in columns)
-        self._boxes = boxes = boxes_of(readings, parameters)
-        widest = float(max((boxes[1] - boxes[0]).max(), (boxes[3] - boxes[2]).max())) / grid.resolution
-        self.colours = self._coloured(max(math.ceil(widest) + 2, self._around))
+        self.colours = self._coloured(max(math.ceil(widest / grid.resolution) + 2, self._around))
 
     def _tile(self, row: int, column: int) -> Tile:
         resolution, edge, m = self.grid.resolution, self._edge, self._margin
-        core = _clipped(Grid(resolution, column * edge, row * edge, edge, edge), self.grid)
+        core = common_part(Grid(resolution, column * edge, row * edge, edge, edge), self.grid)
         wide = Grid(resolution, column * edge - m, row * edge - m, edge + 2 * m, edge + 2 * m)
-        return Tile(row, column, core, _clipped(wide, self.grid))
-
-    def _touched(self, around: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return the first and the last row and column of tiles that cones touch, with cells around; shape (2, N)."""
-        left, right, bottom, top = np.floor(self._boxes / self.grid.resolution).astype(np.int64)
-        corner = np.array(self._corner)[:, None]
-        first = (np.stack([bottom, left]) - around) // self._edge - corner
-        last = (np.stack([top, right]) + around) // self._edge - corner
-        most = np.array([self._up - 1, self._across - 1])[:, None]
-        return np.clip(first, 0, most), np.clip(last, 0, most)
+        return Tile(row, column, core, common_part(wide, self.grid))
 
     def _coloured(self, apart: int) -> tuple[tuple[int, ...], ...]:
         """Return tiles by colour, so that windows of one colour are at least `apart` cells from each other."""
@@ -102,24 +92,44 @@ class Tiling:
         """Return the window and the cells around it that its search looks at, whatever the readings reach."""
         n, w = self._around, tile.window
         wide = Grid(w.resolution, w.column - n, w.row - n, w.width + 2 * n, w.height + 2 * n)
-        return _clipped(wide, self.grid)
+        return common_part(wide, self.grid)
 
-    def readings_of(self, around: float = 0.0) -> list[NDArray[np.int64]]:
+    def box(self, number: int, readings: Readings, parameters: Parameters) -> Grid:
+        """Return the box of a tile with these readings."""
+        around = self.around(self.tiles[number])
+        if not len(readings):
+            return around
+        # no box is larger than the whole
+        unlimited = dataclasses.replace(parameters.grid, max_cells=self.grid.size)
+        return grid_of(readings, parameters.model, unlimited, within=around)
+
+    def readings_of(self, boxes: NDArray[np.float64], around: float = 0.0) -> list[NDArray[np.int64]]:
         """Return the indices of the readings whose cones may touch the window of each tile, in their order.
 
-        With `around`, metres, also those that touch what is so near to the core, where that is more.
+        Parameters
+        ----------
+        boxes : float64, shape (4, N)
+            Those of `boxes_of`.
+        around : float
+            Metres: also those that touch what is so near to the core, where that is more.
         """
-        first, last = self._touched(max(self._margin, round(around / self.grid.resolution)))
-        spans = last - first + 1
-        count = spans[0] * spans[1]
-        reading = np.repeat(np.arange(len(count)), count)
-        nth = np.arange(len(reading)) - np.repeat(np.cumsum(count) - count, count)
-        row = first[0][reading] + nth // spans[1][reading]
-        column = first[1][reading] + nth % spans[1][reading]
-        tile = row * self._across + column
-        order = np.argsort(tile, kind='stable')
-        edges = np.searchsorted(tile[order], np.arange(len(self.tiles) + 1))
-        return [reading[order[edges[k] : edges[k + 1]]] for k in range(len(self.tiles))]
+        found = by_tile(boxes, self.grid.resolution, self._edge, around)
+        none = np.zeros(0, np.int64)
+        return [found.get((tile.row, tile.column), none) for tile in self.tiles]
+
+    def touching(self, number: int, boxes: NDArray[np.float64], around: float = 0.0) -> NDArray[np.bool_]:
+        """Return which readings are among those that `readings_of` gives a tile, shape (N,)."""
+        first, last = _touched(boxes, self.grid.resolution, self._edge, around)
+        place = np.array(self.tiles[number][:2])[:, None]
+        return np.asarray(((first <= place) & (place <= last)).all(axis=0))
+
+    def meeting(self, part: Grid, window: bool = False) -> list[int]:
+        """Return the tiles whose cores, or windows, have cells in a part of the grid."""
+        m = self._margin if window else 0
+        rows = range((part.row - m) // self._edge, (part.row + part.height - 1 + m) // self._edge + 1)
+        columns = range((part.column - m) // self._edge, (part.column + part.width - 1 + m) // self._edge + 1)
+        places = ((row - self._corner[0], column - self._corner[1]) for row in rows for column in columns)
+        return [r * self._across + c for r, c in places if 0 <= r < self._up and 0 <= c < self._across]
 
     def owners(self, readings: Readings) -> NDArray[np.int64]:
         """Return the tile in whose core each sensor was, shape (N,): so each reading is of one tile."""
@@ -128,6 +138,47 @@ class Tiling:
         column = (np.clip(columns, 0, self.grid.width - 1) + self.grid.column) // self._edge - self._corner[1]
         owner: NDArray[np.int64] = row * self._across + column
         return owner
+
+
+def edge_of(size: float, resolution: float) -> int:
+    """Return the edge of tiles of `size` metres, in cells."""
+    return max(round(size / resolution), 1)
+
+
+def _touched(
+    boxes: NDArray[np.float64], resolution: float, edge: int, around: float
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the first and the last row and column of tiles that cones touch, metres around; shape (2, N)."""
+    left, right, bottom, top = np.floor(boxes / resolution).astype(np.int64)
+    cells = max(margin(resolution), round(around / resolution))
+    return (np.stack([bottom, left]) - cells) // edge, (np.stack([top, right]) + cells) // edge
+
+
+def by_tile(
+    boxes: NDArray[np.float64], resolution: float, edge: int, around: float = 0.0
+) -> dict[tuple[int, int], NDArray[np.int64]]:
+    """Return the indices of the readings that touch each tile, as `Tiling.readings_of`, by its row and column.
+
+    For this no grid need be known: the edges of tiles lie on the lattice.
+    """
+    first, last = _touched(boxes, resolution, edge, around)
+    spans = last - first + 1
+    count = spans[0] * spans[1]
+    reading = np.repeat(np.arange(len(count)), count)
+    nth = np.arange(len(reading)) - np.repeat(np.cumsum(count) - count, count)
+    row = first[0][reading] + nth // spans[1][reading]
+    column = first[1][reading] + nth % spans[1][reading]
+    order = np.lexsort((column, row))
+    row, column = row[order], column[order]
+    edges = np.flatnonzero((np.diff(row) != 0) | (np.diff(column) != 0)) + 1
+    parts = np.split(reading[order], edges)
+    begins = [0, *edges.tolist()] if len(reading) else []
+    return {(int(row[k]), int(column[k])): part for k, part in zip(begins, parts, strict=False)}
+
+
+def widest_of(boxes: NDArray[np.float64]) -> float:
+    """Return the longest side of boxes, metres."""
+    return float(max((boxes[1] - boxes[0]).max(), (boxes[3] - boxes[2]).max()))
 
 
 def margin(resolution: float) -> int:
@@ -142,8 +193,8 @@ def boxes_of(readings: Readings, parameters: Parameters) -> NDArray[np.float64]:
     return cone_boxes(readings.x, readings.y, readings.yaw, readings.half_angle, reach)
 
 
-def _clipped(grid: Grid, whole: Grid) -> Grid:
-    """Return the part of a grid that lies in another one."""
+def common_part(grid: Grid, whole: Grid) -> Grid:
+    """Return the part of a grid that lies in another one; it may have no cells."""
     left, bottom = max(grid.column, whole.column), max(grid.row, whole.row)
     right = min(grid.column + grid.width, whole.column + whole.width)
     top = min(grid.row + grid.height, whole.row + whole.height)

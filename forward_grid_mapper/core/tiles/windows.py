@@ -72,10 +72,10 @@ def normals_from(xy: NDArray[np.float32], parameters: Parameters) -> SurfaceNorm
 
 
 class Searched(NamedTuple):
-    """The map of a window after a search: `changed` says whether any cell of it was."""
+    """The map of a window after a search, and the part of the lattice in which it changed, None if it did not."""
 
     occupied: NDArray[np.uint8]
-    changed: bool
+    changed: Grid | None
     progress: Progress
     converged: bool
 
@@ -122,6 +122,15 @@ def _evidence(given: Given, parameters: Parameters, stop: NDArray[np.uint8] | No
     return made
 
 
+def _filled_part(mask: NDArray[np.bool_], window: Grid) -> Grid | None:
+    """Return the smallest part of a window that holds all cells of a mask; None if there are none."""
+    rows, columns = np.flatnonzero(mask.any(axis=1)).tolist(), np.flatnonzero(mask.any(axis=0)).tolist()
+    if not rows:
+        return None
+    height, width = rows[-1] - rows[0] + 1, columns[-1] - columns[0] + 1
+    return Grid(window.resolution, window.column + columns[0], window.row + rows[0], width, height)
+
+
 def first_map(given: Given, parameters: Parameters, stop: NDArray[np.uint8] | None = None) -> Searched:
     """Search all of the box from the empty map, and return the window's part of it.
 
@@ -132,7 +141,7 @@ def first_map(given: Given, parameters: Parameters, stop: NDArray[np.uint8] | No
     found = Search(evidence, parameters.search, given.traversed.ravel()).run()
     occupied = evidence.state.maps.occupied.reshape(given.box.shape)
     part = np.array(occupied[given.box.window(given.tile.window)])
-    return Searched(part, bool(part.any()), found.progress, found.converged)
+    return Searched(part, _filled_part(part != 0, given.tile.window), found.progress, found.converged)
 
 
 def improved(given: Given, parameters: Parameters, stop: NDArray[np.uint8] | None = None) -> Searched:
@@ -145,7 +154,8 @@ def improved(given: Given, parameters: Parameters, stop: NDArray[np.uint8] | Non
     found = search.improve()
     after = evidence.state.maps.occupied
     part = np.array(after.reshape(given.box.shape)[rows, columns])
-    return Searched(part, bool((after != before).any()), found.progress, found.converged)
+    changed = (after != before).reshape(given.box.shape)[rows, columns]
+    return Searched(part, _filled_part(changed, given.tile.window), found.progress, found.converged)
 
 
 def finished(given: Given, parameters: Parameters) -> Finished:

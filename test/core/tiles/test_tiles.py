@@ -29,7 +29,7 @@ from forward_grid_mapper.core.search.search import LEAST_GAIN, ROUNDING, Search
 from forward_grid_mapper.core.tiled_mapping import TiledMapper
 from forward_grid_mapper.core.tiles import windows
 from forward_grid_mapper.core.tiles.mosaic import Mosaic
-from forward_grid_mapper.core.tiles.tiling import Tiling
+from forward_grid_mapper.core.tiles.tiling import Tiling, boxes_of, common_part, widest_of
 from forward_grid_mapper.simulation.drive import corridor_drive, drive
 from forward_grid_mapper.simulation.sonar import NOISY, front_array
 from forward_grid_mapper.simulation.world import rooms_world
@@ -70,14 +70,21 @@ def test_every_reading_that_touches_a_window_is_its_own(seed: int, size: float) 
     p = Parameters()
     readings = random_readings(np.random.default_rng(seed), AREA, 12)
     grid = map_grid(readings, p)
-    tiling = Tiling(grid, readings, p, size)
+    boxes = boxes_of(readings, p)
+    tiling = Tiling(grid, size, widest_of(boxes))
     cores = np.zeros(grid.shape, int)
     for tile in tiling.tiles:
         cores[grid.window(tile.core)] += 1
     assert (cores == 1).all()
     cells = [naive.cells_of(readings, t, grid, p.model) for t in range(len(readings))]
     touched = [[divmod(c, grid.width) for c in of] for of in cells]
-    found = tiling.readings_of()
+    found = tiling.readings_of(boxes)
+    for number, tile in enumerate(tiling.tiles):
+        np.testing.assert_array_equal(np.flatnonzero(tiling.touching(number, boxes)), found[number])
+        for window in (False, True):
+            part = (tile.core, tile.window)[window]
+            near = [k for k, t in enumerate(tiling.tiles) if common_part((t.core, t.window)[window], part).size]
+            assert set(near) <= set(tiling.meeting(part, window)), 'a tile that lies there is missing'
     for tile, indices in zip(tiling.tiles, found, strict=True):
         rows, columns = grid.window(tile.window)
         inside = {

@@ -1,0 +1,171 @@
+"""`process_bag --workers`: the same maps by processes of this machine, or by those of a cluster."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import math
+import shutil
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from ..core.common.errors import ParameterError
+from ..core.common.parameters import Parameters
+from ..core.messages.message_types import Pose2
+from ..files.output_folder import free_name, output_folder, readable
+from ..recordings.drive import Part
+from ..recordings.drives import without_repetition
+from ..recordings.finding import find_recordings
+from .console import Ticker
+
+TILE = 30.0
+"""Metres; the edge of a tile where `--tiles` does not give one."""
+
+MEMORY = 2.0
+"""Gigabytes that a worker may take, where `--memory-per-worker` does not say."""
+
+LEAST_MEMORY = 0.5
+"""Gigabytes that a worker takes before it holds anything, and as much again."""
+
+RESERVED = 0.6e9
+"""Bytes of a worker that are not for pairs of cells and readings: Python, kernels and the readings of a tile."""
+
+
+def add_worker_options(parser: argparse.ArgumentParser) -> None:
+    """Add `--workers`, `--scheduler`, `--memory-per-worker` and `--work`."""
+    group = parser.add_argument_group('many processes (extra "scale")')
+    group.add_argument(
+        '--workers',
+        type=int,
+        metavar='N',
+        help=f'map in tiles ({TILE:g} m, or --tiles) by N processes of this machine, with readings and maps on disk',
+    )
+    group.add_argument(
+        '--scheduler', metavar='ADDRESS', help='use the workers of this Dask scheduler (tcp://HOST:8786)'
+    )
+    group.add_argument(
+        '--memory-per-worker',
+        type=float,
+        metavar='GB',
+        help=f'what a worker may take; beyond, it is ended and its tile begun anew (default {MEMORY:g})',
+    )
+    group.add_argument(
+        '--work',
+        metavar='DIR',
+        help='where readings and tiles are kept until all is done, on a disk that all workers share; an interrupted '
+        'job goes on from there (default: beside the results)',
+    )
+
+
+def with_workers(
+    options: argparse.Namespace,
+    parameters: Parameters,
+    extrinsics: Mapping[str, Pose2],
+    ignored: Sequence[str],
+    part: Part,
+    default: str,
+    tell: Callable[[argparse.Namespace, Mapping[str, Any], Path], None],
+) -> int:
+    """Do what the command line asks for; `default` is the name of the folder, and `tell` prints what came out."""
+    from ..scale.extra import need
+
+    need()
+    _check(options)
+    # imported only now: they need the extra
+    from ..scale.cluster import Cluster
+    from ..scale.job import Job, Recordings, versions
+    from ..scale.mapping import ScaledMapper
+    from ..scale.output import write_output
+    from ..scale.work_folder import WorkFolder
+
+    output = Path(options.output) if options.output else free_name(Path.cwd(), default)
+    work = WorkFolder(str(Path(options.work or f'{output}.work').resolve()))
+    memory = int((options.memory_per_worker or MEMORY) * 1e9)
+    size = TILE if options.tiles is None else options.tiles
+    paths, repeated = without_repetition(find_recordings(options.bags))
+    of_all = dataclasses.replace(parameters, association=dataclasses.replace(parameters.association, max_readings=0))
+    recordings = Recordings(
+        tuple(str(path.resolve()) for path in paths),
+        extrinsics,
+        tuple(options.range_topics) if options.range_topics else None,
+        options.odom_topic,
+        part,
+    )
+    begun = time.perf_counter()
+    with Ticker(options.quiet) as ticker, output_folder(output) as folder:
+        again = work.begin(_described(recordings, of_all, size))
+        ticker.say('starting workers')
+        try:
+            with Cluster(options.workers or 1, options.scheduler, memory) as cluster:
+                if not options.quiet:
+                    told = f', the dashboard is at {cluster.dashboard}' if cluster.dashboard else ''
+                    going_on = ', and going on with what was done before' if again else ''
+                    print(f'mapping in tiles of {size:g} m in {readable(work.path)}{going_on}{told}', file=sys.stderr)
+                job = Job(work, _for_worker(of_all, cluster.memory or memory), size, versions())
+                found = ScaledMapper(cluster, job, ticker.say).run(recordings, [*repeated, *ignored])
+                title = f'{readable(Path(*paths[0].resolve().parts[-2:]))}'
+                title += f' and {len(paths) - 1} more' if len(paths) > 1 else ''
+                report = write_output(folder, job, found, cluster, of_all, title, ticker.say)
+        except BaseException:
+            if work.placed:
+                print(
+                    f'what was done is kept in {readable(work.path)}; the same command goes on there', file=sys.stderr
+                )
+            else:
+                shutil.rmtree(work.root, ignore_errors=True)
+            raise
+    shutil.rmtree(work.root, ignore_errors=True)
+    tell(options, report, output)
+    if not options.quiet and not options.json:
+        seconds = time.perf_counter() - begun
+        print(f'{seconds:.0f} s; the largest worker took {found.peak / 1e9:.2f} GB')
+    return 0
+
+
+def _check(options: argparse.Namespace) -> None:
+    """Check options that only make sense together, or not together."""
+    if options.workers is not None and options.workers < 1:
+        raise ParameterError('--workers must be a positive number')
+    if options.workers is not None and options.scheduler is not None:
+        raise ParameterError('--scheduler has workers of its own; leave out --workers')
+    memory = options.memory_per_worker
+    if memory is not None and not (math.isfinite(memory) and memory >= LEAST_MEMORY):
+        raise ParameterError(f'--memory-per-worker {memory:g}: give gigabytes, {LEAST_MEMORY:g} or more')
+    given = (
+        ('--learn', options.learn),
+        ('--refine-poses', options.refine_poses),
+        ('--bag', options.write_bag),
+        ('--show', options.show),
+        ('--rerun', options.rerun),
+        ('--poses', options.poses),
+    )
+    for name, value in given:
+        if value:
+            raise ParameterError(f'{name} is for one process; leave it out, or --workers and --scheduler')
+
+
+def _for_worker(parameters: Parameters, memory: int) -> Parameters:
+    """Return parameters with one thread, and with so much memory for pairs that the rest of a tile fits beside them."""
+    pairs = int(max(memory - RESERVED, 0.1e9) / 2e6)
+    of_search = dataclasses.replace(parameters.search, threads=1, max_memory=min(parameters.search.max_memory, pairs))
+    return dataclasses.replace(parameters, search=of_search)
+
+
+def _described(recordings: Any, parameters: Parameters, size: float) -> dict[str, Any]:
+    """Return what makes a job another one."""
+    files = []
+    for name in recordings.paths:
+        path = Path(name)
+        inside = sorted(p for p in path.iterdir() if p.is_file()) if path.is_dir() else [path]
+        files.append([name, *([p.name, p.stat().st_size, p.stat().st_mtime_ns] for p in inside if p.exists())])
+    return {
+        'recordings': files,
+        'tiles': size,
+        'parameters': parameters.flat(),
+        'sensors': {frame: list(pose) for frame, pose in recordings.extrinsics.items()},
+        'topics': [recordings.range_topics, recordings.odom_topic],
+        'part': str(recordings.part),
+    }

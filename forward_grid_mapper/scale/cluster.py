@@ -1,0 +1,178 @@
+"""Dask does the distribution: a cluster of processes on this machine, or one that exists, and tasks given to it."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import uuid
+from collections.abc import Callable, Iterable, Iterator
+from typing import Any
+
+from ..core.common.errors import ClusterError, MapperError, OutputError
+from .job import Job, check_versions, versions
+
+PATIENCE = 10.0
+"""Seconds in which a scheduler has to answer."""
+
+COME = 60.0
+"""Seconds in which the first worker of a scheduler has to be there."""
+
+SETTINGS = {
+    # what workers hold is on disk already: none of it need be spilled, and none waits for memory
+    'distributed.worker.memory.target': False,
+    'distributed.worker.memory.spill': False,
+    'distributed.worker.memory.pause': False,
+    'distributed.worker.memory.terminate': 0.95,
+    'distributed.scheduler.allowed-failures': 3,
+    'distributed.comm.timeouts.connect': f'{PATIENCE:g}s',
+    'distributed.admin.tick.limit': '1h',
+}
+
+Work = Callable[..., dict[str, Any]]
+
+
+def _memory_of(dask_worker: Any) -> int:
+    """Return the bytes that a worker may take, 0 if it has no bound; Dask gives it the worker."""
+    return int(dask_worker.memory_manager.memory_limit or 0)
+
+
+class Cluster:
+    """Workers of a scheduler, in a `with` block.
+
+    Attributes
+    ----------
+    dashboard : str
+        The address of Dask's dashboard.
+    workers : int
+        How many there were at the beginning.
+    memory : int
+        Bytes that the smallest of them may take; 0 if they do not say.
+    """
+
+    def __init__(self, workers: int, scheduler: str | None, memory: int) -> None:
+        """Prepare.
+
+        Parameters
+        ----------
+        workers : int
+            How many processes to start on this machine, without a scheduler.
+        scheduler : str, optional
+            Address of one that exists, with workers of its own.
+        memory : int
+            Bytes that a worker started here may take; one that takes more is ended, and its task begun anew.
+        """
+        self.workers, self._scheduler, self.memory = workers, scheduler, memory
+        # several jobs may be with one scheduler
+        self._token = uuid.uuid4().hex
+        self._open = contextlib.ExitStack()
+        self.dashboard = ''
+
+    def __enter__(self) -> Cluster:
+        """Start workers, or find them.
+
+        Raises
+        ------
+        ClusterError
+            If the scheduler cannot be reached, has no workers, or one of them has other versions.
+        """
+        import dask
+        from distributed import Client, LocalCluster
+
+        try:
+            self._open.enter_context(dask.config.set(SETTINGS))
+            # what workers meet is told by the tasks' errors
+            for name in ('distributed', 'tornado.application'):
+                logging.getLogger(name).setLevel(logging.CRITICAL)
+            address: Any = self._scheduler
+            if address is None:
+                address = self._open.enter_context(
+                    LocalCluster(
+                        n_workers=self.workers,
+                        threads_per_worker=1,
+                        processes=True,
+                        memory_limit=self.memory,
+                        dashboard_address='127.0.0.1:0',
+                        silence_logs=logging.CRITICAL,
+                    )
+                )
+            try:
+                self._client = self._open.enter_context(Client(address, timeout=PATIENCE, set_as_default=False))
+            except (OSError, ValueError, TimeoutError) as error:
+                raise ClusterError(
+                    f'no scheduler answers at {self._scheduler}: {error or "nothing came"}. Is the address right '
+                    f'(tcp://HOST:8786), and is dask-scheduler running there?'
+                ) from error
+            self._check()
+        except BaseException:
+            self._open.close()
+            raise
+        return self
+
+    def __exit__(self, *unused: object) -> None:
+        """End the workers that were started here; tasks of this job are dropped."""
+        self._open.close()
+
+    def _check(self) -> None:
+        """Look at the workers that there are."""
+        try:
+            self._client.wait_for_workers(1, timeout=COME)
+        except TimeoutError as error:
+            raise ClusterError(f'the scheduler at {self._scheduler} has no workers; start some') from error
+        self.dashboard = str(self._client.dashboard_link)
+        try:
+            self._client.get_versions(check=True)
+            self._client.run(check_versions, versions())
+        except ValueError as error:
+            raise ClusterError(f'the workers do not have the packages of this machine: {error}') from error
+        except ImportError as error:
+            raise ClusterError(f'a worker lacks what this machine has: {error}') from error
+        limits = list(self._client.run(_memory_of).values())
+        self.workers, self.memory = len(limits), min(filter(None, limits), default=0)
+
+    def each(self, name: str, work: Work, job: Job, numbers: Iterable[int], *more: Any) -> Iterator[tuple[int, Any]]:
+        """Have a task done for each number; yield numbers with what was returned, in the order in which they end.
+
+        A worker that dies costs the tasks that it was at: they are done by others.
+
+        Raises
+        ------
+        ClusterError
+            If a task ended its worker again and again, or the scheduler is gone.
+        MapperError
+            That of a task.
+        """
+        from distributed import as_completed
+        from distributed.scheduler import KilledWorker
+
+        begun = {
+            self._client.submit(work, job, k, *more, pure=False, key=f'{name}-{k}-{self._token}'): k for k in numbers
+        }
+        try:
+            for future in as_completed(begun, loop=self._client.loop):
+                number = begun[future]
+                try:
+                    yield number, future.result()
+                except MapperError:
+                    raise
+                except KilledWorker as error:
+                    raise ClusterError(
+                        f'{name} {number} ended its worker {SETTINGS["distributed.scheduler.allowed-failures"]} times '
+                        f'and more: its memory is not enough, most likely. Give more (--memory-per-worker), or '
+                        f'make tiles smaller (--tiles)'
+                    ) from error
+                except MemoryError as error:
+                    raise ClusterError(
+                        f'{name} {number}: the memory of its worker is not enough; give more (--memory-per-worker), '
+                        f'or make tiles smaller (--tiles)'
+                    ) from error
+                except OSError as error:
+                    raise OutputError(f'{name} {number}: {error}') from error
+                except Exception as error:
+                    if type(error).__module__.startswith('distributed'):
+                        raise ClusterError(f'{name} {number}: {type(error).__name__}: {error}') from error
+                    raise
+                finally:
+                    future.release()
+        finally:
+            with contextlib.suppress(Exception):
+                self._client.cancel(list(begun), force=True)

@@ -1,0 +1,169 @@
+"""The folder of a job: all that workers tell each other, in files that are whole or not there.
+
+    manifest.json                                   what the job is; another one is refused
+    drives/0007.json                                what is known of a drive, once it is placed
+    readings/row=3/column=-1/drive_0007.parquet     readings of a drive that touch a tile or come near it
+    ground/row=3/column=-1/drive_0007.parquet       cells of a tile that the drive traversed
+    plan.json                                       the grid and the order of drives, once all are placed
+    tiles/3_-1/                                     what is known of a tile: see `tile_work`
+
+A file is written beside its place and renamed. So a worker that dies leaves nothing half written, and what is there
+need not be made again: whoever is to make a file looks for it first.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import os
+import uuid
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core.common.errors import OutputError
+from ..files.output_folder import output_errors
+from ..files.report import json_text
+
+Arrays = Mapping[str, NDArray[Any]]
+
+
+@dataclass(frozen=True)
+class WorkFolder:
+    """Where the files of a job are."""
+
+    path: str
+
+    @property
+    def root(self) -> Path:
+        """The folder."""
+        return Path(self.path)
+
+    @property
+    def manifest(self) -> Path:
+        """What the job is."""
+        return self.root / 'manifest.json'
+
+    @property
+    def plan(self) -> Path:
+        """The grid and the order of drives."""
+        return self.root / 'plan.json'
+
+    @property
+    def placed(self) -> bool:
+        """Return whether any drive has been placed."""
+        return any((self.root / 'drives').glob('*.json'))
+
+    def drive(self, number: int) -> Path:
+        """Return where it says what is known of a drive."""
+        return self.root / 'drives' / f'{number:04d}.json'
+
+    def parts(self, kind: str, row: int, column: int) -> Path:
+        """Return the folder of what drives have for a tile; `kind` is readings or ground."""
+        return self.root / kind / f'row={row}' / f'column={column}'
+
+    def tile(self, row: int, column: int, name: str) -> Path:
+        """Return where a file of a tile is."""
+        return self.root / 'tiles' / f'{row}_{column}' / name
+
+    def begin(self, job: Mapping[str, Any]) -> bool:
+        """Make the folder for a job, or go on in it; return whether it was begun before.
+
+        Raises
+        ------
+        OutputError
+            If the folder holds another job, or something else, or cannot be written.
+        """
+        described = json.loads(json_text(job))
+        if self.manifest.exists():
+            before = read_json(self.manifest)
+            if before != described:
+                differ = ', '.join(key for key in {**before, **described} if before.get(key) != described.get(key))
+                raise OutputError(
+                    f'{self.path} holds what was done of another job (they differ in {differ}): remove it, or choose '
+                    f'another folder with --work'
+                )
+            return True
+        with output_errors(self.root):
+            self.root.mkdir(parents=True, exist_ok=True)
+            if any(entry for entry in self.root.iterdir() if not entry.name.endswith(PARTIAL)):
+                raise OutputError(f'{self.path} is not empty, and holds no job; choose another folder with --work')
+        write_json(self.manifest, described)
+        return False
+
+
+PARTIAL = '.partial'
+
+
+@contextlib.contextmanager
+def whole(path: Path) -> Iterator[Path]:
+    """Give a name to write to, which becomes `path` when the block succeeds; nothing is left if it fails.
+
+    Raises
+    ------
+    OutputError
+        If it cannot be written.
+    """
+    partial = path.with_name(f'.{path.name}.{uuid.uuid4().hex[:8]}{PARTIAL}')
+    with output_errors(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            yield partial
+            partial.replace(path)
+        finally:
+            with contextlib.suppress(OSError):
+                partial.unlink(missing_ok=True)
+
+
+def write_json(path: Path, data: Mapping[str, Any]) -> None:
+    """Write a mapping; what is there stays until the new file is on the disk."""
+    with whole(path) as partial, partial.open('w', encoding='utf-8') as file:
+        file.write(json_text(data))
+        file.flush()
+        os.fsync(file.fileno())
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """Read what `write_json` wrote.
+
+    Raises
+    ------
+    OutputError
+        If it cannot be read.
+    """
+    try:
+        found: dict[str, Any] = json.loads(path.read_text(encoding='utf-8'))
+    except (OSError, ValueError) as error:
+        raise OutputError(
+            f'{path} cannot be read ({error}); remove the work folder, and the job begins anew'
+        ) from error
+    return found
+
+
+def write_arrays(path: Path, arrays: Arrays, outcome: Mapping[str, Any]) -> None:
+    """Write arrays, and a mapping of plain values that goes with them."""
+    packed = io.BytesIO()
+    np.savez(packed, outcome=np.array(json_text(outcome)), **arrays)  # type: ignore[arg-type]
+    with whole(path) as partial:
+        partial.write_bytes(packed.getbuffer())
+
+
+def read_arrays(path: Path, *names: str) -> list[NDArray[Any]]:
+    """Return some of the arrays of a file."""
+    with np.load(path, allow_pickle=False) as data:
+        return [data[name] for name in names]
+
+
+def outcome_in(path: Path) -> dict[str, Any] | None:
+    """Return the mapping in a file of arrays; None if there is no such file."""
+    try:
+        (text,) = read_arrays(path, 'outcome')
+    except FileNotFoundError:
+        return None
+    found: dict[str, Any] = json.loads(str(text))
+    return found

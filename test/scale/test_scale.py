@@ -1,0 +1,385 @@
+"""Tiles by workers: the maps of one process, whoever is killed; clear errors; large maps in parts."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from forward_grid_mapper.commands import process_bag
+from forward_grid_mapper.commands.simulate import write_bag
+from forward_grid_mapper.core.common.errors import ClusterError, OutputError
+from forward_grid_mapper.core.common.parameters import Parameters
+from forward_grid_mapper.files import drawing
+from forward_grid_mapper.files.map_archive import read_npz
+from forward_grid_mapper.files.map_files import read_map
+from forward_grid_mapper.recordings.drive import WHOLE
+from forward_grid_mapper.scale import extra
+from forward_grid_mapper.scale.job import Job, Recordings, check_versions, versions
+from forward_grid_mapper.scale.work_folder import WorkFolder, whole
+from forward_grid_mapper.simulation.campus import campus_drive
+from forward_grid_mapper.simulation.sonar import front_array
+
+ROOT = Path(__file__).resolve().parents[2]
+TILE = 8.0
+MAPS = ('live', 'ml', 'uncertainty')
+MISSING = [name for name in extra.PACKAGES if not extra.installed(name)]
+
+
+scaled = pytest.mark.skipif(bool(MISSING), reason=f'the extra scale is not installed: {", ".join(MISSING)}')
+
+
+def code_of(*arguments: object) -> int:
+    return process_bag.main([str(word) for word in arguments])
+
+
+@pytest.fixture(autouse=True)
+def quick_picture(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(drawing, 'draw', lambda path, picture: path.write_bytes(b''))
+
+
+@pytest.fixture(scope='module')
+def drives(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Three short drives in one building."""
+    folder = tmp_path_factory.mktemp('drives')
+    for number in range(3):
+        write_bag(folder / f'drive_{number}', campus_drive(number, 1, 900, sonars=front_array()), 'mcap', False)
+    return folder
+
+
+@pytest.fixture(scope='module')
+def one_process(drives: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The maps of one process, in tiles."""
+    folder = tmp_path_factory.mktemp('one') / 'maps'
+    assert code_of(drives, '-o', folder, '--tiles', TILE, '-q') == 0
+    return folder
+
+
+class Here:
+    """A cluster of this process; it may be interrupted after so many tasks."""
+
+    workers, memory, dashboard = 1, 0, ''
+
+    def __init__(self, tasks: float = float('inf'), turned: bool = False) -> None:
+        self.left, self.done, self.turned = tasks, 0, turned
+
+    def each(
+        self, name: str, work: Callable[..., dict[str, Any]], job: Job, numbers: Iterable[int], *more: Any
+    ) -> Iterator[tuple[int, Any]]:
+        order = list(numbers)
+        for number in reversed(order) if self.turned else order:
+            if not self.left:
+                raise KeyboardInterrupt
+            self.left -= 1
+            self.done += 1
+            yield number, work(job, number, *more)
+
+
+def job_in(folder: Path) -> Job:
+    job = Job(WorkFolder(str(folder)), Parameters.from_flat({'max_readings': 0, 'threads': 1}), TILE, versions())
+    job.folder.begin({'a': 'job'})
+    return job
+
+
+def recordings(drives: Path, turned: bool = False) -> Recordings:
+    paths = sorted(map(str, drives.iterdir()), reverse=turned)
+    return Recordings(tuple(paths), {}, None, None, WHOLE)
+
+
+def assert_same(folder: Path, other: Path) -> None:
+    one, two = read_npz(folder / 'maps.npz'), read_npz(other / 'maps.npz')
+    assert one.grid == two.grid
+    for name in MAPS:
+        np.testing.assert_array_equal(getattr(one, name), getattr(two, name))
+    assert one.log_likelihood == pytest.approx(two.log_likelihood, abs=1e-6)
+    assert one.objective == pytest.approx(two.objective, abs=1e-6)
+    with np.load(folder / 'maps.npz') as a, np.load(other / 'maps.npz') as b:
+        np.testing.assert_array_equal(a['dynamic'], b['dynamic'])
+    reports = [json.loads((f / 'report.json').read_text()) for f in (folder, other)]
+    for key in ('counts', 'map', 'drives'):
+        assert [r for r in reports[:1] if r[key]] and reports[0][key] == reports[1][key]
+    for key in ('readings', 'unexplained'):
+        assert reports[0]['result'][key] == reports[1]['result'][key]
+    for key in ('pairs', 'flips', 'iterations', 'tiles', 'searches_of_tiles', 'evaluations_of_a_reading', 'converged'):
+        assert reports[0]['statistics'][key] == reports[1]['statistics'][key]
+    assert reports[0]['warnings'] == reports[1]['warnings']
+
+
+def made_here(drives: Path, tmp_path: Path, cluster: Here, turned: bool = False) -> Path:
+    from forward_grid_mapper.scale.mapping import ScaledMapper
+    from forward_grid_mapper.scale.output import write_output
+
+    job, folder = job_in(tmp_path / 'work'), tmp_path / 'maps'
+    found = ScaledMapper(cluster, job).run(recordings(drives, turned))
+    folder.mkdir()
+    write_output(folder, job, found, cluster, Parameters(), 'drives', lambda text: None)
+    return folder
+
+
+# ---- the maps
+
+
+@scaled
+@pytest.mark.parametrize('turned', [False, True])
+def test_maps_are_those_of_one_process_in_whatever_order(
+    drives: Path, one_process: Path, tmp_path: Path, turned: bool
+) -> None:
+    assert_same(made_here(drives, tmp_path, Here(turned=turned), turned), one_process)
+
+
+@scaled
+def test_an_interrupted_job_goes_on_where_it_stood(drives: Path, one_process: Path, tmp_path: Path) -> None:
+    """Interrupted every few tasks, no task but the one of then is done twice."""
+    rounds = 0
+    while True:
+        rounds += 1
+        done = len([path for path in (tmp_path / 'work').rglob('*') if path.is_file()])
+        try:
+            # those that are done only say so
+            folder = made_here(drives, tmp_path, Here(12 * rounds))
+            break
+        except KeyboardInterrupt:
+            assert len([path for path in (tmp_path / 'work').rglob('*') if path.is_file()]) > done
+    assert rounds > 3
+    assert_same(folder, one_process)
+
+
+@scaled
+def test_a_task_that_is_run_again_changes_nothing(drives: Path, tmp_path: Path) -> None:
+    from forward_grid_mapper.scale import tile_work
+    from forward_grid_mapper.scale.mapping import ScaledMapper
+
+    job = job_in(tmp_path / 'work')
+    ScaledMapper(Here(), job).run(recordings(drives))
+    before = {path: (path.read_bytes(), path.stat().st_mtime_ns) for path in (tmp_path / 'work').rglob('*.npz')}
+    for work in (tile_work.gather, tile_work.normals, tile_work.finish, tile_work.judge):
+        assert work(job, 5) == {**work(job, 5), 'cpu': pytest.approx(0, abs=1), 'peak': pytest.approx(0, abs=1e12)}
+    tile_work.search(job, 5, 0)
+    after = {path: (path.read_bytes(), path.stat().st_mtime_ns) for path in (tmp_path / 'work').rglob('*.npz')}
+    assert before == after
+
+
+@scaled
+def test_large_maps_are_written_in_parts(
+    drives: Path, one_process: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import zarr
+
+    from forward_grid_mapper.scale import output
+
+    for name, value in (('LARGEST', 0), ('REGION', 64), ('OVERVIEW', 60)):
+        monkeypatch.setattr(output, name, value)
+    folder = made_here(drives, tmp_path, Here())
+    maps = read_npz(one_process / 'maps.npz')
+    assert {path.name for path in folder.iterdir()} == {
+        'maps.zarr',
+        'tiles',
+        'maps.png',
+        'report.json',
+        'report.txt',
+        'tasks.csv',
+    }
+    group = zarr.open_group(str(folder / 'maps.zarr'), mode='r')
+    assert group.attrs['resolution'] == maps.grid.resolution and group.attrs['origin'] == list(maps.grid.origin)
+    for name in MAPS:
+        np.testing.assert_array_equal(group[f'0/{name}_map'][:], getattr(maps, name))
+    with np.load(one_process / 'maps.npz') as whole_maps:
+        np.testing.assert_array_equal(group['0/dynamic'][:], whole_maps['dynamic'])
+    levels = len(group.attrs['levels'])
+    assert levels > 2
+    for level in range(levels):
+        cells, edge = group[f'{level}/ml_map'][:], 2**level
+        rows, columns = np.nonzero(maps.ml == 1)
+        expected = np.zeros(cells.shape, bool)
+        expected[rows // edge, columns // edge] = True
+        np.testing.assert_array_equal(cells == 1, expected)
+    assert max(cells.shape) <= 60
+    index = json.loads((folder / 'tiles' / 'index.json').read_text())
+    seen = np.full(maps.grid.shape, -1)
+    for entry in index['tiles']:
+        if entry['map'] == 'ml_map':
+            grid, probability = read_map(folder / 'tiles' / entry['yaml'])
+            assert grid.shape == tuple(entry['shape'])
+            seen[maps.grid.window(grid)] = np.nan_to_num(probability, nan=-1)
+    np.testing.assert_array_equal(seen, maps.ml)
+
+
+# ---- workers of Dask
+
+
+def started(*arguments: object) -> subprocess.Popen[bytes]:
+    command = [sys.executable, '-m', 'forward_grid_mapper', 'process_bag', *map(str, arguments)]
+    return subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+
+
+def wait_for(condition: Callable[[], bool], process: subprocess.Popen[bytes]) -> None:
+    while not condition():
+        assert process.poll() is None, process.communicate()
+        time.sleep(0.02)
+
+
+@scaled
+def test_a_killed_worker_and_a_killed_client_cost_only_what_they_were_at(
+    drives: Path, one_process: Path, tmp_path: Path
+) -> None:
+    import psutil
+
+    work = tmp_path / 'work'
+    arguments = (drives, '-o', tmp_path / 'maps', '--tiles', TILE, '--workers', 2, '--work', work, '-q')
+
+    def count(name: str) -> int:
+        return len(list(work.glob(f'tiles/*/{name}')))
+
+    client = started(*arguments)
+    wait_for(lambda: count('normals.npz') > 0, client)
+    workers = [p for p in psutil.Process(client.pid).children(recursive=True) if 'spawn_main' in ' '.join(p.cmdline())]
+    os.kill(workers[0].pid, signal.SIGKILL)
+    wait_for(lambda: count('search_0000.npz') > 1, client)
+    client.kill()
+    client.communicate()
+    assert not (tmp_path / 'maps').exists()
+    before = {path: path.stat().st_mtime_ns for path in work.glob('tiles/*/search_*.npz')}
+    client = started(*arguments)
+    wait_for(lambda: count('search_*.npz') > len(before), client)
+    assert before.items() <= {path: path.stat().st_mtime_ns for path in work.glob('tiles/*/search_*.npz')}.items()
+    _, error = client.communicate()
+    assert client.returncode == 0, error
+    assert_same(tmp_path / 'maps', one_process)
+    assert not work.exists(), 'what is done needs no work folder'
+
+
+@scaled
+def test_a_scheduler_that_does_not_answer(
+    drives: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from forward_grid_mapper.scale import cluster
+
+    monkeypatch.setattr(cluster, 'PATIENCE', 0.5)
+    assert code_of(drives, '-o', tmp_path / 'maps', '--scheduler', 'tcp://127.0.0.1:9') == 1
+    assert 'no scheduler answers at tcp://127.0.0.1:9' in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+def doubled(job: Job, number: int, more: int) -> dict[str, Any]:
+    return {'twice': 2 * number + more}
+
+
+def refused(job: Job, number: int) -> dict[str, Any]:
+    raise (OutputError('the disk is full') if number else OSError(errno.EIO, 'the disk is broken'))
+
+
+@scaled
+def test_a_scheduler_that_exists(monkeypatch: pytest.MonkeyPatch) -> None:
+    from distributed import LocalCluster
+
+    from forward_grid_mapper.scale import cluster
+
+    job = Job(WorkFolder('nowhere'), Parameters(), TILE, versions())
+    with LocalCluster(
+        n_workers=2, threads_per_worker=1, processes=False, memory_limit='1GB', dashboard_address=None
+    ) as there:
+        address = there.scheduler_address
+        with cluster.Cluster(1, address, 10) as given:
+            assert (given.workers, given.memory) == (2, 10**9)
+            assert sorted(given.each('twice', doubled, job, range(5), 1)) == [
+                (k, {'twice': 2 * k + 1}) for k in range(5)
+            ]
+            for number, told in ((0, 'the disk is broken'), (1, 'the disk is full')):
+                with pytest.raises(OutputError, match=told):
+                    list(given.each('refused', refused, job, [number]))
+        monkeypatch.setattr(cluster, 'versions', lambda: {**versions(), 'numba': '0.1'})
+        with pytest.raises(ClusterError, match=r'numba .*, not 0\.1'), cluster.Cluster(1, address, 10):
+            pass
+
+
+# ---- errors
+
+
+def test_without_the_extra_it_says_what_to_install(
+    drives: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, 'distributed', None)
+    assert code_of(drives, '-o', tmp_path / 'maps', '--workers', 2) == 1
+    assert "pip install 'forward_grid_mapper[scale]'" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+@scaled
+@pytest.mark.parametrize(
+    ('options', 'told'),
+    [
+        (('--workers', 0), '--workers'),
+        (('--workers', 2, '--scheduler', 'tcp://a:1'), 'leave out --workers'),
+        (('--workers', 2, '--memory-per-worker', 0.1), '--memory-per-worker'),
+        (('--workers', 2, '--refine-poses'), '--refine-poses'),
+        (('--workers', 2, '--learn', 1), '--learn'),
+        (('--work', 'here'), '--work'),
+    ],
+)
+def test_options_that_do_not_go_together(
+    drives: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], options: tuple[object, ...], told: str
+) -> None:
+    assert code_of(drives, '-o', tmp_path / 'maps', *options) == 1
+    assert told in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_another_version_is_named() -> None:
+    check_versions(versions())
+    with pytest.raises(ClusterError, match=r'numpy .*, not 0\.1.*install the same'):
+        check_versions({**versions(), 'numpy': '0.1'})
+
+
+def test_a_work_folder_holds_one_job(tmp_path: Path) -> None:
+    work = WorkFolder(str(tmp_path / 'work'))
+    assert not work.begin({'tiles': 5.0, 'of': (1, 2)})
+    assert work.begin({'tiles': 5.0, 'of': (1, 2)})
+    with pytest.raises(OutputError, match=r'another job .*differ in tiles.*--work'):
+        work.begin({'tiles': 6.0, 'of': (1, 2)})
+    (tmp_path / 'other').mkdir()
+    (tmp_path / 'other' / 'file').touch()
+    with pytest.raises(OutputError, match='not empty'):
+        WorkFolder(str(tmp_path / 'other')).begin({})
+    assert [path.name for path in (tmp_path / 'other').iterdir()] == ['file']
+
+
+@pytest.mark.parametrize(('number', 'told'), [(errno.ENOSPC, 'disk is full'), (errno.EACCES, 'permission')])
+def test_a_file_is_whole_or_not_there(tmp_path: Path, number: int, told: str) -> None:
+    (tmp_path / 'file').write_text('before')
+    with pytest.raises(OutputError, match=told), whole(tmp_path / 'file') as partial:
+        partial.write_text('half of')
+        raise OSError(number, os.strerror(number))
+    assert (tmp_path / 'file').read_text() == 'before'
+    assert [path.name for path in tmp_path.iterdir()] == ['file']
+
+
+@scaled
+def test_drives_that_cannot_be_mapped_are_named(drives: Path, tmp_path: Path) -> None:
+    from forward_grid_mapper.scale.mapping import ScaledMapper
+
+    paths = (*recordings(drives).paths, str(tmp_path / 'nothing'))
+    with pytest.raises(Exception, match=r'1 of 4 drives cannot be mapped.*\n.*nothing'):
+        ScaledMapper(Here(), job_in(tmp_path / 'work')).run(Recordings(paths, {}, None, None, WHOLE))
+
+
+@scaled
+def test_the_same_drive_twice_counts_once(drives: Path, one_process: Path, tmp_path: Path) -> None:
+    import shutil
+
+    copies = tmp_path / 'copies'
+    shutil.copytree(drives, copies)
+    shutil.copytree(drives / 'drive_1', copies / 'drive_9')
+    folder = made_here(copies, tmp_path, Here())
+    report = json.loads((folder / 'report.json').read_text())
+    assert [w for w in report['warnings'] if 'is the same drive as' in w and 'drive_9' in w]
+    np.testing.assert_array_equal(read_npz(folder / 'maps.npz').ml, read_npz(one_process / 'maps.npz').ml)
