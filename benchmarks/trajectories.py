@@ -3,6 +3,7 @@
     python benchmarks/trajectories.py                       # all simulated runs
     python benchmarks/trajectories.py --robot front --level wheels --seeds 2
     python benchmarks/trajectories.py --shared ../shared/data
+    python benchmarks/trajectories.py --distance 250 500 1000    # how time and memory grow
 
 Each run prints the absolute trajectory error (rms after rigid alignment, metres) of odometry and of what `Refiner`
 makes of it, whether that was taken, and the time of one core a metre; each group ends with a summary.
@@ -13,6 +14,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import math
+import resource
 import time
 from pathlib import Path
 
@@ -136,6 +138,22 @@ def simulated(robot: str, level: str, seeds: range, first: int) -> list[dict[str
     return rows
 
 
+def far(robot: str, level: str, distances: list[float], seed: int) -> None:
+    """Run drives around one building, longer and longer ones, and print time and the most memory so far."""
+    sonars, spacing, noise = ROBOTS[robot]
+    for distance in sorted(distances):
+        legs = 4
+        while np.hypot(*np.diff(corridors(seed, legs)[1], axis=0).T).sum() < distance:
+            legs += 1
+        world, way = corridors(seed, legs)
+        exact = drive(world, way, spacing, sonars(), noise, seed)
+        recording = with_drift(exact, LEVELS[level], seed)
+        true, before = odometry_of(exact), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+        run(f'{robot}, {level}, {true.travel[-1]:.0f} m', recording.readings, odometry_of(recording), true)
+        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+        print(f'{"":<34} {len(exact.readings)} readings; {before:.0f} MB before, {peak:.0f} MB at the peak', flush=True)
+
+
 def recorded(folder: Path) -> list[dict[str, float | bool | str]]:
     """Run the recordings that have corrected odometry beside the raw one."""
     rows = []
@@ -168,7 +186,13 @@ def main() -> None:
     parser.add_argument('--seeds', type=int, default=5)
     parser.add_argument('--first-seed', type=int, default=0, help='0 to 9, 20 and 21 were tuned on')
     parser.add_argument('--shared', type=Path, help='folder of recordings with corrected odometry, instead')
+    parser.add_argument('--distance', type=float, nargs='+', help='metres of longer and longer drives, instead')
     options = parser.parse_args()
+    if options.distance:
+        for robot in options.robot or ['front']:
+            for level in options.level or ['middle']:
+                far(robot, level, options.distance, options.first_seed)
+        return
     if options.shared:
         summary('recordings', recorded(options.shared))
         return

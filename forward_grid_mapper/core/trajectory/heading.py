@@ -55,7 +55,7 @@ BIAS_SIGMA, TURN_SCALE_SIGMA = math.radians(1.5), 0.03
 NEAR = 8
 """Degrees around the heading in which a vote is taken for one of it."""
 
-PRECISION = 8.0
+PRECISION = 2.0
 """Times that the mean direction of a peak is known better than one vote in it."""
 
 TEMPER, WIDER = 0.5, 1.5
