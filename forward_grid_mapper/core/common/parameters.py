@@ -217,7 +217,7 @@ class SearchParameters:
         1.0,
     )
     neighbour_weight: float = _param(
-        0.9,
+        0.6,
         'Weight of what the neighbours of a cell say in the uncertainty map, by the prior of walls (the second '
         'coefficient of the calibration); 0 is the paper.',
         '',
@@ -225,7 +225,7 @@ class SearchParameters:
         1.0,
     )
     uncertainty_prior: float = _param(
-        0.57,
+        0.38,
         'Occupancy that the uncertainty map states without evidence and without neighbours (the offset of the '
         'calibration).',
         'probability',
