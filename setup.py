@@ -81,6 +81,8 @@ setup(
             'pillow>=9.2,<14',
             'argcomplete>=3.1,<4',
         ],
+        # the viewer and what writes for it are of one version; it takes neither an older Python nor an older numpy
+        'rerun': ["rerun-sdk>=0.41,<0.42; python_version>='3.11'"],
         'completion': ['argcomplete>=3.1,<4'],
         'site': ['mkdocs>=1.6,<2', 'mkdocs-material>=9.5,<10', 'nbclient>=0.10,<1', 'ipykernel>=6.29,<8'],
         'lint': ['ruff>=0.17,<0.18', 'mypy>=1.15,<3', 'types-PyYAML>=6,<7'],

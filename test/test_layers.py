@@ -27,7 +27,7 @@ CORE = ('common', 'runtime', 'sensor', 'messages', 'evidence', 'search', 'maps',
 
 OUTSIDE = {
     'core': {'numpy', 'numba', 'scipy'},
-    'files': {'numpy', 'yaml', 'matplotlib'},
+    'files': {'numpy', 'yaml', 'matplotlib', 'rerun'},
     # rosbags brings the decompressors
     'bags': {'numpy', 'rosbags', 'lz4', 'backports'},
     'simulation': {'numpy'},

@@ -49,15 +49,11 @@ def choose_topics(
     BagError
         If a named topic is not there, or none or too many are found.
     """
-    ranges = _of_type(contents, RANGE)
-    if range_topics is not None:
-        ranges = list(dict.fromkeys(_named(contents, topic, (RANGE,), '--range-topics') for topic in range_topics))
-    if not ranges:
-        raise BagError(f'The bag has no sensor_msgs/Range messages to map from. {_listing(contents)}')
+    ranges = choose_range_topics(contents, range_topics)
     kinds = tuple(POSES) if any_poses else (ODOMETRY,)
     if odom_topic is not None:
         topic = _named(contents, odom_topic, kinds, '--odom-topic')
-        return Topics(tuple(ranges), topic, contents[topic][0])
+        return Topics(ranges, topic, contents[topic][0])
     # stamped poses only where there is no odometry, since they may be goals; transforms only if asked for
     found = _of_type(contents, ODOMETRY) or [
         t for kind in kinds if kind != TF_MESSAGE for t in _of_type(contents, kind)
@@ -70,7 +66,24 @@ def choose_topics(
     if len(found) > 1:
         lines = (f'\n  {topic}: {contents[topic][1]} messages, {frames_of(topic)}' for topic in found)
         raise BagError('The bag has several odometry topics; choose one with `--odom-topic`:' + ''.join(lines))
-    return Topics(tuple(ranges), found[0], contents[found[0]][0])
+    return Topics(ranges, found[0], contents[found[0]][0])
+
+
+def choose_range_topics(contents: Contents, range_topics: Sequence[str] | None) -> tuple[str, ...]:
+    """Return the named topics of ranges, or where none is named all there are; the parameters are as above.
+
+    Raises
+    ------
+    BagError
+        If a named topic is not there, or there is none.
+    """
+    if range_topics is None:
+        ranges = tuple(_of_type(contents, RANGE))
+    else:
+        ranges = tuple(dict.fromkeys(_named(contents, topic, (RANGE,), '--range-topics') for topic in range_topics))
+    if not ranges:
+        raise BagError(f'The bag has no sensor_msgs/Range messages to map from. {_listing(contents)}')
+    return ranges
 
 
 def _moving(contents: Contents, kinds: Sequence[str]) -> str:

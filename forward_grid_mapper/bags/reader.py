@@ -10,7 +10,7 @@ from typing import Any
 
 from ..core.common.errors import BagError, InputError
 from ..core.messages.message_types import OdometryMessage, RangeMessage, range_message
-from .choice import RANGE, Topics, choose_topics
+from .choice import ODOMETRY, RANGE, Topics, choose_range_topics, choose_topics
 from .decoder import TF_MESSAGE, decoder_of
 from .opening import open_sources, repair_hint
 from .poses import POSES
@@ -94,6 +94,24 @@ class Bag:
             If a named topic is not there, or there is none, or several Odometry topics and none named.
         """
         return choose_topics(self.topics(), range_topics, odom_topic, self._frames_of, any_poses)
+
+    def choose_range_topics(self, range_topics: Sequence[str] | None = None) -> Topics:
+        """Return the topics to map from where the poses come from elsewhere: those of ranges, and no odometry.
+
+        Raises
+        ------
+        BagError
+            If a named topic is not there, or there is none.
+        """
+        return Topics(choose_range_topics(self.topics(), range_topics), '')
+
+    def base_frame(self) -> str:
+        """Return the frame whose pose the bag's odometry gives; empty where there is none."""
+        wanted = {(channel.topic, ODOMETRY) for channel in self._channels() if channel.msgtype == ODOMETRY}
+        for _, message in self._decoded(wanted):
+            if message is not None:
+                return str(message.child_frame_id)
+        return ''
 
     def messages(
         self, topics: Topics, progress: Callable[[int, int], None] | None = None

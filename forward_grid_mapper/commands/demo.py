@@ -18,7 +18,8 @@ from ..recordings.read_drive import read_drive
 from ..simulation.drive import Recording
 from ..simulation.score import Scores, score_map, threshold, visible_surface
 from .console import Ticker, run
-from .options import add_mapping_options, chosen_parameters
+from .desktop import show
+from .options import add_mapping_options, add_show_option, chosen_parameters
 from .simulate import SONARS, record, write_recording
 
 COMMAND = 'demo'
@@ -40,6 +41,7 @@ def parser() -> argparse.ArgumentParser:
     made.add_argument('--rate', type=float, default=10.0, metavar='R', help='speed of the replay (default 10)')
     made.add_argument('--offline', action='store_true', help='map the bag with process_bag instead, without ROS')
     made.add_argument('--seed', type=int, default=0, help='of the noise (default 0)')
+    add_show_option(made, 'the picture')
     add_mapping_options(made)
     return made
 
@@ -140,6 +142,8 @@ def demo(options: argparse.Namespace) -> int:
             (folder / 'scores.txt').write_text(table + '\n', encoding='utf-8')
     print(f'EM {"offline" if options.offline else "in the node"}: {summary}\n\n{table}\n')
     print(f'the picture is {output / "demo.png"}; the maps as for Nav2 and their report are in {output / "maps"}')
+    if options.show:
+        show(output / 'demo.png')
     return 0
 
 

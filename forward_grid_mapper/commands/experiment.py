@@ -12,9 +12,10 @@ from ..core.common.parameters import Parameters
 from ..files.figure import write_density, write_figure
 from ..files.output_folder import free_name, output_errors, output_folder
 from .console import Ticker, run
+from .desktop import show
 from .experiment_density import density_of_ranges, density_table
 from .experiment_maps import corridor, door, passer_by
-from .options import add_mapping_options, chosen_parameters
+from .options import add_mapping_options, add_show_option, chosen_parameters
 
 COMMAND = 'experiment'
 
@@ -41,6 +42,7 @@ def parser() -> argparse.ArgumentParser:
     )
     made.add_argument('-o', '--output', metavar='DIR', help='new folder (default: experiment_WHICH)')
     made.add_argument('--seeds', type=int, default=5, metavar='N', help='noises to average over (default 5)')
+    add_show_option(made, 'the figure')
     add_mapping_options(made)
     return made
 
@@ -60,6 +62,8 @@ def experiment(options: argparse.Namespace) -> int:
             (folder / 'table.txt').write_text(table + '\n', encoding='utf-8')
     print(table)
     print(f'\ntable and figure are in {output}')
+    if options.show:
+        show(output / 'figure.png')
     return 0
 
 

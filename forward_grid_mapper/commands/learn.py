@@ -30,6 +30,7 @@ from .options import (
     add_part_options,
     chosen_parameters,
     chosen_part,
+    chosen_poses,
 )
 
 COMMAND = 'learn'
@@ -77,7 +78,7 @@ def learn(options: argparse.Namespace) -> int:
             raise OutputError(f'{output} exists; choose another file with --output, or remove it first')
         if not output.parent.is_dir():
             raise OutputError(f'{output.parent} is no folder; make it first, or choose another with --output')
-    part = chosen_part(options)
+    part, poses = chosen_part(options), chosen_poses(options)
     with Ticker(options.quiet) as ticker:
         drives = read_drives(
             options.bags,
@@ -88,6 +89,7 @@ def learn(options: argparse.Namespace) -> int:
             part,
             ticker.reading,
             ticker.say,
+            poses,
         )
         found = learn_jointly(drives.readings, parameters, options.rounds, options.keep_going, ticker.mapping)
         if not options.keep_going:
@@ -125,6 +127,8 @@ def _mapping(options: argparse.Namespace, parameters: Path) -> str:
         words += ['--start', f'{options.start!r}']
     if math.isfinite(options.duration):
         words += ['--duration', f'{options.duration!r}']
+    if options.poses:
+        words += ['--poses', Path(options.poses)]
     if options.odom_topic:
         words += ['--odom-topic', options.odom_topic]
     if options.range_topics:

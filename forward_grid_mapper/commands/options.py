@@ -16,6 +16,7 @@ from ..files.output_folder import readable
 from ..files.parameter_file import load_parameters, parse_setting
 from ..files.parameter_text import dump_parameters
 from ..recordings.drive import Part
+from ..recordings.given_poses import GivenPoses, read_given_poses
 
 
 def add_json_option(parser: argparse.ArgumentParser) -> None:
@@ -23,6 +24,11 @@ def add_json_option(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--json', action='store_true', help='print the result as JSON, and nothing else on standard output'
     )
+
+
+def add_show_option(parser: argparse.ArgumentParser, what: str) -> None:
+    """Add `--show`, which opens `what`."""
+    parser.add_argument('--show', action='store_true', help=f"open {what} with the desktop's viewer")
 
 
 class BagParser(argparse.ArgumentParser):
@@ -112,12 +118,34 @@ def add_bag_options(parser: argparse.ArgumentParser) -> None:
         'base_link (needed if the bag has several)',
     )
     parser.add_argument(
+        '--poses',
+        metavar='FILE',
+        help="take the robot's poses from a TUM or CSV file in place of the bag's odometry; stamps in seconds",
+    )
+    parser.add_argument(
         '--sensor',
         action='append',
         default=[],
         metavar='FRAME=X,Y,YAW',
         help='pose of a sensor on the robot in metres and radians (or 90deg); wins over /tf_static; may be repeated',
     )
+
+
+def chosen_poses(options: argparse.Namespace) -> GivenPoses | None:
+    """Return the poses of `--poses`, if there is one.
+
+    Raises
+    ------
+    ParameterError
+        If an odometry topic is chosen, too.
+    InputError
+        If the file cannot be read.
+    """
+    if options.poses is None:
+        return None
+    if options.odom_topic:
+        raise ParameterError('--poses is given in place of odometry; leave out --odom-topic')
+    return read_given_poses(options.poses)
 
 
 def add_part_options(parser: argparse.ArgumentParser) -> None:

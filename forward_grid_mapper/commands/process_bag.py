@@ -13,6 +13,7 @@ from typing import Any
 
 from ..core.common.errors import InputError, ParameterError
 from ..core.common.parameters import Parameters
+from ..core.common.shell import module_line
 from ..core.joint_learning import map_and_learn
 from ..core.mapping import Mapper
 from ..core.maps.map_set import MapSet
@@ -22,7 +23,10 @@ from ..core.trajectory.windows import Odometry
 from ..files.map_files import occupancy_values
 from ..files.output_folder import free_name, output_folder, readable
 from ..files.parameter_file import parse_sensor
+from ..files.picture import NOWHERE
 from ..files.report import json_text, report_text
+from ..files.rerun_recording import NAME as RECORDING
+from ..files.rerun_recording import check_rerun, write_rerun
 from ..files.results import write_results
 from ..files.trajectory_text import trajectory_data, tum_text
 from ..recordings.drives import Drives, read_drives
@@ -34,8 +38,10 @@ from .options import (
     add_json_option,
     add_mapping_options,
     add_part_options,
+    add_show_option,
     chosen_parameters,
     chosen_part,
+    chosen_poses,
 )
 
 SMALLEST_TILE = 1.0
@@ -80,9 +86,12 @@ def parser() -> argparse.ArgumentParser:
         help='map in tiles of that edge in metres, one after the other; 20 or more for sonars that reach 5 m',
     )
     made.add_argument('--bag', dest='write_bag', action='store_true', help='also write the maps as a bag (mcap)')
+    made.add_argument(
+        '--rerun', action='store_true', help='also write the drive for the viewer Rerun, which plays it (drive.rrd)'
+    )
     made.add_argument('-q', '--quiet', action='store_true', help='print nothing but errors and the folder')
     add_json_option(made)
-    made.add_argument('--show', action='store_true', help="open the report with the desktop's browser")
+    add_show_option(made, 'the report')
     add_mapping_options(made)
     return made
 
@@ -93,9 +102,11 @@ def process(options: argparse.Namespace) -> int:
     extrinsics |= dict(parse_sensor(text) for text in options.sensor)
     if options.learn < 0:
         raise ParameterError('--learn: the number of rounds must not be negative')
-    part = chosen_part(options)
+    part, poses = chosen_part(options), chosen_poses(options)
     if options.tiles is not None and not (math.isfinite(options.tiles) and options.tiles >= SMALLEST_TILE):
         raise ParameterError(f'--tiles {options.tiles:g}: give the edge of a tile in metres, {SMALLEST_TILE:g} or more')
+    if options.rerun:
+        check_rerun()
     mapper = Mapper if options.tiles is None else partial(TiledMapper, size=options.tiles)
     output = Path(options.output) if options.output else free_name(Path.cwd(), f'{_stem(options.bags)}_maps')
     begin = time.perf_counter()
@@ -110,6 +121,7 @@ def process(options: argparse.Namespace) -> int:
             part,
             ticker.reading,
             ticker.say,
+            poses,
         )
         source = drives.source
         source['warnings'] += ignored
@@ -129,7 +141,7 @@ def process(options: argparse.Namespace) -> int:
             source['warnings'].append(_learned(maps))
         if not maps.statistics['converged']:
             source['warnings'].append('the search ended at max_iterations before it converged; raise max_iterations')
-        path, extras, before = drives.path_xy, {}, None
+        path, extras, before = drives.path_xy, {}, NOWHERE
         if refined is not None and moved:
             path, before = refined.trajectory.pose[:, :2], drives.path_xy
             odometry = Odometry.of(*drives.drives[0].associator.odometry)
@@ -137,6 +149,15 @@ def process(options: argparse.Namespace) -> int:
         report = write_results(folder, maps, source, path, _title(drives), extras=extras, odometry_xy=before)
         if options.write_bag:
             _write_bag(folder / 'maps.mcap_bag', maps, drives)
+        if options.rerun:
+            write_rerun(
+                folder / RECORDING,
+                maps,
+                report_text(report),
+                _title(drives),
+                path,
+                NOWHERE if before is None else before,
+            )
     tell(options, report, output)
     if options.show:
         show(output / 'report.html')
@@ -154,6 +175,8 @@ def tell(options: argparse.Namespace, report: Mapping[str, Any], output: Path) -
         for warning in report['warnings']:
             print(f'{COMMAND}: warning: {warning}', file=sys.stderr)
     print(f'maps are in {output}')
+    if options.rerun and not options.quiet:
+        print(f'play the drive with\n  {module_line("rerun", output / RECORDING)}')
 
 
 def _stem(words: Sequence[str]) -> str:

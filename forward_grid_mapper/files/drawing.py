@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,13 +22,13 @@ from matplotlib.ticker import MaxNLocator
 from matplotlib.transforms import Affine2D
 from numpy.typing import NDArray
 
-from .panels import Box, Picture, coarse
+from .panels import DRIVES, PATH, UNKNOWN_COLOUR, Box, Picture, coarse, paths_of
 
 # Free is white and unknown a cool tint, so that they differ to every eye; in between runs a warm scale, so that an
 # uncertain cell looks like neither. Path, dots and the path by odometry are blue, vermilion and purple of
 # the Okabe-Ito palette.
-_FREE, _OCCUPIED, UNKNOWN = '#ffffff', '#14171c', '#cfd9e4'
-PATH, DOT, _BEFORE = '#0072b2', '#d55e00', '#cc79a7'
+_FREE, _OCCUPIED, UNKNOWN = '#ffffff', '#14171c', UNKNOWN_COLOUR
+DOT, _BEFORE = '#d55e00', '#cc79a7'
 INK, FRAME = '#22262b', '#8b96a3'
 _PROBABILITY = LinearSegmentedColormap.from_list(
     'occupancy', [(0.0, _FREE), (0.2, '#fdf0d2'), (0.5, '#eeb04d'), (0.78, '#8a4a1c'), (1.0, _OCCUPIED)]
@@ -39,8 +40,8 @@ DPI = 150
 EDGE, HEAD, _FOOT, _LABELS, CAPTION, GAP = 0.3, 0.8, 0.8, 0.55, 0.42, 0.3
 # Below this width the legend would run into the scale of probabilities.
 _MIN_WIDTH = 11.3
-# Drives whose start and end are marked.
-_MOST_MARKED = 12
+# Drives whose start and end are marked, and those that are named, each with so many characters at most.
+_MOST_MARKED, _MOST_NAMED, _NAME = 12, 4, 20
 WIDE = 2.6
 # Pixels of a cell, at least: below that walls of one cell are hardly seen.
 _CELL = 2.5
@@ -144,7 +145,7 @@ def _frame(axes: Axes, title: str, view: tuple[float, float, float, float], oute
 
 
 def _draw_overlay(axes: Axes, picture: Picture) -> None:
-    dots, paths = picture.unexplained_xy, picture.paths
+    dots, paths = picture.unexplained_xy, _coloured(picture)
     if len(dots):
         # together they cover a hundredth of the panel at most, so that the map stays visible beneath them
         extent, points = axes.get_window_extent(), 72.0 / axes.figure.dpi
@@ -156,13 +157,19 @@ def _draw_overlay(axes: Axes, picture: Picture) -> None:
     if len(before):
         axes.plot(before[:, 0], before[:, 1], color=_BEFORE, linewidth=1.1, linestyle=(0, (4, 2)), zorder=3.5)
     halo = [patheffects.withStroke(linewidth=2.4, foreground='white', alpha=0.9)]
-    for path in paths:
+    for path, colour in paths:
         x, y = path.T
-        axes.plot(x, y, color=PATH, linewidth=1.4, path_effects=halo, solid_joinstyle='round', zorder=4)
+        axes.plot(x, y, color=colour, linewidth=1.4, path_effects=halo, solid_joinstyle='round', zorder=4)
     # of many drives the marks would hide the map
-    for path in paths if len(paths) <= _MOST_MARKED else []:
+    for path, colour in paths if len(paths) <= _MOST_MARKED else []:
         for marker, xy in zip(_path_markers(_heading(path)), (path[0], path[-1]), strict=True):
-            axes.add_line(_marker_line(marker, xy[0], xy[1]))
+            axes.add_line(_marker_line(marker, xy[0], xy[1], colour))
+
+
+def _coloured(picture: Picture) -> list[tuple[NDArray[np.float64], str]]:
+    """Return the paths of the drives that have one, each with its colour."""
+    paths = paths_of(picture.path_xy)
+    return [(path, DRIVES[k % len(DRIVES)]) for k, path in enumerate(paths) if len(path)]
 
 
 def _heading(path: np.ndarray) -> float:
@@ -177,7 +184,7 @@ def _path_markers(heading: float) -> tuple[MarkerStyle, MarkerStyle]:
     return MarkerStyle('o'), dart
 
 
-def _marker_line(marker: MarkerStyle, x: float, y: float, **options: Any) -> Line2D:
+def _marker_line(marker: MarkerStyle, x: float, y: float, colour: str = PATH, **options: Any) -> Line2D:
     start = marker.get_marker() == 'o'
     return Line2D(
         [x],
@@ -185,8 +192,8 @@ def _marker_line(marker: MarkerStyle, x: float, y: float, **options: Any) -> Lin
         linestyle='none',
         marker=marker,
         markersize=8 if start else 13,
-        markerfacecolor='white' if start else PATH,
-        markeredgecolor=PATH if start else 'white',
+        markerfacecolor='white' if start else colour,
+        markeredgecolor=colour if start else 'white',
         markeredgewidth=2.0 if start else 1.0,
         zorder=5,
         **options,
@@ -205,6 +212,38 @@ def _head(figure: Figure, picture: Picture) -> None:
     figure.text(x, 1 - 0.67 / height, picture.figures, fontsize=9.5, color='#4a525c', va='baseline')
 
 
+def _named(picture: Picture) -> list[Line2D]:
+    """Return what says which colour is which drive's; nothing for a single one."""
+    count = len(paths_of(picture.path_xy))
+    if len(_coloured(picture)) < 2:
+        return []
+    # a dollar sign would start a formula
+    names = [(Path(name).name or name).replace('$', r'\$') for name in picture.drives[:_MOST_NAMED]]
+    names = [name if len(name) <= _NAME else f'{name[: _NAME - 1]}…' for name in names]
+    handles = [Line2D([], [], color=DRIVES[k], linewidth=1.6, label=f'{k + 1}: {name}') for k, name in enumerate(names)]
+    if count > len(names):
+        more = f'and {count - len(names)} more drives' if names else f'paths of {count} drives'
+        handles.append(Line2D([], [], linestyle='none', label=more))
+    return handles
+
+
+def _row(figure: Figure, handles: Sequence[Patch | Line2D], y: float) -> None:
+    """Draw a row of a legend, `y` inches from below."""
+    width, height = figure.get_size_inches()
+    figure.legend(
+        handles=handles,
+        loc='center left',
+        bbox_to_anchor=((EDGE - 0.05) / width, y / height),
+        ncol=max(len(handles), 1),
+        frameon=False,
+        fontsize=9,
+        labelcolor=INK,
+        handlelength=1.5,
+        handletextpad=0.5,
+        columnspacing=1.4,
+    )
+
+
 def _foot(figure: Figure, picture: Picture) -> None:
     """Draw the legend and the scale of probabilities below the maps."""
     width, height = figure.get_size_inches()
@@ -215,9 +254,9 @@ def _foot(figure: Figure, picture: Picture) -> None:
         Patch(facecolor=_OCCUPIED, label='occupied', **edge),
         Patch(facecolor=UNKNOWN, label='not observed', **edge),
     ]
-    if count := len(picture.paths):
-        label = 'path of the robot' if count == 1 else f'paths of {count} drives'
-        handles.append(Line2D([], [], color=PATH, linewidth=1.6, label=label))
+    if count := len(_coloured(picture)):
+        if count == 1:
+            handles.append(Line2D([], [], color=PATH, linewidth=1.6, label='path of the robot'))
         if count <= _MOST_MARKED:
             handles += [_marker_line(start, 0, 0, label='start'), _marker_line(end, 0, 0, label='end')]
     if len(picture.odometry_xy):
@@ -225,18 +264,9 @@ def _foot(figure: Figure, picture: Picture) -> None:
     if count := len(picture.unexplained_xy):
         label = f'unexplained reading ({count:,})'
         handles.append(Line2D([], [], linestyle='none', marker='o', markersize=4, color=DOT, mew=0, label=label))
-    figure.legend(
-        handles=handles,
-        loc='center left',
-        bbox_to_anchor=((EDGE - 0.05) / width, 0.38 / height),
-        ncol=len(handles),
-        frameon=False,
-        fontsize=9,
-        labelcolor=INK,
-        handlelength=1.5,
-        handletextpad=0.5,
-        columnspacing=1.4,
-    )
+    named = _named(picture)
+    _row(figure, handles, 0.48 if named else 0.38)
+    _row(figure, named, 0.2)
     bar_width = 2.0
     axes = figure.add_axes(((width - EDGE - bar_width) / width, 0.36 / height, bar_width / width, 0.12 / height))
     bar = figure.colorbar(ScalarMappable(Normalize(0, 1), _PROBABILITY), cax=axes, orientation='horizontal')

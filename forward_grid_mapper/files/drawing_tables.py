@@ -13,8 +13,8 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Wedge
 
 from ..core.common.readings import Readings
-from .drawing import CAPTION, DOT, DPI, EDGE, FRAME, GAP, HEAD, INK, PATH, UNKNOWN, WIDE, draw_map, draw_scale
-from .panels import Curve, Tile
+from .drawing import CAPTION, DOT, DPI, EDGE, FRAME, GAP, HEAD, INK, UNKNOWN, WIDE, draw_map, draw_scale
+from .panels import PATH, Curve, Tile
 
 
 def draw_table(path: Path, title: str, rows: Sequence[Sequence[Tile]], view: tuple[float, float, float, float]) -> None:

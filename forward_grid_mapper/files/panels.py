@@ -14,6 +14,11 @@ Box = tuple[float, float, float, float]
 """Left, right, bottom, top in metres."""
 
 
+UNKNOWN_COLOUR, PATH = '#cfd9e4', '#0072b2'
+DRIVES = (PATH, '#009e73', '#e69f00', '#7b3294', '#56b4e9', '#8c510a', '#666666', '#1b5e20')
+"""Colours of the paths of several drives, the first one that of a single drive; those of chart.js."""
+
+
 class Tile(NamedTuple):
     """One map of the table: `values` are probabilities, or cells 0 and 1, with NaN or -1 where unknown.
 
@@ -56,8 +61,8 @@ class Panel(NamedTuple):
 class Picture(NamedTuple):
     """What is drawn. `view` is the box shown; points are in metres; `overlay` is the panel that bears them.
 
-    `path_xy` is parted by rows of NaN where there are several drives. `odometry_xy` is the path that odometry gives,
-    where it is another one than `path_xy`.
+    `path_xy` is parted by rows of NaN where there are several drives, whose names are `drives`. `odometry_xy` is the
+    path that odometry gives, where it is another one than `path_xy`.
     """
 
     title: str
@@ -68,11 +73,10 @@ class Picture(NamedTuple):
     path_xy: NDArray[np.float64]
     unexplained_xy: NDArray[np.float64]
     odometry_xy: NDArray[np.float64] = np.zeros((0, 2))
+    drives: tuple[str, ...] = ()
 
-    @property
-    def paths(self) -> list[NDArray[np.float64]]:
-        """The path of each drive, none of them empty."""
-        known = np.isfinite(self.path_xy).all(axis=1)
-        parts = np.split(self.path_xy, np.flatnonzero(~known))
-        parts = [part[np.isfinite(part).all(axis=1)] for part in parts]
-        return [part for part in parts if len(part)]
+
+def paths_of(xy: NDArray[np.float64]) -> list[NDArray[np.float64]]:
+    """Return the paths that rows of NaN part, one for each drive; one may be empty."""
+    parts = np.split(xy, np.flatnonzero(~np.isfinite(xy).all(axis=1)))
+    return [part[np.isfinite(part).all(axis=1)] for part in parts]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +29,7 @@ def write_picture(
     title: str,
     reference: tuple[Grid, NDArray[np.int8]] | None = None,
     odometry_xy: NDArray[np.float64] = NOWHERE,
+    drives: Sequence[str] = (),
 ) -> None:
     """Draw the maps into an image file (`.png`, or what else matplotlib knows).
 
@@ -42,6 +44,8 @@ def write_picture(
         The true map, −1 unknown, 0 free, 1 occupied, drawn as one more panel.
     odometry_xy : float64, shape (Q, 2)
         The path that odometry gives, metres, where the robot was elsewhere.
+    drives : sequence of str
+        What the drives are called, where there are several.
 
     Raises
     ------
@@ -56,7 +60,7 @@ def write_picture(
             '"apt install python3-matplotlib"'
         ) from error
     path = Path(path)
-    picture = compose(maps, np.asarray(path_xy, np.float64).reshape(-1, 2), title, reference, odometry_xy)
+    picture = compose(maps, np.asarray(path_xy, np.float64).reshape(-1, 2), title, reference, odometry_xy, drives)
     with output_errors(path):
         drawing.draw(path, picture)
 
@@ -67,6 +71,7 @@ def compose(
     title: str,
     reference: tuple[Grid, NDArray[np.int8]] | None,
     odometry_xy: NDArray[np.float64] = NOWHERE,
+    drives: Sequence[str] = (),
 ) -> Picture:
     """Choose what the picture shows; the parameters are those of `write_picture`."""
     alpha = maps.parameters.search.alpha
@@ -80,7 +85,8 @@ def compose(
     # odometry may lead far away from the map, which would be drawn small
     view = view_of(maps, path_xy)
     panels = [Panel(name, *_crop(grid, values, view)) for name, grid, values in named]
-    return Picture(title, figures_of(maps), panels, view, 1, path_xy, _unexplained_ends(maps), odometry_xy)
+    odd = _unexplained_ends(maps)
+    return Picture(title, figures_of(maps), panels, view, 1, path_xy, odd, odometry_xy, tuple(drives))
 
 
 def _probability(cells: NDArray[np.int8]) -> NDArray[np.float32]:

@@ -9,6 +9,7 @@ import numpy as np
 
 from ..core.common.parameters import Parameters
 from ..core.common.readings import Readings, drives_of
+from ..core.drive_changes import change_warnings
 from ..core.drive_fit import fit_warnings
 from ..core.learning.consistency import consistency_warnings
 from ..core.learning.input_warnings import input_warnings
@@ -32,9 +33,11 @@ def data_warnings(maps: MapSet, source: Mapping[str, Any]) -> list[str]:
         Of which `extrinsics` counts, the poses of the sensors that are fixed to the robot by `frame_id`, and of several
         drives `drives`, a list of such mappings with `bag`, the name of the drive.
     """
+    names = [str(drive['bag']) for drive in source.get('drives') or ()]
     return [
         *reading_warnings(maps.readings, source, maps.parameters),
-        *fit_warnings(maps, [str(drive['bag']) for drive in source.get('drives') or ()]),
+        # a drive that fits nowhere contradicts the others everywhere
+        *(fit_warnings(maps, names) or change_warnings(maps, names)),
         *filter(None, [quality_warning(maps)]),
     ]
 

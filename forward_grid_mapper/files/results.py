@@ -16,6 +16,7 @@ from .map_archive import write_npz
 from .map_files import write_raw, write_trinary
 from .output_folder import output_errors, output_folder
 from .picture import NOWHERE, write_picture
+from .png import write_png
 from .quality_warning import data_warnings
 from .reading_archive import write_readings
 from .report import report_data, write_report
@@ -30,7 +31,7 @@ def write_results(
     title: str,
     reference: tuple[Grid, NDArray[np.int8]] | None = None,
     extras: Mapping[str, str] | None = None,
-    odometry_xy: NDArray[np.float64] | None = None,
+    odometry_xy: NDArray[np.float64] = NOWHERE,
     judged: Sequence[str] | None = None,
 ) -> dict[str, Any]:
     """Write maps, archive, picture, page and report into a new folder; nothing is left if any of them fails.
@@ -50,7 +51,7 @@ def write_results(
         The true map, for the picture.
     extras : mapping of str to str, optional
         More text files, by name.
-    odometry_xy : float64, shape (Q, 2), optional
+    odometry_xy : float64, shape (Q, 2)
         The path that odometry gives, metres, where the robot was elsewhere.
     judged : sequence of str, optional
         What `data_warnings` says of the maps, if that is known.
@@ -69,20 +70,22 @@ def write_results(
         write_raw(folder / 'live_map', maps.grid, maps.live)
         write_trinary(folder / 'ml_map', maps.grid, maps.ml)
         write_raw(folder / 'uncertainty_map', maps.grid, maps.uncertainty)
+        for name, values in (('live_map', maps.live), ('uncertainty_map', maps.uncertainty)):
+            write_png(folder / f'{name}.png', values)
         write_npz(folder / 'maps.npz', maps)
         write_readings(folder / 'readings.npz', maps)
         warnings = [
             *(source.get('warnings') or []),
             *(data_warnings(maps, source) if judged is None else judged),
         ]
-        before = NOWHERE if odometry_xy is None else odometry_xy
+        drives = [str(drive.get('bag')) for drive in source.get('drives') or ()]
         try:
-            write_picture(folder / 'maps.png', maps, path_xy, title, reference, before)
+            write_picture(folder / 'maps.png', maps, path_xy, title, reference, odometry_xy, drives)
         except OutputError as error:
             warnings.append(f'no picture was drawn: {error}')
         report = report_data(maps, {**source, 'warnings': warnings})
         try:
-            write_page(folder / 'report.html', maps, report, title, path_xy, before, reference)
+            write_page(folder / 'report.html', maps, report, title, path_xy, odometry_xy, reference)
         except OutputError as error:
             report['warnings'].append(f'report.html was not written: {error}')
         write_report(folder, report)

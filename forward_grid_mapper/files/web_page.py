@@ -25,6 +25,8 @@ from ..core.common.errors import OutputError
 from ..core.common.grid import UNKNOWN, Grid
 from ..core.maps.cell_evidence import HERE, NOTHING, prior_odds
 from ..core.maps.map_set import MapSet
+from ..core.maps.moments import moments
+from ..core.maps.reading_causes import likeliest_causes
 from ..core.maps.traversed import traversed_cells
 from ..core.messages.message_types import NANOSECONDS
 from ..core.sensor.density import CUT, causes_of
@@ -41,6 +43,12 @@ MOST_CELLS = 6_000_000
 MOST_READINGS = 100_000
 """Readings that a page holds; they take some 60 bytes each. Beyond, it shows the maps, and `explain` tells the rest."""
 
+MOMENTS = 10
+"""Parts of the drive after each of which the page has the standard map as it was."""
+
+MOST_CELLS_OF_MOMENTS = 8_000_000
+"""Cells of all these maps together; larger maps have fewer of them, or none."""
+
 MOST_POINTS = 4000
 """Points of a path: more cannot be told apart."""
 
@@ -48,8 +56,11 @@ UNKNOWN_SHARE = 65535
 STEPS = 10_000
 """Steps of probabilities on the page."""
 
-CAUSES = ('hit', 'random', 'lost', 'no_echo')
-"""Causes of a reading as `Expectations` has them, in the order of the page."""
+UNKNOWN_THEN, STEPS_THEN = 255, 250
+"""The same of the standard map during the drive."""
+
+MOST_DRIVES = 8
+"""Drives whose names a page shows."""
 
 _CONE = ('x', 'y', 'axis_x', 'axis_y', 'sine', 'cosine', 'z', 'z_max', 'sigma', 'reach')
 
@@ -137,11 +148,13 @@ def page_data(
         arrays['odometry'] = _thinned(odometry_xy)
     if reference is not None:
         arrays['reference'] = np.where(reference[1] == UNKNOWN, 255, reference[1]).astype(np.uint8)
+    stamps = maps.readings.stamp
+    then: list[float] = []
     if 0 < len(maps.readings) <= MOST_READINGS:
         arrays |= _readings(maps)
+        then, arrays['moments'] = _moments(maps)
     everywhere = np.concatenate([path_xy.reshape(-1, 2), odometry_xy])
     model = maps.parameters.model
-    stamps = maps.readings.stamp
     return {
         'grid': _grid(maps.grid),
         'reference': None if reference is None else _grid(reference[0]),
@@ -157,6 +170,8 @@ def page_data(
             'through': THROUGH,
             'cos2_limit': maps.normals.cos2_limit if len(maps.normals.known) else 0.0,
         },
+        'moments': then,
+        'drives': [str(drive.get('bag')) for drive in report.get('drives') or ()][:MOST_DRIVES],
         'start': float(stamps.min() / NANOSECONDS) if len(stamps) else 0.0,
         'sensors': [_sensor(name, report) for name in maps.readings.sensor_names or ('',)],
         'arrays': {name: _packed(values) for name, values in arrays.items()},
@@ -166,18 +181,34 @@ def page_data(
 def _readings(maps: MapSet) -> dict[str, NDArray[Any]]:
     """Return the columns from which the page computes what each reading says of a cell."""
     forward, readings = maps.forward_model(), maps.readings
-    expected = forward.expectations(maps.ml)
-    likely = np.stack([getattr(expected, name) for name in CAUSES])
-    # as in the report: random where that is likelier than all else together
-    likely[CAUSES.index('random')] = np.where(maps.unexplained, 2.0, 0.0)
     causes = causes_of(readings, forward.cones['sigma'] * maps.grid.resolution, forward.model, maps.grid.resolution)
     columns: dict[str, NDArray[Any]] = {name: forward.cones[name] for name in _CONE}
     columns |= {'random': causes.random, 'lost': causes.lost, 'max_range': causes.max_range}
-    columns |= {'stamp': readings.stamp / NANOSECONDS}
-    columns |= {'sensor': readings.sensor.astype(np.uint16), 'cause': likely.argmax(axis=0).astype(np.uint8)}
+    columns |= {'stamp': readings.stamp / NANOSECONDS, 'drive': readings.drive.astype(np.uint16)}
+    columns |= {'sensor': readings.sensor.astype(np.uint16), 'cause': likeliest_causes(maps)}
     if len(maps.normals.known):
         columns |= {'normal_x': maps.normals.x, 'normal_y': maps.normals.y}
     return columns
+
+
+def _moments(maps: MapSet) -> tuple[list[float], NDArray[np.uint8]]:
+    """Return until when each standard map during the drive is, seconds, and the maps, each as what it adds to the last.
+
+    Sums are modulo 256; what has not changed is 0, which takes next to no room. The last map, `live_map`, is left out.
+    """
+    count = min(MOMENTS, MOST_CELLS_OF_MOMENTS // max(maps.grid.size, 1))
+    then: list[float] = []
+    changes: list[NDArray[np.uint8]] = [np.zeros((0, *maps.grid.shape), np.uint8)]
+    before = np.zeros(maps.grid.shape, np.uint8)
+    for moment in moments(maps, count) if count > 1 else ():
+        if moment.live is maps.live:
+            break
+        steps = np.rint(np.nan_to_num(moment.live) * STEPS_THEN)
+        now = np.where(np.isnan(moment.live), UNKNOWN_THEN, steps).astype(np.uint8)
+        changes.append((now - before)[None])
+        then.append(moment.stamp / NANOSECONDS)
+        before = now
+    return then, np.concatenate(changes)
 
 
 def _shares(probability: NDArray[np.float32]) -> NDArray[np.uint16]:

@@ -16,6 +16,7 @@ import traceback
 from collections.abc import Sequence
 from typing import Any
 
+from .. import __version__
 from ..core.common.errors import MapperError
 from .stopping import Stopper
 
@@ -59,6 +60,9 @@ def _spin(executor: Any, node: Any) -> None:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the node until it has to stop; return the exit code."""
+    if '--version' in (sys.argv[1:] if arguments is None else arguments):
+        print(f'mapper of forward_grid_mapper {__version__}')
+        return 0
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGINT, signal.SIG_DFL)
     arguments = sys.argv[1:] if arguments is None else list(arguments)

@@ -127,7 +127,7 @@ class Trajectory:
         values: dict[str, Any] = {
             'map frame': self.frame,
             'transform': 'on TF' if self._out is None or self._out.by_tf else 'none: tf2_ros is not installed',
-            'poses of odometry kept': len(self._associator.record),
+            'poses of odometry kept': self._associator.record.since_anew,
         }
         refinement = self.found.refinement if self.found else None
         if refinement is not None and self.correction is not None:

@@ -23,6 +23,7 @@ from ..files.quality_warning import thinned
 from .contradictions import Described, check_frames, contradictions, listed, shared_echoes
 from .drive import WHOLE, Drive, Part, thinning_note
 from .finding import SUFFIXES, find_recordings
+from .given_poses import GivenPoses
 from .read_drive import read_drive
 
 MOST_ERRORS = 5
@@ -93,6 +94,7 @@ def read_drives(
     part: Part = WHOLE,
     progress: Callable[[int, int], None] | None = None,
     say: Watch = lambda text: None,
+    poses: GivenPoses | None = None,
 ) -> Drives:
     """Read all drives that `words` mean (`find_recordings`).
 
@@ -107,6 +109,8 @@ def read_drives(
         Called with (done, total) messages of a drive.
     say : callable, optional
         Called with the name of each drive as it is read, where there are several.
+    poses : GivenPoses, optional
+        Of all drives, as `read_drive` takes them.
 
     Raises
     ------
@@ -115,14 +119,14 @@ def read_drives(
     """
     paths, repeated = _without_repetition(find_recordings(words))
     if len(paths) == 1:
-        drive = read_drive(paths[0], parameters, extrinsics, range_topics, odom_topic, progress, part)
+        drive = read_drive(paths[0], parameters, extrinsics, range_topics, odom_topic, progress, part, poses)
         drive.source['warnings'] += repeated
         return Drives((drive,), drive.source, parameters)
     drives, errors = [], []
     for number, path in enumerate(paths, 1):
         say(f'reading {number} of {len(paths)}: {readable(path)}')
         try:
-            drives.append(read_drive(path, parameters, extrinsics, range_topics, odom_topic, None, part))
+            drives.append(read_drive(path, parameters, extrinsics, range_topics, odom_topic, None, part, poses))
         except (BagError, InputError) as error:
             errors.append((path, error))
     if errors:
@@ -187,19 +191,8 @@ def _together(drives: Sequence[Drive], repeated: list[str], parameters: Paramete
     order = sorted(range(len(drives)), key=lambda k: (keys[k], drives[k].source['bag']))
     described = [_described(drives[k], held[k]) for k in order]
     check_frames(described)
-    left_out: set[int] = set()
-    warnings = list(repeated)
-    for pair in shared_echoes([drive.readings for drive in described]):
-        one, other = described[pair.one].name, described[pair.other].name
-        if pair.same:
-            left_out.add(pair.other)
-            warnings.append(f'{other} is the same drive as {one} (same sensors, stamps and ranges); it is left out')
-        elif not {pair.one, pair.other} & left_out:
-            part, whole = (one, other) if pair.echoes[0] <= pair.echoes[1] else (other, one)
-            warnings.append(
-                f'{pair.shared} of {min(pair.echoes)} echoes of {part} are in {whole} as well: it is a part of it, and '
-                f'what counts twice is wrong evidence; leave out {part}'
-            )
+    left_out, told = _copies(described)
+    warnings = [*repeated, *told]
     kept = [k for k in range(len(order)) if k not in left_out]
     warnings += contradictions([described[k] for k in kept])
     chosen = tuple(drives[order[k]] for k in kept)
@@ -207,6 +200,34 @@ def _together(drives: Sequence[Drive], repeated: list[str], parameters: Paramete
         chosen[0].source['warnings'] += warnings
         return Drives(chosen, chosen[0].source, parameters)
     return Drives(chosen, _source(chosen, warnings, parameters), parameters)
+
+
+def _copies(drives: Sequence[Described]) -> tuple[set[int], list[str]]:
+    """Return which drives are left out as copies of an earlier one, and what to say of them and of parts of others."""
+    pairs = shared_echoes([drive.readings for drive in drives])
+    copies: dict[int, list[int]] = {}
+    left_out: set[int] = set()
+    # in order of their numbers, so that of several copies all are of the first one
+    for pair in pairs:
+        if pair.same and pair.one not in left_out:
+            copies.setdefault(pair.one, []).append(pair.other)
+            left_out.add(pair.other)
+    told = []
+    for one, others in copies.items():
+        verb, it = ('is', 'it is') if len(others) == 1 else ('are', 'they are')
+        told.append(
+            f'{listed([drives[k].name for k in others])} {verb} the same drive as {drives[one].name} (same sensors, '
+            f'stamps and ranges); {it} left out'
+        )
+    for pair in pairs:
+        if not {pair.one, pair.other} & left_out:
+            names = drives[pair.one].name, drives[pair.other].name
+            part, whole = names if pair.echoes[0] <= pair.echoes[1] else names[::-1]
+            told.append(
+                f'{pair.shared} of {min(pair.echoes)} echoes of {part} are in {whole} as well: it is a part of it, and '
+                f'what counts twice is wrong evidence; leave out {part}'
+            )
+    return left_out, told
 
 
 def _described(drive: Drive, readings: Readings) -> Described:

@@ -6,10 +6,12 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
+from ..bags.poses import BASE_FRAMES
 from ..bags.reader import Bag
 from ..bags.static_transforms import StaticTransforms, SteepSensorError
-from ..core.common.errors import BagError, InputError
+from ..core.common.errors import BagError, InputError, ParameterError
 from ..core.common.parameters import Parameters
+from ..core.common.shell import quoted
 from ..core.messages.extrinsics import STEEP
 from ..core.messages.message_types import NANOSECONDS, Pose2, RangeMessage
 from ..core.messages.pose_association import PoseAssociator
@@ -17,9 +19,13 @@ from ..core.messages.rep117 import ODOMETRY_REASONS, REASONS
 from ..files.journal import drive_file
 from ..files.output_folder import readable
 from .drive import WHOLE, Drive, LogOddsMapOfAll, Part, thinning_note
+from .given_poses import GivenPoses
 from .journal_drive import read_journal
 
 __all__ = ['Drive', 'Extrinsics', 'read_drive']
+
+MOST_OPTIONS = 24
+"""Sensors whose options a message spells out, to be copied."""
 
 
 class Extrinsics:
@@ -72,9 +78,11 @@ class Extrinsics:
         known = self._transforms.frames
         joined = f'/tf_static joins {", ".join(known[:12])}' if known else 'the bag has no /tf_static'
         reasons = ''.join(f' {self.unusable[frame]}' for frame in frames if frame in self.unusable)
+        options = ' '.join(f'--sensor {quoted(f"{frame}=x,y,yaw")}' for frame in frames[:MOST_OPTIONS])
+        more = ', and so on' if len(frames) > MOST_OPTIONS else ''
         return (
             f'no pose on the robot (frame {base_frame or "?"}) is known for {", ".join(frames)}: {joined}.{reasons} '
-            f'Give --sensor {frames[0]}=x,y,yaw for each, or sensors.{frames[0]}.pose in --params'
+            f'Give {options}{more}, in metres and radians (or 90deg), or sensors.{frames[0]}.pose in --params'
         )
 
 
@@ -86,6 +94,7 @@ def read_drive(
     odom_topic: str | None = None,
     progress: Callable[[int, int], None] | None = None,
     part: Part = WHOLE,
+    poses: GivenPoses | None = None,
 ) -> Drive:
     """Read a bag and bring its readings into the map frame, or take those of a journal.
 
@@ -101,6 +110,8 @@ def read_drive(
         Called with (done, total) messages.
     part : Part
         What to take, by stamps; the drive begins with its first message on these topics.
+    poses : GivenPoses, optional
+        To be taken in place of the bag's odometry.
 
     Raises
     ------
@@ -113,9 +124,14 @@ def read_drive(
     plain = Path(path).is_dir() or Path(path).is_file()
     journal = drive_file(Path(path)) if plain else None
     if journal is not None:
+        if poses is not None:
+            raise ParameterError(f'{path} is a journal, whose readings have their poses; leave out --poses')
         return read_journal(journal, parameters, extrinsics, range_topics, odom_topic, part)
     with Bag(path) as bag:
-        topics = bag.choose_topics(range_topics, odom_topic, any_poses=True)
+        if poses is None:
+            topics = bag.choose_topics(range_topics, odom_topic, any_poses=True)
+        else:
+            topics = bag.choose_range_topics(range_topics)
         lookup = Extrinsics(extrinsics, bag.static_transforms())
         associator = PoseAssociator(lookup, parameters, patient=True)
         live = LogOddsMapOfAll(associator, parameters)
@@ -139,6 +155,11 @@ def read_drive(
                 associator.add_range(message)
             else:
                 associator.add_odometry(message)
+        if poses is not None and spans['ranges']:
+            spans['odometry'] = [int(poses.stamp[0]), int(poses.stamp[-1])]
+            begin, end = spans['ranges']
+            for odometry in poses.between(begin - margin, end + margin, _base_frame(bag)):
+                associator.add_odometry(odometry)
         associator.finish()
         undecodable = dict(bag.undecodable)
         warnings = _warnings(bag, associator, lookup)
@@ -147,12 +168,12 @@ def read_drive(
             raise InputError(
                 f'{path} has no reading in the part {part}; its messages span {(left_out[1] - left_out[0]) / 1e9:.1f} s'
             )
-        raise _nothing_associated(associator, lookup, spans, undecodable)
+        raise _nothing_associated(associator, lookup, spans, undecodable, poses)
     stamps = associator.readings.stamp
     source = {
         'bag': readable(path),
         'range_topics': list(topics.range_topics),
-        'odom_topic': topics.odom_topic,
+        'odom_topic': topics.odom_topic if poses is None else readable(poses.path),
         'odom_frame': associator.map_frame,
         'map_frame': associator.map_frame,
         'base_frame': associator.base_frame,
@@ -204,8 +225,18 @@ def _warnings(bag: Bag, associator: PoseAssociator, lookup: Extrinsics) -> list[
     return warnings
 
 
+def _base_frame(bag: Bag) -> str:
+    """Return the frame that given poses are of: that of the bag's odometry, or else a usual one."""
+    known = bag.static_transforms().frames
+    return bag.base_frame() or next((frame for frame in BASE_FRAMES if frame in known), BASE_FRAMES[0])
+
+
 def _nothing_associated(
-    associator: PoseAssociator, lookup: Extrinsics, spans: Mapping[str, Sequence[int]], undecodable: Mapping[str, int]
+    associator: PoseAssociator,
+    lookup: Extrinsics,
+    spans: Mapping[str, Sequence[int]],
+    undecodable: Mapping[str, int],
+    poses: GivenPoses | None,
 ) -> Exception:
     """Return the error that says why no reading got a pose, and what to do."""
     ranges, odometry = spans['ranges'], spans['odometry']
@@ -217,9 +248,11 @@ def _nothing_associated(
         return InputError(lookup.advice(associator.base_frame, sorted(associator.unknown_frames)))
     if ranges[1] < odometry[0] or ranges[0] > odometry[1]:
         a, b, c, d = (stamp / NANOSECONDS for stamp in (*ranges, *odometry))
+        other = 'odometry' if poses is None else readable(poses.path)
+        why = 'are the drivers set to' if poses is None else 'do the poses have'
         return InputError(
-            f'the stamps do not overlap: Range has {a:.3f} … {b:.3f} s, odometry {c:.3f} … {d:.3f} s; '
-            f'are the drivers set to the same clock (use_sim_time)?'
+            f'the stamps do not overlap: Range has {a:.3f} … {b:.3f} s, {other} {c:.3f} … {d:.3f} s; '
+            f'{why} the same clock (use_sim_time)?'
         )
     reasons = '; '.join(f'{count} {reason} ({REASONS[reason]})' for reason, count in associator.rejected.most_common())
     for reason, count in associator.odometry_rejected.most_common():

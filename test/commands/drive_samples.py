@@ -19,9 +19,11 @@ from forward_grid_mapper.simulation.drive import BASE_FRAME, START, door_drive
 from forward_grid_mapper.simulation.sonar import NOISY, front_array, sonar_ring
 
 SECOND = 1_000_000_000
-FILES = {'maps.npz', 'maps.png', 'readings.npz', 'report.html', 'report.json', 'report.txt'} | {
-    f'{name}.{suffix}' for name in ('live_map', 'ml_map', 'uncertainty_map') for suffix in ('pgm', 'yaml')
-}
+FILES = (
+    {'maps.npz', 'maps.png', 'readings.npz', 'report.html', 'report.json', 'report.txt'}
+    | {f'{name}.{suffix}' for name in ('live_map', 'ml_map', 'uncertainty_map') for suffix in ('pgm', 'yaml')}
+    | {'live_map.png', 'uncertainty_map.png'}
+)
 Message = OdometryMessage | RangeMessage
 
 

@@ -12,12 +12,13 @@ import stat
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 from drive_samples import code_of, report_in, tape, write_tape
 
 from forward_grid_mapper.__main__ import COMMANDS
-from forward_grid_mapper.commands import completion, desktop, process_bag
+from forward_grid_mapper.commands import completion, demo, desktop, experiment, process_bag
 from forward_grid_mapper.files import drawing
 from forward_grid_mapper.node.main import USAGE
 
@@ -91,6 +92,23 @@ def test_show_opens_the_report(
     assert 'no desktop' not in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ('main', 'words', 'picture'),
+    [
+        (experiment.main, ['density', '--show'], 'figure.png'),
+        (demo.main, ['--offline', '--seen', 1, '--show'], 'demo.png'),
+    ],
+)
+def test_show_opens_pictures(
+    tmp_path: Path, main: Any, words: list[str], picture: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shown = []
+    for module in (experiment, demo):
+        monkeypatch.setattr(module, 'show', shown.append)
+    assert code_of(main, *words, '-o', tmp_path / 'out') == 0
+    assert shown == [tmp_path / 'out' / picture] and shown[0].exists()
+
+
 def test_without_a_desktop_show_says_what_to_open(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -100,6 +118,28 @@ def test_without_a_desktop_show_says_what_to_open(
     page = tmp_path / 'a page.html'
     desktop.show(page)
     assert page.as_uri() in capsys.readouterr().err
+
+
+def test_rerun_writes_the_drive_and_says_how_to_play_it(
+    tmp_path: Path, bag: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip('rerun', reason='the extra rerun is not installed')
+    assert code_of(process_bag.main, bag, '-o', tmp_path / 'my maps', '--rerun') == 0
+    line = capsys.readouterr().out.splitlines()[-1]
+    words = shlex.split(line)
+    assert words[1:] == ['-m', 'rerun', str(tmp_path / 'my maps' / 'drive.rrd')]
+    # its viewer needs a screen, what checks a file does not
+    done = subprocess.run([*words[:3], 'rrd', 'verify', words[3]], capture_output=True, check=False)
+    assert done.returncode == 0, done.stderr
+
+
+def test_without_rerun_nothing_is_begun(
+    tmp_path: Path, bag: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, 'rerun', None)
+    assert code_of(process_bag.main, bag, '-o', tmp_path / 'maps', '--rerun') == 1
+    assert 'forward_grid_mapper[rerun]' in capsys.readouterr().err
+    assert not (tmp_path / 'maps').exists()
 
 
 def test_commands_and_their_options_are_completed() -> None:

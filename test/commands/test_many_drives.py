@@ -22,6 +22,7 @@ from forward_grid_mapper.core.maps.traversed import traversed_cells
 from forward_grid_mapper.core.messages.message_types import NANOSECONDS, Pose2
 from forward_grid_mapper.files import drawing
 from forward_grid_mapper.files.map_archive import read_npz
+from forward_grid_mapper.files.panels import paths_of
 from forward_grid_mapper.files.reading_archive import read_readings
 from forward_grid_mapper.recordings.drive import Part
 from forward_grid_mapper.recordings.drives import Drives, read_drives
@@ -182,7 +183,7 @@ def test_the_picture_has_a_path_for_each_drive(days: Path, tmp_path: Path, monke
     pictures = []
     monkeypatch.setattr(drawing, 'draw', lambda path, picture: (pictures.append(picture), path.write_bytes(b'')))
     mapped(days, tmp_path / 'maps')
-    paths = pictures[0].paths
+    paths = paths_of(pictures[0].path_xy)
     assert len(paths) == 3
     for path, bag in zip(paths, sorted(days.iterdir()), strict=True):
         np.testing.assert_array_equal(path, read(bag).path_xy)
@@ -231,6 +232,17 @@ def test_a_copy_in_another_format_is_left_out(days: Path, tmp_path: Path, kind: 
         )
     alone = read(days / 'day_0', copy)
     assert len(alone.drives) == 1 and 'is the same drive' in alone.source['warnings'][0]
+
+
+def test_copies_are_told_in_one_warning(days: Path, tmp_path: Path) -> None:
+    copies = [write_tape(tmp_path / f'copy_{k}', day(0), 'sqlite3') for k in range(3)]
+    part = write_tape(tmp_path / 'part', day(0)._replace(ranges=day(0).ranges[:200]))
+    drives = read(days / 'day_0', days / 'day_1', *copies)
+    (warning,) = drives.source['warnings']
+    assert warning.count(' the same drive as ') == 1 and 'they are left out' in warning
+    assert len(drives.drives) == 2
+    both = read(days / 'day_0', days / 'day_1', *copies, part).source['warnings']
+    assert len(both) == 2 and f'leave out {part}' in both[1]
 
 
 def test_a_part_of_a_drive_beside_it_is_told(days: Path, tmp_path: Path) -> None:

@@ -208,7 +208,7 @@ def test_the_parameters_of_a_call_are_shown_as_a_file(
     assert {path.name for path in tmp_path.iterdir()} == {'bag', 'dumped.yaml'}
 
 
-@pytest.mark.parametrize('name', sorted(set(COMMANDS) - {'mapper'}))
+@pytest.mark.parametrize('name', sorted(COMMANDS))
 def test_every_command_tells_its_version(name: str, capsys: pytest.CaptureFixture[str]) -> None:
     main = importlib.import_module(f'forward_grid_mapper.{COMMANDS[name][0]}').main
     assert code_of(main, '--version') == 0

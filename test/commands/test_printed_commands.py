@@ -17,7 +17,7 @@ from forward_grid_mapper.core.common import shell
 from forward_grid_mapper.core.messages.message_types import Pose2
 from forward_grid_mapper.files import drawing
 
-LEAD = f'{shell.command_line("").rstrip()} '
+LEAD = f'{shell.module_line("forward_grid_mapper")} '
 PARSERS = {'process_bag': process_bag.parser, 'learn': learn.parser, 'replay_bag': replay_bag.parser}
 NAMES = ['plain', 'with space', 'a, b', 'it\'s $HOME `x` "y"', 'a;b&c|d>e', '-dash', 'Büro 日本', '*?[a]', '#1', '~']
 

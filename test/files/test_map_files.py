@@ -22,6 +22,8 @@ from forward_grid_mapper.core.common.grid import Grid
 from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.files.map_archive import read_npz, write_npz
 from forward_grid_mapper.files.map_files import occupancy_values, read_map, write_raw, write_trinary
+from forward_grid_mapper.files.panels import UNKNOWN_COLOUR
+from forward_grid_mapper.files.png import write_png
 
 SCORE_MAP = Path(__file__).parents[2].parent / 'shared' / 'tools' / 'score_map.py'
 # Row 0 has the smallest y: the only occupied cell is at the lower right.
@@ -239,3 +241,21 @@ def test_npz_of_something_else(tmp_path: Path) -> None:
     for name in ('other.npz', 'cut.npz', 'empty.npz'):
         with pytest.raises(InputError, match='not an archive of maps'):
             read_npz(tmp_path / name)
+
+
+@pytest.mark.parametrize('shape', [(1, 1), (7, 5), (300, 40)])
+def test_image_viewers_show_probability_maps(tmp_path: Path, shape: tuple[int, int]) -> None:
+    image = pytest.importorskip('PIL.Image')
+    probability = np.random.default_rng(shape[0]).uniform(0, 1, shape).astype(np.float32)
+    probability[0, 0] = np.nan
+    probability[-1, -1] = probability[-1, -1] if shape == (1, 1) else 0.0
+    write_png(tmp_path / 'live_map.png', probability)
+    with image.open(tmp_path / 'live_map.png') as shown:
+        shown.verify()
+    with image.open(tmp_path / 'live_map.png') as shown:
+        pixels = np.array(shown.convert('RGB'))[::-1].astype(float)
+    assert pixels.shape == (*shape, 3)
+    known = ~np.isnan(probability)
+    expected = 255 * (1 - probability[known])
+    np.testing.assert_allclose(pixels[known], np.repeat(expected[:, None], 3, axis=1), atol=1.1)
+    assert (pixels[~known] == list(bytes.fromhex(UNKNOWN_COLOUR[1:]))).all()

@@ -13,7 +13,7 @@ from made_maps import made_maps
 from forward_grid_mapper import files
 from forward_grid_mapper.core.common.errors import OutputError
 from forward_grid_mapper.core.common.grid import Grid
-from forward_grid_mapper.files.panels import coarse
+from forward_grid_mapper.files.panels import DRIVES, coarse
 from forward_grid_mapper.files.picture import compose, write_picture
 
 PATH = np.stack([np.linspace(-1, 1, 50), np.zeros(50)], axis=1)
@@ -35,6 +35,22 @@ def test_odd_paths(tmp_path: Path, path: np.ndarray) -> None:
     pytest.importorskip('matplotlib')
     write_picture(tmp_path / 'maps.png', made_maps(readings=0), path, 'no readings')
     assert (tmp_path / 'maps.png').read_bytes().startswith(PNG)
+
+
+@pytest.mark.parametrize('count', [1, 2, 40])
+def test_each_drive_has_its_colour(tmp_path: Path, count: int) -> None:
+    pytest.importorskip('matplotlib')
+    image = pytest.importorskip('PIL.Image')
+    y = np.linspace(-1, 1, count)
+    paths = [np.array([[-1.5, v], [1.5, v], [np.nan, np.nan]]) for v in y]
+    names = [f'a$drive_{k}' * 5 for k in range(count)]
+    write_picture(
+        tmp_path / 'maps.png', made_maps(readings=0), np.concatenate(paths)[:-1], '', None, drives=names[: count - 1]
+    )
+    with image.open(tmp_path / 'maps.png') as drawn:
+        seen = {colour for _, colour in drawn.convert('RGB').getcolors(1_000_000)}
+    for k, colour in enumerate(DRIVES):
+        assert (tuple(bytes.fromhex(colour[1:])) in seen) == (k < count), colour
 
 
 def test_pyplot_stays_out(tmp_path: Path) -> None:

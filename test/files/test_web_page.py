@@ -19,7 +19,10 @@ from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.mapping import Mapper
 from forward_grid_mapper.core.maps.cell_evidence import cell_evidence
 from forward_grid_mapper.core.maps.map_set import MapSet
+from forward_grid_mapper.core.maps.moments import moments
+from forward_grid_mapper.core.maps.reading_causes import CAUSES, RANDOM
 from forward_grid_mapper.files import web_page
+from forward_grid_mapper.files.panels import DRIVES
 from forward_grid_mapper.files.report import report_data
 from forward_grid_mapper.files.results import write_results
 from forward_grid_mapper.files.web_page import write_page
@@ -119,10 +122,18 @@ USED = """
     out.opacity = picture() !== whole;
     $$('time').value = 0.5 * $$('time').max;
     $$('time').dispatchEvent(new Event('input'));
-    const half = picture();
+    const half = picture(), shown = () => report.layers.filter(layer => layer.shown).map(layer => layer.id);
     out.time = half !== whole && $$('clock').textContent;
+    out.half = [shown(), $$('ml_map').checked, $$('live_map').checked, report.standard.label.textContent];
+    $$('time').value = 0.9 * $$('time').max;
+    $$('time').dispatchEvent(new Event('input'));
+    out.grows = picture() !== half;
+    $$('time').value = 0;
+    $$('time').dispatchEvent(new Event('input'));
+    out.begins = report.standard.levels[0].width;
     $$('time').value = $$('time').max;
     $$('time').dispatchEvent(new Event('input'));
+    out.whole = [shown(), $$('ml_map').checked, $$('live_map').checked, report.standard.label.textContent];
     send('pointermove', PLACE);
     out.tip = $$('tip').textContent;
     send('pointerdown', PLACE);
@@ -158,6 +169,10 @@ def test_the_page_is_used(tmp_path: Path, width: int, height: int) -> None:
     for switch in ('live_map', 'uncertainty_map', 'ml_map', 'path', 'obstacle', 'opacity', 'clicked'):
         assert out[switch] is True, switch
     assert out['time'].endswith(' s')
+    assert out['half'] == [['live_map'], False, True, 'Standard map after 50 % of the readings']
+    assert out['grows'] is True
+    assert out['begins'] == 1, 'of the first part of the drive nothing is known'
+    assert out['whole'] == [['ml_map'], True, False, 'Standard map']
     assert f'x = {place[0]:.2f} m, y = {place[1]:.2f} m' in out['tip']
     assert f'nats from {len(found.readings)} readings' in out['tip']
     assert out['rows'] == min(12, len(found.readings)) > 0
@@ -179,11 +194,36 @@ def test_the_page_holds_the_maps(tmp_path: Path) -> None:
         assert ((steps == web_page.UNKNOWN_SHARE) == np.isnan(values)).all()
         assert np.nanmax(np.abs(np.where(np.isnan(values), np.nan, steps / web_page.STEPS) - values)) < 1e-4
     causes = array(data, 'cause')
-    assert np.count_nonzero(causes == web_page.CAUSES.index('random')) == np.count_nonzero(maps.unexplained)
+    assert np.count_nonzero(causes == RANDOM) == np.count_nonzero(maps.unexplained)
     # p_lost is part of the model, so silence is one or the other
-    silent = np.isin(causes, [web_page.CAUSES.index('lost'), web_page.CAUSES.index('no_echo')])
+    silent = np.isin(causes, [CAUSES.index('lost'), CAUSES.index('no_echo')])
     assert not (silent & maps.readings.echo & (maps.readings.z < maps.readings.z_max - 1.0)).any()
     assert array(data, 'path').tolist() == PATH.ravel().tolist()
+
+
+def test_the_slider_has_the_standard_map_of_then(tmp_path: Path) -> None:
+    maps = drive()
+    page = written(tmp_path, maps)
+    changes = array(numbers(page), 'moments').reshape(-1, *maps.grid.shape)
+    then = list(moments(maps, web_page.MOMENTS))[:-1]
+    assert len(changes) == len(then) == web_page.MOMENTS - 1
+    said = found_in(page, tmp_path, 'return report.moments.map(m => [m.until, [...m.values]])')
+    for (until, values), moment, steps in zip(said, then, changes.cumsum(axis=0, dtype=np.uint8), strict=True):
+        assert until == moment.stamp / 1e9
+        np.testing.assert_array_equal(np.array(values).reshape(maps.grid.shape), steps)
+        np.testing.assert_array_equal(steps == web_page.UNKNOWN_THEN, np.isnan(moment.live))
+        known = steps != web_page.UNKNOWN_THEN
+        assert np.abs(steps[known] / web_page.STEPS_THEN - moment.live[known]).max() <= 0.5 / web_page.STEPS_THEN + 1e-6
+
+
+def test_large_maps_have_fewer_moments(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    maps = drive()
+    for cells, count in ((4, 3), (1, 0)):
+        monkeypatch.setattr(web_page, 'MOST_CELLS_OF_MOMENTS', cells * maps.grid.size)
+        page = written(tmp_path, maps)
+        assert len(numbers(page)['moments']) == count
+        script = 'report.go(0.5); return [report.layers.filter(layer => layer.shown).map(layer => layer.id)]'
+        assert found_in(page, tmp_path, script) == [['live_map' if count else 'ml_map']]
 
 
 class Tags(HTMLParser):
@@ -266,6 +306,27 @@ def test_several_drives_stay_apart(tmp_path: Path) -> None:
         return lines;
     """
     assert found_in(tmp_path / 'report.html', tmp_path, script) == [gap - 1, len(kept) - gap - 2]
+    assert f'DRIVES = [PATH, {", ".join(map(repr, DRIVES[1:]))}]' in (web_page.WEB / 'chart.js').read_text()
+    assert f"PATH = '{DRIVES[0]}'" in (web_page.WEB / 'chart.js').read_text()
+
+
+@pytest.mark.parametrize('count', [2, 30])
+def test_each_drive_has_a_colour_and_the_first_ones_a_name(tmp_path: Path, count: int) -> None:
+    paths = np.concatenate([[[k, 0.0], [k, 1.0], [np.nan, np.nan]] for k in range(count)])[:-1]
+    maps, names = made_maps(), [f'day_{k}' for k in range(count)]
+    write_page(
+        tmp_path / 'report.html', maps, report_data(maps, {'drives': [{'bag': name} for name in names]}), '', paths
+    )
+    script = """
+        const lines = [];
+        report.chart.line = (g, xy, colour) => { if (colour !== 'white') lines.push([xy[0], colour]); };
+        report.chart.drawNow();
+        return [lines, [...document.querySelectorAll('#drives li')].map(li => li.textContent)];
+    """
+    lines, legend = found_in(tmp_path / 'report.html', tmp_path, script)
+    assert lines == [[k, DRIVES[k % len(DRIVES)]] for k in range(count)]
+    shown = [f'{k + 1}: {name}' for k, name in enumerate(names[: web_page.MOST_DRIVES])]
+    assert legend == shown + ([f'and {count - len(shown)} more'] if count > len(shown) else [])
 
 
 def test_a_long_path_is_thinned(tmp_path: Path) -> None:

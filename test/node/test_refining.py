@@ -241,6 +241,7 @@ def test_reset_forgets_the_trajectory(inside: Callable[..., Inside], quick: Any)
     robot.call(robot.node.reset)
     assert robot.node.trajectory.correction is None
     assert robot.node.trajectory.found is None
+    assert robot.status('trajectory')['poses of odometry kept'] == '0', 'of the drive before'
     robot.drive(200, 30)
     assert_live(robot, None)
     assert 'until run_em' in robot.status('trajectory')['message']

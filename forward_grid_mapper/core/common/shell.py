@@ -39,4 +39,9 @@ def _interpreter() -> str:
 
 def command_line(command: str, *words: Path | str) -> str:
     """Return the line that runs one of our commands with these arguments, also where no environment is activated."""
-    return ' '.join([_interpreter(), '-m forward_grid_mapper', command, *map(quoted, words)])
+    return module_line('forward_grid_mapper', command, *words)
+
+
+def module_line(module: str, *words: Path | str) -> str:
+    """Return the line that runs a module with the interpreter that runs."""
+    return ' '.join([_interpreter(), '-m', module, *map(quoted, words)])

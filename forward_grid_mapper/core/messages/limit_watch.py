@@ -8,6 +8,9 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+
+from ..common.readings import Floats
 from .message_types import RangeMessage
 
 SAMPLES = 1024
@@ -46,74 +49,78 @@ class LimitWatch:
 
     def clear(self) -> None:
         """Forget all messages."""
-        self._samples: list[RangeMessage] = []
-        self._every, self._count = 1, 0
+        # range, min_range and max_range of each
+        self._samples = np.empty((SAMPLES, 3))
+        self._held, self._every, self._count = 0, 1, 0
 
     def add(self, message: RangeMessage) -> None:
         """Look at a message; costs next to nothing for most of them."""
         self._count += 1
         if self._count % self._every:
             return
-        self._samples.append(message)
-        if len(self._samples) == SAMPLES:
-            del self._samples[::2]
+        self._samples[self._held] = message.range, message.min_range, message.max_range
+        self._held += 1
+        if self._held == SAMPLES:
+            self._held //= 2
+            self._samples[: self._held] = self._samples[1::2].copy()
             self._every *= 2
 
     def warnings(self) -> list[str]:
         """Return what seems to be wrong; empty if nothing is."""
-        finite = [m for m in self._samples if math.isfinite(m.range) and m.range > 0 and 0 < m.max_range < math.inf]
-        if len(finite) < ENOUGH:
+        ranges, _, limits = samples = self._samples[: self._held].T
+        finite = samples[:, np.isfinite(ranges) & (ranges > 0) & (limits > 0) & (limits < np.inf)]
+        if finite.shape[1] < ENOUGH:
             return []
         # one cause has several symptoms; the first that is reported is enough
-        first = next((text for check in (_beyond, _far, _below) if (text := check(finite))), '')
+        first = next((text for check in (_beyond, _far, _below) if (text := check(*finite))), '')
         return [first] if first else []
 
 
-def _beyond(messages: list[RangeMessage]) -> str:
-    ratios = sorted(m.range / m.max_range for m in messages if m.range > BEYOND * m.max_range)
-    values = [m.range for m in messages if m.range > BEYOND * m.max_range]
-    if len(values) < MANY * len(messages) or values.count(max(set(values), key=values.count)) > SENTINEL * len(values):
+def _beyond(ranges: Floats, _: Floats, limits: Floats) -> str:
+    beyond = ranges > BEYOND * limits
+    counts = np.unique(ranges[beyond], return_counts=True)[1]
+    count = int(counts.sum())
+    if count < MANY * len(ranges) or counts.max() > SENTINEL * count:
         return ''
     # the farthest echoes come near max_range, whatever their unit
-    ratio = ratios[int(0.98 * (len(ratios) - 1))]
+    ratio = _at(0.98, (ranges / limits)[beyond])
     unit = min(UNITS, key=lambda name: abs(math.log(UNITS[name] / ratio)))
-    limit = sorted(m.max_range for m in messages)[len(messages) // 2]
     return (
-        f'{len(values)} of {len(messages)} ranges looked at are larger than max_range ({limit:g} m), up to '
+        f'{count} of {len(ranges)} ranges looked at are larger than max_range ({_middle(limits):g} m), up to '
         f'{ratio:.0f} times as large, and so count as no echo: are the ranges in {unit} and the limits in metres? '
         f'Messages must state metres; correct the driver'
     )
 
 
-def _below(messages: list[RangeMessage]) -> str:
+def _below(ranges: Floats, least: Floats, limits: Floats) -> str:
     # limits that contradict each other are rejected for that
-    below = [m for m in messages if m.range < m.min_range < m.max_range]
-    if len(below) < MANY * len(messages):
+    below = (ranges < least) & (least < limits)
+    count = int(below.sum())
+    if count < MANY * len(ranges):
         return ''
-    ratios = sorted(m.min_range / m.range for m in below)
-    limit = sorted(m.min_range for m in messages)[len(messages) // 2]
+    limit = _middle(least)
     # a sonar's blind zone is a few centimetres, and its limits have one unit
-    if limit < 1.0 and ratios[len(ratios) // 2] < 2.0:
+    if limit < 1.0 and _middle((least / ranges)[below]) < 2.0:
         return ''
     return (
-        f'{len(below)} of {len(messages)} ranges looked at are below min_range ({limit:g} m), and so are rejected: are '
+        f'{count} of {len(ranges)} ranges looked at are below min_range ({limit:g} m), and so are rejected: are '
         f'the limits in centimetres or millimetres and the ranges in metres? Messages '
         f'must state metres; correct the driver'
     )
 
 
-def _far(messages: list[RangeMessage]) -> str:
-    # in a corridor most ranges are short
-    large = sorted(m.range for m in messages)[9 * len(messages) // 10]
-    limit = sorted(m.max_range for m in messages)[len(messages) // 2]
+def _far(ranges: Floats, _: Floats, limits: Floats) -> str:
+    limit = _middle(limits)
     if limit < FARTHEST:
         return ''
+    # in a corridor most ranges are short
+    large = _at(0.9, ranges)
     if large > FARTHEST:
         return (
             f'a tenth of the ranges is larger than {large:.0f} m, and max_range is {limit:.4g} m, farther than sonars '
             f'hear: are ranges and limits in centimetres or millimetres? Messages must state metres; correct the driver'
         )
-    farthest = max((m.range for m in messages if m.range < m.max_range), default=0.0)
+    farthest = ranges[ranges < limits].max(initial=0.0)
     if farthest > NEAR * limit:
         return ''
     cause = 'is it in centimetres or millimetres' if limit < STATED else 'does the driver state no limit'
@@ -121,3 +128,12 @@ def _far(messages: list[RangeMessage]) -> str:
         f'max_range is {limit:.4g} m, and no range is larger than {farthest:.1f} m: {cause}? A reading without echo is '
         f'taken to say that all is free up to max_range; correct the driver, or set the parameter max_range'
     )
+
+
+def _middle(values: Floats) -> float:
+    return float(np.sort(values)[len(values) // 2])
+
+
+def _at(part: float, values: Floats) -> float:
+    """Return the value that this part of the others lies below."""
+    return float(np.sort(values)[int(part * (len(values) - 1))])

@@ -54,9 +54,16 @@ class OdometryRecord:
             return None
         return int(self._stamp[self._size - 1]), Pose2(*self._pose[self._size - 1].tolist())
 
+    @property
+    def since_anew(self) -> int:
+        """How many poses came since `begin_anew`, which keeps the last ones before it; all, if it was never called."""
+        before = int(np.searchsorted(self._stamp[: self._size], self._before, side='right'))
+        return self._size - before + sum(stamp > self._before for stamp in self._late)
+
     def clear(self) -> None:
         """Forget every pose."""
         self._size, self._next, self._anew = 0, 0, False
+        self._before = np.iinfo(np.int64).min
         self._late: dict[int, Pose2] = {}
         self._stamp = np.empty(1024, np.int64)
         self._pose = np.empty((1024, 3))
@@ -85,6 +92,7 @@ class OdometryRecord:
         self._sort_in()
         self._anew = True
         newest = int(self._stamp[self._size - 1]) if self._size else 0
+        self._before = newest if self._size else self._before
         begin = int(np.searchsorted(self._stamp[: self._size], newest - OVERLAP))
         # what stays is not much, and the rest is to be freed
         self._stamp, self._pose = self._stamp[begin : self._size].copy(), self._pose[begin : self._size].copy()

@@ -103,7 +103,9 @@ class ReadingBuffer:
     def extend(self, readings: Readings) -> None:
         """Add many readings at once."""
         count = len(readings)
-        self._reserve(count)
+        ahead = self._size + count
+        # the move to larger columns, which appending begins, needs this room to be done in steps
+        self._reserve(count + (ahead // 3 if ahead >= LARGE else 0))
         sensors = np.array([self._number_of(name) for name in readings.sensor_names] or [0], np.int32)
         for number, count_of, silent in zip(sensors.tolist(), *readings.counts(), strict=False):
             self._counts[number] += count_of

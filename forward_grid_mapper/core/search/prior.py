@@ -36,7 +36,7 @@ class Prior(NamedTuple):
     Attributes
     ----------
     local : float64, shape (cells,)
-        Of each cell by itself.
+        Of each cell by itself; not above 0, but for occupied cells that must stay.
     shape : float64, shape (256,)
         What the pattern of occupied neighbours adds; bit k stands for the neighbour k eighths of a turn from east.
     """

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..common.errors import InputError
-from ..common.grid import Grid, cone_boxes
+from ..common.grid import Grid
 from ..common.parameters import GridParameters, ModelParameters
 from ..common.readings import Readings
 from ..runtime.jit import allocating_kernel, kernel
@@ -40,9 +40,6 @@ kernels come upon readings at random.
 """
 
 Cones = NDArray[np.void]
-
-_SAMPLE = 16
-"""Of so many readings one gives a first box of all; a reading whose whole disc lies in there cannot make it larger."""
 
 UNIT = 2.0**-32
 """Cells; coordinates are rounded to it, which leaves 20 bits of float64 for the number of a cell."""
@@ -102,20 +99,41 @@ def check_size(made: Grid, grid: GridParameters) -> None:
 
 
 def _box(readings: Readings, reach: Floats) -> tuple[float, float, float, float]:
-    """Return left, right, bottom and top of all cones, metres; none but a few need be looked at closely."""
+    """Return left, right, bottom and top of all cones, metres."""
     r = readings
+    box: tuple[float, float, float, float] = _widest(
+        *(np.ascontiguousarray(v) for v in (r.x, r.y, r.yaw, r.half_angle, reach))
+    )
+    return box
 
-    def boxes(some: slice | NDArray[np.intp]) -> tuple[float, float, float, float]:
-        b = cone_boxes(r.x[some], r.y[some], r.yaw[some], r.half_angle[some], reach[some])
-        return float(b[0].min()), float(b[1].max()), float(b[2].min()), float(b[3].max())
 
-    left, right, bottom, top = boxes(slice(None, None, _SAMPLE))
-    inside = (r.x - reach >= left) & (r.x + reach <= right) & (r.y - reach >= bottom) & (r.y + reach <= top)
-    others = np.flatnonzero(~inside)
-    if not len(others):
-        return left, right, bottom, top
-    a = boxes(others)
-    return min(left, a[0]), max(right, a[1]), min(bottom, a[2]), max(top, a[3])
+@kernel
+def _widest(x: Floats, y: Floats, yaw: Floats, half_angle: Floats, reach: Floats) -> tuple[float, float, float, float]:
+    """Return the box of all sectors, as `cone_boxes` gives one for each."""
+    quarter = math.pi / 2
+    left, right, bottom, top = math.inf, -math.inf, math.inf, -math.inf
+    for i in range(len(x)):
+        u, v, r = x[i], y[i], reach[i]
+        # a whole disc in there cannot make it larger: all but a few
+        if u - r >= left and u + r <= right and v - r >= bottom and v + r <= top:
+            continue
+        low, high = yaw[i] - half_angle[i], yaw[i] + half_angle[i]
+        cos_low, cos_high, sin_low, sin_high = math.cos(low), math.cos(high), math.sin(low), math.sin(high)
+        right = max(right, u + r * max(cos_low, cos_high, 0.0))
+        top = max(top, v + r * max(sin_low, sin_high, 0.0))
+        left = min(left, u + r * min(cos_low, cos_high, 0.0))
+        bottom = min(bottom, v + r * min(sin_low, sin_high, 0.0))
+        first, last = math.ceil(low / quarter), math.floor(high / quarter)
+        for k in range(first, last + 1):
+            if k % 4 == 0:
+                right = max(right, u + r)
+            elif k % 4 == 1:
+                top = max(top, v + r)
+            elif k % 4 == 2:
+                left = min(left, u - r)
+            else:
+                bottom = min(bottom, v - r)
+    return left, right, bottom, top
 
 
 def cone_table(readings: Readings, grid: Grid, model: ModelParameters) -> Cones:

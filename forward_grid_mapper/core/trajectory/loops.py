@@ -14,12 +14,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from .chain import axes_at
 from .likelihood import scores
 from .local_map import LocalMap
 from .matching import grid_around, measure
 from .passes import FEWEST, Found, Progress
-from .poses import Floats, compose, relative, wrapped
+from .poses import Floats, axes_at, compose, relative, wrapped
 from .scans import FEWEST_ON_MAP, Scans
 
 LENGTH = 8
@@ -44,6 +43,9 @@ STEPS = (0.15, 0.15, math.radians(2.5))
 
 ASKED = 60
 """Readings that the search asks."""
+
+MEASURED = 150
+"""Readings that measure the best pose of the search."""
 
 GOOD = 0.65
 """Part of the usual score of a reading that a loop must have."""
@@ -132,8 +134,8 @@ def find_loop(
     total = values - prior
     best = poses[int(total.argmax())]
     for _ in range(CLIMBS):
-        best = measure(joint, around, best).pose
-    final = measure(joint, around, best)
+        best = measure(joint, around, best, MEASURED).pose
+    final = measure(joint, around, best, MEASURED)
     count = len(joint.readings)
     if final.score < GOOD * usual * count:
         return None

@@ -18,7 +18,7 @@ import numpy as np
 
 from .likelihood import Scan, scores
 from .local_map import LocalMap
-from .poses import Floats, compose, relative
+from .poses import Floats, compose
 
 CURVED = np.array([0.06, 0.06, math.radians(1.5)])
 """s: metres ahead and aside, and radians, between the poses of a parabola."""
@@ -28,6 +28,9 @@ LEAST_CURVATURE = 0.02
 
 FARTHEST_TOP = 2.0
 """Steps that the top of a parabola may lie away."""
+
+ENOUGH = 32
+"""Readings that measure a pose: more of a short piece of the drive tell little more, and take time."""
 
 COARSE = (0.1, 0.1, math.radians(2.5))
 """Steps of a search: metres ahead and aside, radians."""
@@ -65,16 +68,18 @@ class Match(NamedTuple):
     score: float
 
 
-def measure(scan: Scan, around: LocalMap, pose: Floats) -> Match:
-    """Return where a scan fits near a pose."""
-    values = scores(scan, around, pose + NEIGHBOURS * CURVED)
+def measure(scan: Scan, around: LocalMap, pose: Floats, most: int = ENOUGH) -> Match:
+    """Return where a scan fits near a pose; of more readings than `most`, some are asked, evenly."""
+    stride = max(len(scan.readings) // most, 1)
+    values = scores(scan, around, pose + NEIGHBOURS * CURVED, stride)
     fit = _PARABOLA @ values
     xx, yy, tt, xy, xt, yt = -fit[4:]
     curvature, axes = np.linalg.eigh(np.array([[xx, xy, xt], [xy, yy, yt], [xt, yt, tt]]))
     kept = curvature > LEAST_CURVATURE
     curvature, axes = curvature[kept], axes[:, kept]
     top = np.clip(axes @ (axes.T @ fit[1:4] / curvature), -FARTHEST_TOP, FARTHEST_TOP)
-    information: Floats = (axes * curvature) @ axes.T / np.outer(CURVED, CURVED)
+    # those asked tell no more than they are, though they stand for all in the score
+    information: Floats = (axes * curvature) @ axes.T / np.outer(CURVED, CURVED) / stride
     return Match(pose + top * CURVED, information, float(values[13]))
 
 
@@ -86,23 +91,3 @@ def grid_around(center: Floats, reach: Floats, steps: tuple[float, float, float]
         axes.append(np.arange(-n, n + 1) * step)
     offsets = np.stack([axis.ravel() for axis in np.meshgrid(*axes, indexing='ij')], axis=1)
     return compose(center, offsets)
-
-
-def search(scan: Scan, around: LocalMap, poses: Floats, center: Floats, information: Floats, readings: int) -> Floats:
-    """Return the best of `poses` given a prior, shape (3,).
-
-    Parameters
-    ----------
-    scan : Scan
-    around : LocalMap
-    poses : float64, shape (P, 3)
-    center, information : float64, shapes (3,) and (3, 3)
-        The prior, along its own axes.
-    readings : int
-        About how many readings of the scan to ask.
-    """
-    off = relative(center, poses)
-    value = scores(scan, around, poses, max(len(scan.readings) // readings, 1))
-    value -= 0.5 * np.einsum('pi,ij,pj->p', off, information, off)
-    best: Floats = poses[int(value.argmax())]
-    return best

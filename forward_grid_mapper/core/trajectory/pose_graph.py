@@ -5,16 +5,18 @@ of node i, the sum of
 
     ρ(‖d_ij − z_ij‖²_Ω) over matches   and   ρ(‖d_k,k+1 − (o_k + C_k c)‖²_Ω) over odometry   and   ‖c‖²_Ω
 
-and, where yaws are measured, of τ((θ_k − y_k)² Ω), is minimised by Gauss-Newton steps. ρ(s) = k² log(1 + s / k²) is
-Cauchy's loss; τ(s) = s / (1 + s / k²), that of Geman and McClure, lets go of what is far off, as the direction of a
-wall is that stands askew. Both work by weights that follow the residuals. The normal equations are sparse, and solved
-as such.
+and, where walls are measured, of τ((θ_k − y_k)² Ω) over yaws and τ((n · x_k + z_k − w − a t_k)² Ω) over distances, is
+minimised by Gauss-Newton steps. The offset w of each wall and the angle a at which it stands askew, half a degree or
+so, are unknown as well; t_k is how far along the wall node k is. ρ(s) = k² log(1 + s / k²) is the loss of Cauchy;
+τ(s) = s / (1 + s / k²), that of Geman and McClure, lets go of what is far off, as the direction of a wall is that
+stands askew. Both work by weights that follow the residuals. The normal equations are sparse, and solved as such.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,7 +32,10 @@ ROBUST_ODOMETRY = 3.0
 """The same for odometry: wheels slip more often than a normal distribution has it."""
 
 ROBUST_YAW = 3.0
-"""σ from which on a measured yaw is let go."""
+"""σ from which on a measured yaw, or the distance of a wall, is let go."""
+
+ASKEW = math.radians(0.5)
+"""σ of the angle between a wall and the axis that it follows."""
 
 ITERATIONS = 30
 
@@ -73,6 +78,55 @@ class Yaws(NamedTuple):
     information: Floats
 
 
+class Walls(NamedTuple):
+    """Distances of nodes from straight walls along the axes of the map: D of them, of W walls.
+
+    Attributes
+    ----------
+    node, wall : int64, shape (D,)
+        Walls are numbered from 0 on.
+    normal : float64, shape (D, 2)
+        Unit vectors along an axis, from the node to the wall.
+    distance : float64, shape (D,)
+        Of the wall from the node, metres.
+    lever : float64, shape (D,)
+        By how much the distance grows with the yaw of the node: metres a radian.
+    yaw : float64, shape (D,)
+        Yaw of the node that `distance` is for.
+    along : float64, shape (D,)
+        Metres along the wall.
+    information : float64, shape (D,)
+        In 1/m².
+    """
+
+    node: NDArray[np.int64]
+    wall: NDArray[np.int64]
+    normal: Floats
+    distance: Floats
+    lever: Floats
+    yaw: Floats
+    along: Floats
+    information: Floats
+
+    @property
+    def total(self) -> int:
+        """W."""
+        return int(self.wall.max(initial=-1)) + 1
+
+    def places(self, nodes: Floats) -> Floats:
+        """Return where each distance puts its wall along the normal, shape (D,), metres."""
+        at = nodes[self.node]
+        off = wrapped(at[:, 2] - self.yaw)
+        out: Floats = (self.normal * at[:, :2]).sum(1) + self.distance + self.lever * off
+        return out
+
+
+def no_walls() -> Walls:
+    """Return distances of walls, of which there are none."""
+    none, zero = np.zeros(0, np.int64), np.zeros(0)
+    return Walls(none, none, np.zeros((0, 2)), zero, zero, zero, zero, zero)
+
+
 def no_yaws() -> Yaws:
     """Return measured yaws, of which there are none."""
     return Yaws(np.zeros(0, np.int64), np.zeros(0), np.zeros(0))
@@ -103,6 +157,7 @@ class Graph:
         A priori.
     matches : Edges
     yaws : Yaws
+    walls : Walls
     """
 
     odometry: Edges
@@ -110,6 +165,7 @@ class Graph:
     calibration_sigma: Floats
     matches: Edges
     yaws: Yaws
+    walls: Walls
 
 
 @dataclass(frozen=True)
@@ -166,26 +222,46 @@ def _squared(r: Floats, information: Floats) -> Floats:
     return out
 
 
+class _State(NamedTuple):
+    """All unknowns.
+
+    Attributes
+    ----------
+    nodes : float64, shape (K, 3)
+    calibration : float64, shape (C,)
+    walls : float64, shape (W, 2)
+        Offset and angle of each wall.
+    """
+
+    nodes: Floats
+    calibration: Floats
+    walls: Floats
+
+    def moved(self, step: Floats) -> _State:
+        """Return the unknowns after a step, shape (3 K + C + 2 W,)."""
+        ends = np.cumsum([3 * len(self.nodes), len(self.calibration)])
+        nodes, calibration, walls = np.split(step, ends)
+        return _State(
+            self.nodes + nodes.reshape(-1, 3), self.calibration + calibration, self.walls + walls.reshape(-1, 2)
+        )
+
+
 class _Normal:
     """Normal equations of a graph, linearised at a guess."""
 
-    def __init__(self, graph: Graph, nodes: Floats, calibration: Floats) -> None:
-        self.graph, self.nodes, self.calibration = graph, nodes, calibration
+    def __init__(self, graph: Graph, state: _State) -> None:
+        self.graph, self.state = graph, state
+        nodes, calibration = state.nodes, state.calibration
         both = joined(graph.odometry, graph.matches)
         n, count, wide = len(graph.odometry.first), len(nodes), len(calibration)
+        self.size = 3 * count + wide + 2 * len(state.walls)
         r = residuals(nodes, both)
         r[:n] -= graph.sensitivity @ calibration
         self.squared = _squared(r, both.information)
         loss = np.where(np.arange(len(r)) < n, ROBUST_ODOMETRY, ROBUST)
         weight = weights(self.squared, loss)
         self.cost = float((loss**2 * np.log1p(self.squared / loss**2)).sum())
-        self.cost += float(((calibration / graph.calibration_sigma) ** 2).sum())
         self.information = both.information * weight[:, None, None]
-        yaws = graph.yaws
-        off = wrapped(nodes[yaws.node, 2] - yaws.yaw)
-        far = 1.0 + off**2 * yaws.information / ROBUST_YAW**2
-        self.cost += float((off**2 * yaws.information / far).sum())
-        pull = yaws.information / far**2
         one, other = jacobians(nodes, both)
         rows = np.arange(3 * len(r)).reshape(-1, 3, 1)
         columns = [3 * ends[:, None, None] + np.arange(3) for ends in (both.first, both.second)]
@@ -197,19 +273,56 @@ class _Normal:
         extra = np.broadcast_to(3 * count + np.arange(wide), shape)
         parts.append((np.broadcast_to(rows[:n], shape), extra, -graph.sensitivity))
         i, j, v = (np.concatenate([part[k].ravel() for part in parts]) for k in range(3))
-        self.j = sparse.csr_matrix((v, (i, j)), shape=(3 * len(r), 3 * count + wide))
+        self.j = sparse.csr_matrix((v, (i, j)), shape=(3 * len(r), self.size))
         self.omega = sparse.block_diag(list(self.information), format='csr')
-        prior = np.zeros(3 * count + wide)
-        prior[:2], prior[3 * count :] = 1e8, 1.0 / graph.calibration_sigma**2
-        prior[2] = 1e-3 if len(yaws.node) else 1e8
-        np.add.at(prior, 3 * yaws.node + 2, pull)
-        self.h = (self.j.T @ self.omega @ self.j + sparse.diags(prior)).tocsc()
-        gradient = self.j.T @ (self.omega @ r.ravel())
-        np.add.at(gradient, 3 * yaws.node + 2, pull * off)
-        self.yaw_pull = np.bincount(3 * yaws.node + 2, pull, 3 * count + wide)
-        gradient[3 * count :] += calibration / graph.calibration_sigma**2
-        self.gradient = gradient
-        self.factor = None
+        self.h = self.j.T @ self.omega @ self.j
+        self.gradient = self.j.T @ (self.omega @ r.ravel())
+        self.pulled = [self._add(*self._yaws()), self._add(*self._walls())]
+        self._add_prior()
+
+    def _yaws(self) -> tuple[Any, Floats, Floats]:
+        """Return how the residuals of measured yaws change with the unknowns, the residuals, and their information."""
+        yaws = self.graph.yaws
+        j = sparse.csr_matrix(
+            (np.ones(len(yaws.node)), (np.arange(len(yaws.node)), 3 * yaws.node + 2)), (len(yaws.node), self.size)
+        )
+        return j, wrapped(self.state.nodes[yaws.node, 2] - yaws.yaw), yaws.information
+
+    def _walls(self) -> tuple[Any, Floats, Floats]:
+        """Return the same of distances of walls."""
+        walls, (nodes, calibration, lines) = self.graph.walls, self.state
+        count, first = len(walls.node), 3 * len(nodes) + len(calibration)
+        off = walls.places(nodes) - lines[walls.wall, 0] - lines[walls.wall, 1] * walls.along
+        at, wall = 3 * walls.node, first + 2 * walls.wall
+        columns = np.stack([at, at + 1, at + 2, wall, wall + 1], axis=1)
+        values = np.column_stack([walls.normal, walls.lever, -np.ones(count), -walls.along])
+        rows = np.broadcast_to(np.arange(count)[:, None], columns.shape)
+        j = sparse.csr_matrix((values.ravel(), (rows.ravel(), columns.ravel())), (count, self.size))
+        return j, off, walls.information
+
+    def _add(self, j: Any, off: Floats, information: Floats) -> tuple[Any, Floats]:
+        """Add what is measured with the loss of Geman and McClure; return its part in a draw."""
+        far = 1.0 + off**2 * information / ROBUST_YAW**2
+        self.cost += float((off**2 * information / far).sum())
+        pull = information / far**2
+        self.h = self.h + j.T @ sparse.diags(pull) @ j
+        self.gradient += j.T @ (pull * off)
+        return j, np.sqrt(pull)
+
+    def _add_prior(self) -> None:
+        nodes, calibration, walls = self.state
+        end = 3 * len(nodes)
+        prior = np.zeros(self.size)
+        prior[:2], prior[2] = 1e8, 1e-3 if len(self.graph.yaws.node) else 1e8
+        prior[end : end + len(calibration)] = 1.0 / self.graph.calibration_sigma**2
+        prior[end + len(calibration) :: 2], prior[end + len(calibration) + 1 :: 2] = 1e-6, 1.0 / ASKEW**2
+        self.cost += float(((calibration / self.graph.calibration_sigma) ** 2).sum())
+        self.cost += float(((walls[:, 1] / ASKEW) ** 2).sum())
+        self.gradient[end : end + len(calibration)] += calibration / self.graph.calibration_sigma**2
+        self.gradient[end + len(calibration) + 1 :: 2] += walls[:, 1] / ASKEW**2
+        self.h = (self.h + sparse.diags(prior)).tocsc()
+        self.prior = prior
+        self.prior[:3] = 0.0
 
     def step(self, damping: float) -> Floats:
         diagonal = sparse.diags(damping * self.h.diagonal())
@@ -217,16 +330,25 @@ class _Normal:
         return out
 
     def draw(self, count: int, rng: np.random.Generator) -> Floats:
-        """Return deviations of all unknowns, shape (3 K + C, count)."""
+        """Return deviations of all unknowns, shape (3 K + C + 2 W, count)."""
         roots = np.linalg.cholesky(self.information + 1e-9 * np.eye(3))
         noise = rng.standard_normal((len(roots), 3, count))
-        pulled = np.einsum('eij,ejs->eis', roots, noise).reshape(-1, count)
-        right = self.j.T @ pulled
-        wide = len(self.calibration)
-        right += np.sqrt(self.yaw_pull)[:, None] * rng.standard_normal(right.shape)
-        right[-wide:] += rng.standard_normal((wide, count)) / self.graph.calibration_sigma[:, None]
+        right = self.j.T @ np.einsum('eij,ejs->eis', roots, noise).reshape(-1, count)
+        for j, root in self.pulled:
+            right += j.T @ (root[:, None] * rng.standard_normal((len(root), count)))
+        right += np.sqrt(self.prior)[:, None] * rng.standard_normal(right.shape)
         out: Floats = splu(self.h).solve(np.ascontiguousarray(right))
         return out
+
+
+def _where_walls_are(walls: Walls, nodes: Floats) -> Floats:
+    """Return the offset of each wall, the median of what its distances say, and no angle, shape (W, 2)."""
+    at = walls.places(nodes)
+    order = np.lexsort((at, walls.wall))
+    first = np.searchsorted(walls.wall[order], np.arange(walls.total + 1))
+    out = np.zeros((walls.total, 2))
+    out[:, 0] = at[order[(first[:-1] + first[1:] - 1) // 2]] if walls.total else 0.0
+    return out
 
 
 def solve(graph: Graph, nodes: Floats, calibration: Floats, samples: int = 0, seed: int = 0) -> Solution:
@@ -240,19 +362,19 @@ def solve(graph: Graph, nodes: Floats, calibration: Floats, samples: int = 0, se
     samples : int
         How many deviations to draw from the posterior.
     """
-    normal, damping = _Normal(graph, nodes, calibration), 0.0
+    normal, damping = _Normal(graph, _State(nodes, calibration, _where_walls_are(graph.walls, nodes))), 0.0
     for _ in range(ITERATIONS):
         step = normal.step(damping)
-        moved = normal.nodes + step[: 3 * len(nodes)].reshape(-1, 3)
-        tried = _Normal(graph, moved, normal.calibration + step[3 * len(nodes) :])
+        tried = _Normal(graph, normal.state.moved(step))
         if tried.cost > normal.cost * (1 + 1e-9):
             damping = max(10 * damping, 1e-4)
             if damping > 1e4:
                 break
             continue
         normal, damping = tried, damping / 10 if damping > 1e-6 else 0.0
-        if np.abs(step).max() < LEAST_STEP:
+        if np.abs(step[: 3 * len(nodes)]).max() < LEAST_STEP:
             break
     n = len(graph.odometry.first)
     drawn = normal.draw(samples, np.random.default_rng(seed))[: 3 * len(nodes)].T.reshape(samples, -1, 3)
-    return Solution(normal.nodes, normal.calibration, normal.squared[n:], normal.squared[:n], drawn)
+    state = normal.state
+    return Solution(state.nodes, state.calibration, normal.squared[n:], normal.squared[:n], drawn)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -30,6 +31,12 @@ def relative(frame: Floats, pose: Floats) -> Floats:
     return np.stack(
         np.broadcast_arrays(c * dx + s * dy, -s * dx + c * dy, wrapped(pose[..., 2] - frame[..., 2])), axis=-1
     )
+
+
+def axes_at(yaw: float) -> Floats:
+    """Return the rotation by `yaw` of (x, y, θ), shape (3, 3)."""
+    c, s = math.cos(yaw), math.sin(yaw)
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
 def inverse(pose: Floats) -> Floats:

@@ -1,11 +1,11 @@
 """From readings and drifting odometry to the trajectory that explains both: the steps, one after the other.
 
-windows       the drive in pieces of 0.4 m, each a node of the pose graph
-heading       yaw from walls at right angles, followed over the whole drive
-calibration   scale and heading of the wheels: what foresees readings best
-first pass    each block matched with the map of what was driven before it
-again, loops  each block matched with what lies around it, and with what was mapped there at another time
-judgement     what was held out and where walls stand must speak for the trajectory, or odometry stays
+windows         the drive in pieces of 0.4 m, each a node of the pose graph
+heading         yaw from walls at right angles, followed over the whole drive
+straight walls  distances of walls along the drive, which hold it straight and tell scale and heading of the wheels
+matching        each block matched with what was driven before it, and then with what lies around it
+places          blocks matched with what was mapped there at another time
+judgement       what was held out and where walls stand must speak for the trajectory, or odometry stays
 """
 
 from __future__ import annotations
@@ -13,23 +13,20 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 
 from ..common.parameters import Parameters
 from ..common.readings import Readings
 from ..runtime.cancelling import check
-from .chain import Chain
 from .heading import Heading, heading
 from .holding_out import Gain, blocks_of, foreseen, gain, held_out, held_out_blocks
 from .local_map import at_poses
-from .loops import Loop, find_loops
-from .odometry_model import CALIBRATION, Noise, calibrated, covariances, motions, sensitivity, with_yaw
-from .passes import BLOCK, again, first_pass
-from .pose_graph import Edges, Graph, Solution, Yaws, joined, solve
+from .odometry_model import CALIBRATION
+from .passes import BLOCK
 from .poses import Floats, compose, inverse, relative
 from .scans import Scans
+from .solving import Solver
 from .walls import wall_votes
 from .windows import Odometry, Windows, corrected, cut
 
@@ -50,32 +47,8 @@ LEAST_ECHOES = 0.05
 
 LEAST_SENSORS = 2
 
-ROUNDS = 2
-"""Times that loops are looked for."""
-
-SAMPLES = 40
-"""Deviations that are drawn to know how far places may be off."""
-
-LARGEST_RESIDUAL = 5.0
-"""σ², in the mean over a loop, from which on it does not agree with the rest."""
-
-SCALES = np.array([-0.03, 0.0, 0.03])
-HEADINGS = np.radians([-1.5, 0.0, 1.5])
-"""What is tried of the calibration: parts, and radians. Beyond the ends it goes on in equal steps."""
-
-MOST_STEPS = 3
-"""Steps beyond the ends."""
-
-UNSEEN = 2.0
-"""Times that the yaw drifts more than walls say: an echo votes with all others of three metres, and what drifts within
-these is not seen."""
-
-SIGMA = np.array([0.01, math.radians(0.5), math.radians(0.5), 0.02])
-"""σ of the calibration found."""
-
-TRIED_ON, FEWEST_TRIED, SPAN = 45, 10, 6.0
-"""Windows that a calibration is tried on, the readings that these have at least, and the metres of progress before and
-after a block that the map is made of on which odometry is compared."""
+SPAN = 6.0
+"""Metres of progress before and after a block that the map is made of on which odometry is compared."""
 
 JUDGED_ON, HELD_OUT = 60, 40
 """Blocks, and held-out windows, that trajectories are compared on at the most."""
@@ -89,9 +62,6 @@ standard errors that are then enough: readings must not be foreseen worse. Littl
 
 MOST_WORSE = 1.0
 """Standard errors by which matching may foresee what was held out worse."""
-
-OF_WAYS = np.array([1.0, 1.0, 0.0, 0.0])
-"""The part of a calibration that is left where the yaw is known."""
 
 OVER_CHANCE = 1.7
 """Times that votes must agree better than they would if ranges were random."""
@@ -192,19 +162,21 @@ class Refiner:
                 f'certain'
             )
             return Refinement(False, reason, readings, odometry, {})
-        calibration = self._calibrate(odometry, windows, scans, walls)
-        straight = self._straightened(odometry, windows, walls, calibration)
-        better = self._compare(scans, windows.node, straight)
+        solver = Solver(odometry, windows, scans, walls, self._say)
+        along = solver.along_walls()
+        calibration = solver.calibration_of(along)
+        simple = solver.simple(calibration)
+        better = self._compare(scans, windows.node, simple)
         said = f'readings are foreseen {better.mean:+.3f} ± {better.error:.3f} nats a reading better than with odometry'
         named = dict(zip(CALIBRATION, calibration.tolist(), strict=True))
         least = LEAST_SIGMAS_WITH_WALLS if walls.over_odometry > LEAST_OVER_ODOMETRY else LEAST_SIGMAS
         if better.sigmas < least:
             reason = f'{said}: not enough to tell that odometry is off'
             return Refinement(False, reason, readings, odometry, named, gain=better.mean)
-        solution, loops = self._solve(odometry, windows, scans, walls, calibration)
-        nodes = self._choose(scans, straight, solution.nodes)
+        solution, loops = solver.with_matches(along)
+        nodes = self._choose(scans, simple, along.nodes, solution.nodes)
         if nodes is solution.nodes:
-            named = dict(zip(CALIBRATION, solution.calibration.tolist(), strict=True))
+            named = dict(zip(CALIBRATION, solver.calibration_of(solution).tolist(), strict=True))
         trajectory = refined(odometry, windows, nodes)
         moved, turned = differences(odometry, trajectory)
         if moved < LEAST_MOVED:
@@ -233,59 +205,6 @@ class Refiner:
         chance = heading(by_chance, *wall_votes(by_chance, scans.held_out))
         return found if chance is None or found.gain > OVER_CHANCE * chance.gain else None
 
-    def _calibrate(self, odometry: Odometry, windows: Windows, scans: Scans, walls: Heading) -> Floats:
-        """Return the calibration with which readings are foreseen best, shape (4,)."""
-        say = self._say('calibration of the odometry')
-        enough = np.flatnonzero(scans.count >= FEWEST_TRIED)
-        chosen = [enough[k] for k in blocks_of(len(enough), 1, TRIED_ON)]
-        turned = with_yaw(odometry, windows.node_progress[walls.at], walls.correction)
-        found = np.zeros(len(CALIBRATION))
-
-        def score(which: int, value: float) -> float:
-            say(0.5)
-            trial = found.copy()
-            trial[which] = value
-            nodes = calibrated(turned, trial).at(windows.node_stamp)
-            found_there = foreseen(scans, nodes, chosen, SPAN)
-            return float(np.nanmean(found_there)) if np.isfinite(found_there).any() else 0.0
-
-        for name, values in (('scale', SCALES), ('heading', HEADINGS)):
-            which = CALIBRATION.index(name)
-            found[which] = highest(partial(score, which), values)
-        # the yaw is right already; these are what made it so
-        found[2:] = walls.drifts.bias, walls.drifts.turn_scale
-        return found
-
-    def _solve(
-        self, odometry: Odometry, windows: Windows, scans: Scans, walls: Heading, calibration: Floats
-    ) -> tuple[Solution, list[Loop]]:
-        """Return the pose graph's solution with the whole calibration, and the loops in it."""
-        measured = Yaws(walls.at, windows.node[walls.at, 2] + walls.measured, walls.information)
-        start = windows.node[0] + np.array([0.0, 0.0, walls.correction[0]])
-        change = sensitivity(odometry, windows)
-        motion = motions(odometry, windows) + change @ calibration
-        covariance = covariances(windows, Noise(yaw=UNSEEN * walls.drifts.noise))
-        count = np.arange(len(windows))
-        information = np.asarray(np.linalg.inv(covariance), np.float64)
-        steps = Edges(count[:-1], count[1:], motion, information)
-
-        def graph(matches: Edges) -> Graph:
-            return Graph(steps, change, SIGMA, matches, measured)
-
-        chain = Chain(motion, covariance, measured)
-        nodes, found = first_pass(scans, chain, start, self._say('first pass'))
-        solution, loops = solve(graph(found.edges()), nodes, np.zeros(len(calibration)), SAMPLES), []
-        for _ in range(ROUNDS):
-            found = again(scans, solution.nodes, self._say('matching again'))
-            loops = find_loops(scans, solution.nodes, solution.samples, found.usual, self._say('places seen before'))
-            solution, loops = with_loops(graph, found.edges(), loops, solution)
-        return replace(solution, calibration=solution.calibration + calibration), loops
-
-    def _straightened(self, odometry: Odometry, windows: Windows, walls: Heading, calibration: Floats) -> Floats:
-        """Return the nodes of odometry with the heading of walls and the calibration."""
-        turned = with_yaw(odometry, windows.node_progress[walls.at], walls.correction)
-        return calibrated(turned, calibration * OF_WAYS).at(windows.node_stamp)
-
     def _compare(self, scans: Scans, before: Floats, after: Floats) -> Gain:
         """Return by how much one trajectory foresees readings better than another, all over the drive."""
         say = self._say('judgement')
@@ -295,12 +214,16 @@ class Refiner:
         say(0.5)
         return gain(one, foreseen(scans, after, blocks, SPAN))
 
-    def _choose(self, scans: Scans, straight: Floats, matched: Floats) -> Floats:
-        """Return the nodes after matching, unless they foresee what was held out from it worse than those before."""
+    def _choose(self, scans: Scans, first: Floats, *others: Floats) -> Floats:
+        """Return the last nodes that do not foresee what was held out from them worse than those before."""
         self._say('judgement')
         blocks = held_out_blocks(scans, HELD_OUT)
-        more = gain(foreseen(scans, straight, blocks), foreseen(scans, matched, blocks))
-        return matched if more.sigmas > -MOST_WORSE else straight
+        best, seen = first, foreseen(scans, first, blocks)
+        for nodes in others:
+            now = foreseen(scans, nodes, blocks)
+            if gain(seen, now).sigmas > -MOST_WORSE:
+                best, seen = nodes, now
+        return best
 
 
 def unfit(readings: Readings, odometry: Odometry) -> str:
@@ -324,42 +247,6 @@ def unfit(readings: Readings, odometry: Odometry) -> str:
     if len(np.unique(readings.sensor)) < LEAST_SENSORS:
         return 'there is one sensor only, which cannot tell a turn from a step aside'
     return ''
-
-
-def highest(value_at: Callable[[float], float], tried: Floats) -> float:
-    """Return where a function is highest: among values in equal steps, beyond them if need be, and between two."""
-    step = tried[1] - tried[0]
-    known = {round(x / step): value_at(float(x)) for x in tried}
-    for _ in range(MOST_STEPS):
-        best = max(known, key=lambda k: known[k])
-        if best not in (min(known), max(known)):
-            break
-        beyond = best + (1 if best == max(known) else -1)
-        known[beyond] = value_at(float(beyond * step))
-    best = max(known, key=lambda k: known[k])
-    if best - 1 not in known or best + 1 not in known:
-        return float(best * step)
-    left, middle, right = known[best - 1], known[best], known[best + 1]
-    curvature = left - 2 * middle + right
-    return float((best + (0.5 * (left - right) / curvature if curvature < 0 else 0.0)) * step)
-
-
-def with_loops(
-    graph: Callable[[Edges], Graph], matches: Edges, loops: list[Loop], start: Solution
-) -> tuple[Solution, list[Loop]]:
-    """Return the solution with those loops that agree with each other and with the matches."""
-    while True:
-        edges = joined(matches, *(loop.found.edges() for loop in loops))
-        solution = solve(graph(edges), start.nodes, start.calibration, SAMPLES)
-        at, agree = len(matches.first), []
-        for loop in loops:
-            end = at + len(loop.found)
-            if solution.squared[at:end].mean() <= LARGEST_RESIDUAL:
-                agree.append(loop)
-            at = end
-        if len(agree) == len(loops):
-            return solution, loops
-        loops = agree
 
 
 def refined(odometry: Odometry, windows: Windows, nodes: Floats) -> Odometry:

@@ -2,6 +2,8 @@
 'use strict';
 
 const INK = '#14171c', PATH = '#0072b2', ODOMETRY = '#cc79a7', FOR = '#d55e00', AGAINST = '#0072b2', MARK = '#009e73';
+// those of drawing.py
+const DRIVES = [PATH, '#009e73', '#e69f00', '#7b3294', '#56b4e9', '#8c510a', '#666666', '#1b5e20'];
 const RAMP = [[0, 255, 255, 255], [0.2, 253, 240, 210], [0.5, 238, 176, 77], [0.78, 138, 74, 28], [1, 20, 23, 28]];
 
 /** Return the colours of probabilities, 0 to 1 in 256 steps, as 32 bit numbers of a canvas. */

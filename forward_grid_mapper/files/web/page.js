@@ -40,7 +40,7 @@ function layersOf(page) {
   const add = (id, title, values, own, unknown, largest, shown) => {
     const extent = [own.x, own.x + own.width * own.resolution, own.y, own.y + own.height * own.resolution];
     const levels = pyramid(values, own.width, own.height, unknown, largest);
-    rows.push({id, title, levels, cells: own.width, extent, shown, opacity: 1});
+    rows.push({id, title, levels, cells: own.width, extent, shown, opacity: 1, input: null});
   };
   if (page.reference) add('reference', 'Reference', arrays.reference, page.reference, 255, 1, false);
   add('live_map', 'Standard map', arrays.live_map, grid, UNKNOWN, 10000, false);
@@ -49,11 +49,43 @@ function layersOf(page) {
   return rows;
 }
 
+/** Return the standard maps during the drive; a page has what each adds to the one before, modulo 256. */
+function momentsOf(page) {
+  const {moments: changes} = page.arrays, {width, height} = page.grid, size = width * height;
+  return page.moments.map((until, k) => {
+    const values = changes.subarray(k * size, (k + 1) * size);
+    if (k) for (let i = 0; i < size; i++) values[i] += changes[(k - 1) * size + i];
+    let levels;
+    return {until, values, levels: () => levels ||= pyramid(values, width, height, 255, 250)};
+  });
+}
+
+/** Return the path of each drive; pairs of NaN part them. */
+function pathsOf(xy) {
+  const parts = [];
+  let begin = 0;
+  for (let k = 0; k <= xy.length; k += 2) {
+    if (k < xy.length && Number.isFinite(xy[k] + xy[k + 1])) continue;
+    parts.push(xy.subarray(begin, k));
+    begin = k + 2;
+  }
+  return parts;
+}
+
 class Page {
   constructor(page) {
     this.page = page;
     this.evidence = new Evidence(page);
     this.layers = layersOf(page);
+    this.standard = this.layers.find(layer => layer.id === 'live_map');
+    this.standard.whole = this.standard.levels;
+    this.moments = momentsOf(page);
+    this.paths = pathsOf(page.arrays.path);
+    this.starts = new Map();
+    for (let t = 0; t < this.evidence.count; t++) {
+      const {drive, stamp} = page.arrays;
+      if (!this.starts.has(drive[t])) this.starts.set(drive[t], stamp[t]);
+    }
     this.now = Infinity;
     this.hidden = new Set();
     this.causes = new Set(CAUSES.map((cause, k) => cause[3] ? k : -1));
@@ -118,7 +150,7 @@ class Page {
     const box = $('cell'), {found} = this;
     box.replaceChildren();
     if (!found) return;
-    const said = this.summary(found), {readings} = found, start = this.page.start;
+    const said = this.summary(found), {readings} = found;
     box.append(make('h2', {textContent: said.title}), make('p', {textContent: said.odds}),
       make('p', {textContent: said.evidence}));
     const groups = make('ul', {className: 'groups'});
@@ -139,11 +171,11 @@ class Page {
     for (const r of readings.slice(0, most)) {
       const bar = make('span', {className: r.nats > 0 ? 'bar for' : 'bar against'});
       bar.style.width = `${Math.max(40 * Math.abs(r.nats) / largest, 1)}px`;
-      const {sensor, stamp} = this.page.arrays;
+      const {sensor} = this.page.arrays;
       const row = make('tr', {tabIndex: 0}, make('td', {}, bar, signed(r.nats, 2)),
         make('td', {textContent: r.silent ? 'no echo' : `${r.range.toFixed(2)} m`}),
         make('td', {textContent: `${r.distance.toFixed(2)} m`}),
-        make('td', {textContent: `${(stamp[r.t] - start).toFixed(1)} s`}),
+        make('td', {textContent: this.when(r.t)}),
         make('td', {textContent: this.page.sensors[sensor[r.t]].name || 'a sensor without a name'}));
       for (const kind of ['pointerenter', 'focus']) row.addEventListener(kind, () => this.mark(r));
       for (const kind of ['pointerleave', 'blur']) row.addEventListener(kind, () => this.mark(null));
@@ -157,6 +189,36 @@ class Page {
       box.append(more);
     }
     box.append(make('p', {className: 'hint', textContent: 'Orange cones speak for an obstacle here, blue ones against it.'}));
+  }
+
+  /** Return when a reading was taken: seconds from the beginning of its drive, and which one if there are several. */
+  when(t) {
+    const {drive, stamp} = this.page.arrays, seconds = `${(stamp[t] - this.starts.get(drive[t])).toFixed(1)} s`;
+    return this.starts.size > 1 ? `drive ${drive[t] + 1}, ${seconds}` : seconds;
+  }
+
+  /** Go to a share of the readings: below 1, the standard map is as it was then, and maps of the whole drive are hidden. */
+  go(share) {
+    const {stamp} = this.page.arrays, count = this.evidence.count, last = Math.min(Math.floor(share * count), count - 1);
+    const whole = share >= 1 || !count, {moments, standard} = this;
+    this.now = whole ? Infinity : stamp[last];
+    $('clock').textContent = whole ? 'whole drive' : this.when(last);
+    if (moments.length) {
+      const passed = moments.filter(moment => moment.until <= this.now);
+      if (whole) standard.levels = standard.whole;
+      else standard.levels = passed.length ? passed[passed.length - 1].levels() : [new OffscreenCanvas(1, 1)];
+      const part = Math.round(100 * passed.length / (moments.length + 1));
+      standard.label.textContent = whole ? standard.title : `${standard.title} after ${part} % of the readings`;
+      if (!whole && !this.before) {
+        this.before = this.layers.map(layer => [layer, layer.shown]);
+        for (const layer of this.layers) layer.shown = layer === standard;
+      } else if (whole && this.before) {
+        for (const [layer, shown] of this.before) layer.shown = shown;
+        this.before = null;
+      }
+      for (const layer of this.layers) layer.input.checked = layer.shown;
+    }
+    this.chart.draw();
   }
 
   /** Show a map on top of the others, or hide it. */
@@ -179,11 +241,11 @@ class Page {
   }
 
   paint(g) {
-    const {chart, page, evidence: e} = this, {path, odometry, sensor, cause, stamp} = page.arrays;
+    const {chart, page, evidence: e} = this, {odometry, sensor, cause, stamp} = page.arrays;
     if (this.showPath) {
       if (odometry) chart.line(g, odometry, ODOMETRY, 1.5, [6, 4]);
-      if (path.length) chart.line(g, path, 'white', 4);
-      if (path.length) chart.line(g, path, PATH, 2);
+      for (const path of this.paths) chart.line(g, path, 'white', 4);
+      this.paths.forEach((path, k) => chart.line(g, path, DRIVES[k % DRIVES.length], 2));
     }
     const latest = new Map(), size = chart.dot(cause ? this.counts.filter((_, k) => this.causes.has(k)).reduce((a, b) => a + b, 0) : 0);
     for (let t = 0; t < e.count && stamp[t] <= this.now; t++) {
@@ -216,21 +278,29 @@ class Page {
   }
 
   addControls() {
-    const {page, chart} = this, {sensor, cause, stamp} = page.arrays;
-    const box = (id, text, checked, change) => {
-      const input = make('input', {type: 'checkbox', id, checked});
+    const {page, chart} = this, {sensor} = page.arrays;
+    const box = (id, text, checked, change, input = make('input', {type: 'checkbox', id, checked})) => {
       input.addEventListener('change', () => { change(input.checked); chart.draw(); });
       return make('label', {}, input, ...[text].flat());
     };
     for (const layer of [...this.layers].reverse()) {
       const slider = make('input', {type: 'range', min: 0, max: 100, value: 100, ariaLabel: `opacity of ${layer.title}`});
       slider.addEventListener('input', () => { layer.opacity = slider.value / 100; chart.draw(); });
+      layer.input = make('input', {type: 'checkbox', id: layer.id, checked: layer.shown});
+      layer.label = make('span', {textContent: layer.title});
       $('layers').append(make('div', {className: 'row'},
-        box(layer.id, layer.title, layer.shown, on => this.show(layer, on)), slider));
+        box(layer.id, layer.label, layer.shown, on => this.show(layer, on), layer.input), slider));
     }
     const swatch = colour => { const s = make('span', {className: 'swatch'}); s.style.background = colour; return s; };
+    const several = this.paths.length > 1, title = several ? `paths of ${this.paths.length} drives` : 'path of the robot';
     $('layers').append(make('div', {className: 'row'},
-      box('path', [swatch(PATH), 'path of the robot'], true, on => { this.showPath = on; })));
+      box('path', several ? title : [swatch(PATH), title], true, on => { this.showPath = on; })));
+    if (several && page.drives.length) {
+      const more = this.paths.length - page.drives.length, rows = page.drives.map((name, k) =>
+        make('li', {}, swatch(DRIVES[k % DRIVES.length]), make('span', {textContent: `${k + 1}: ${name}`})));
+      if (more > 0) rows.push(make('li', {textContent: `and ${more} more`}));
+      $('layers').append(make('ul', {id: 'drives'}, ...rows));
+    }
     const toggle = (set, k) => on => { if (on) set.add(k); else set.delete(k); };
     CAUSES.forEach(([id, text, colour, on], k) => {
       $('causes').append(make('div', {className: 'row'}, box(id, [swatch(colour), text], on, toggle(this.causes, k)),
@@ -245,17 +315,9 @@ class Page {
     $('whole').addEventListener('click', () => chart.fit());
     $('drive').hidden = !sensor;
     if (!sensor) return;
-    const last = stamp.length ? stamp[stamp.length - 1] - page.start : 0, time = $('time');
-    time.max = Math.ceil(last * 10) / 10;
-    time.value = time.max;
-    const set = () => {
-      const whole = Number(time.value) >= last;
-      this.now = whole ? Infinity : page.start + Number(time.value);
-      $('clock').textContent = whole ? 'whole drive' : `${Number(time.value).toFixed(1)} s`;
-      chart.draw();
-    };
-    time.addEventListener('input', set);
-    set();
+    const time = $('time');
+    time.addEventListener('input', () => this.go(Number(time.value)));
+    this.go(1);
   }
 }
 

@@ -52,6 +52,23 @@ def test_memory_is_bounded_and_the_way_stays() -> None:
     assert record._stamp.nbytes + record._pose.nbytes <= 2 * 32 * (most + 1024)
 
 
+def test_what_is_kept_for_the_next_reading_does_not_count() -> None:
+    record = OdometryRecord()
+    assert record.since_anew == 0
+    for k in range(100):
+        record.add(k * NANOSECONDS // 10, Pose2(0.0, 0.0, 0.0))
+    assert record.since_anew == len(record) == 100
+    record.begin_anew()
+    assert len(record) > 0 == record.since_anew
+    for k in (103, 101, 102, 101):
+        record.add(k * NANOSECONDS // 10, Pose2(0.0, 0.0, 0.0))
+    assert record.since_anew == 3
+    record.snapshot()
+    assert record.since_anew == 3
+    record.clear()
+    assert record.since_anew == 0
+
+
 def test_a_robot_that_stands_costs_the_way_nothing() -> None:
     record = OdometryRecord(1000)
     for k in range(400):

@@ -110,7 +110,8 @@ def append(buffer: ReadingBuffer, first: int, count: int) -> None:
         buffer.append('s', x=k, y=0.0, yaw=0.0, z=1.0 + k % 2, z_max=2.0, half_angle=0.1, sigma=0.0, stamp=k)
 
 
-def test_columns_grow_without_one_large_copy(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize('restored', [0, 16_000, 12_300, 16_384])
+def test_columns_grow_without_one_large_copy(monkeypatch: pytest.MonkeyPatch, restored: int) -> None:
     monkeypatch.setattr(reading_buffer, 'LARGE', 4096)
     moved: list[int] = []
     move = ReadingBuffer._move
@@ -122,8 +123,11 @@ def test_columns_grow_without_one_large_copy(monkeypatch: pytest.MonkeyPatch) ->
             moved.append(end - before)
 
     monkeypatch.setattr(ReadingBuffer, '_move', counted)
-    buffer = ReadingBuffer()
-    append(buffer, 0, 100_000)
+    buffer, earlier = ReadingBuffer(), ReadingBuffer()
+    append(earlier, 0, restored)
+    buffer.extend(earlier.snapshot())
+    moved.clear()
+    append(buffer, restored, 100_000 - restored)
     assert max(moved) <= 5 * STEP
     assert np.array_equal(buffer.snapshot().x, np.arange(100_000))
     assert buffer.counts() == {'s': (100_000, 50_000)}

@@ -17,7 +17,14 @@ from forward_grid_mapper.core.evidence.evidence import Evidence
 from forward_grid_mapper.core.evidence.fixed_point import QUANTUM
 from forward_grid_mapper.core.evidence.neighbourhood import patterns
 from forward_grid_mapper.core.evidence.updates import flip
-from forward_grid_mapper.core.search.flips import WORTH_WAITING, flip_in_order, free_unneeded, highest, promising
+from forward_grid_mapper.core.search.flips import (
+    WORTH_WAITING,
+    any_above,
+    flip_in_order,
+    free_unneeded,
+    highest,
+    promising,
+)
 from forward_grid_mapper.core.search.prior import Prior
 from forward_grid_mapper.core.search.search import LEAST
 from forward_grid_mapper.core.search.shifts import best_shifts, see_any, shift_in_order, try_shifts, unsettle
@@ -112,6 +119,33 @@ def test_promising_cells_are_those_whose_flip_gains(seed: int, name: str) -> Non
     for bottom, top, left, right in ((2, 5, 3, 11), (0, 9, 4, 4), (8, 9, 0, 12)):
         inside = [c for c in cells if bottom <= c // GRID.width < top and left <= c % GRID.width < right]
         assert listed(evidence, prior, least, (bottom, top, left, right))[0].tolist() == inside
+
+
+@pytest.mark.parametrize('seed', range(5))
+@pytest.mark.parametrize('name', ['none', 'less', 'shapes'])
+def test_promising_cells_of_an_empty_map_are_found_however_little_they_gain(seed: int, name: str) -> None:
+    rng = np.random.default_rng(seed)
+    prior = prior_of(name)
+    evidence, _ = random_case(seed)
+    maps, least = evidence.state.maps, (0.01, 0.0)
+    maps.occupied[:] = maps.pattern[:] = 0
+    needed = (least[0] - prior.local - prior.shape[0]) / QUANTUM
+    maps.evidence[:] = np.rint(needed) + rng.integers(-3, 4, GRID.size)
+    maps.evidence[rng.random(GRID.size) < 0.9] = -(1 << 40)
+    expected = [c for c in range(GRID.size) if maps.seen[c] and gain(evidence, prior, c) > least[0]]
+    assert listed(evidence, prior, least)[0].tolist() == expected
+
+
+@pytest.mark.parametrize('seed', range(20))
+def test_blocks_without_anything_are_told_from_others(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    size, floor = 200, np.int64(rng.integers(-5, 5))
+    evidence = rng.integers(floor - 6, floor + 2, size)
+    occupied, pattern = ((rng.random(size) < 0.03).astype(np.uint8) * np.uint8(k) for k in (1, 64))
+    for _ in range(50):
+        begin, end = sorted(rng.integers(0, size, 2).tolist())
+        some = any(evidence[c] > floor or occupied[c] or pattern[c] for c in range(begin, end))
+        assert any_above(evidence, occupied, pattern, floor, begin, end) == some
 
 
 @pytest.mark.parametrize('seed', range(10))

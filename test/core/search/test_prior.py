@@ -42,7 +42,7 @@ seeds = st.integers(0, 2**32 - 1)
 
 def random_prior(seed: int, size: int) -> Prior:
     rng = np.random.default_rng(seed)
-    return Prior(rng.uniform(-3, 1, size), rng.uniform(-3, 3, 256))
+    return Prior(rng.uniform(-3, 0, size), rng.uniform(-3, 3, 256))
 
 
 @settings(deadline=None)

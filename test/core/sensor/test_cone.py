@@ -17,6 +17,7 @@ from forward_grid_mapper.core.common.readings import Readings
 from forward_grid_mapper.core.sensor.cone import axis_run, rows_of, runs_of, within
 from forward_grid_mapper.core.sensor.cone_table import (
     UNIT,
+    _widest,
     cone_of,
     cone_table,
     effective_sigma,
@@ -219,3 +220,15 @@ def test_where_a_sensor_is_in_its_cell_does_not_depend_on_the_corner_of_the_grid
         # to the bit, though the number of bits before the point differs
         assert np.array_equal(other['x'] + column, near['x'] - 45)
         assert np.array_equal(other['y'] + row, near['y'] - 45)
+
+
+@pytest.mark.parametrize('seed', range(20))
+def test_the_box_of_all_cones_is_that_of_their_boxes(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    n = int(rng.integers(1, 300))
+    yaw = np.where(rng.random(n) < 0.3, rng.integers(-9, 9, n) * math.pi / 2, rng.uniform(-9, 9, n))
+    columns = rng.uniform(-5, 5, n), rng.uniform(-5, 5, n), yaw, rng.uniform(0.01, 1.5, n), rng.uniform(0, 4, n)
+    boxes = cone_boxes(*columns)
+    expected = boxes[0].min(), boxes[1].max(), boxes[2].min(), boxes[3].max()
+    np.testing.assert_allclose(_widest(*columns), expected, rtol=0, atol=1e-12)
+    assert _widest(*columns) == _widest(*(column[::-1].copy() for column in columns)), 'whatever their order'

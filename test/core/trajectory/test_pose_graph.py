@@ -8,17 +8,18 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from forward_grid_mapper.core.trajectory.chain import Chain
-from forward_grid_mapper.core.trajectory.matching import Match
 from forward_grid_mapper.core.trajectory.pose_graph import (
+    ASKEW,
     ROBUST,
     ROBUST_ODOMETRY,
     ROBUST_YAW,
     Edges,
     Graph,
+    Walls,
     Yaws,
     jacobians,
     no_edges,
+    no_walls,
     no_yaws,
     residuals,
     solve,
@@ -44,9 +45,21 @@ def chain_of(nodes: np.ndarray, noise: float, seed: int = 0) -> Edges:
     return Edges(k[:-1], k[1:], motion, np.tile(STEP, (len(nodes) - 1, 1, 1)))
 
 
-def graph_of(odometry: Edges, matches: Edges, yaws: Yaws | None = None) -> Graph:
+def graph_of(odometry: Edges, matches: Edges, yaws: Yaws | None = None, walls: Walls | None = None) -> Graph:
     none = np.zeros((len(odometry.first), 3, 1))
-    return Graph(odometry, none, np.ones(1), matches, no_yaws() if yaws is None else yaws)
+    return Graph(odometry, none, np.ones(1), matches, yaws or no_yaws(), walls or no_walls())
+
+
+def walls_of(nodes: np.ndarray, wrong: float = 0.0) -> Walls:
+    """Distances from two walls, of nodes 1 to 4 and 3 to 5, one of them wrong."""
+    node, wall = np.array([1, 2, 3, 4, 3, 4, 5]), np.array([0, 0, 0, 0, 1, 1, 1])
+    normal = np.where(wall[:, None] == 0, [0.0, 1.0], [-1.0, 0.0])
+    place = nodes[node, :2]
+    distance = np.where(wall == 0, 3.0, 1.0) - (normal * place).sum(1)
+    distance[2] += wrong
+    along = np.where(wall == 0, place[:, 0], -place[:, 1])
+    lever = np.linspace(-0.2, 0.3, 7)
+    return Walls(node, wall, normal, distance, lever, nodes[node, 2] + 0.01, along, np.full(7, 1e4))
 
 
 def test_poses_compose_and_come_apart() -> None:
@@ -76,26 +89,34 @@ def test_the_solution_is_that_of_a_general_optimiser() -> None:
     odometry = chain_of(nodes, 0.02)
     match = Edges(np.array([0]), np.array([5]), relative(nodes[0], nodes[5])[None], STEP[None])
     yaws = Yaws(np.array([2, 4]), nodes[[2, 4], 2] + np.array([0.01, 0.9]), np.array([2e3, 2e3]))
-    graph = graph_of(odometry, match, yaws)
+    walls = walls_of(nodes, 0.05)
+    graph = graph_of(odometry, match, yaws, walls)
     start = np.array(nodes)
     solution = solve(graph, start, np.zeros(1), samples=1)
 
     def cost(free: np.ndarray) -> float:
-        x = np.vstack([[0.0, 0.0, free[0]], free[1:].reshape(-1, 3)])
+        lines, x = free[-4:].reshape(2, 2), np.vstack([[0.0, 0.0, free[0]], free[1:-4].reshape(-1, 3)])
         total = 0.0
         for edges, k in ((odometry, ROBUST_ODOMETRY), (match, ROBUST)):
             r = residuals(x, edges)
             s = np.einsum('ei,eij,ej->e', r, edges.information, r)
             total += (k**2 * np.log1p(s / k**2)).sum()
         s = wrapped(x[yaws.node, 2] - yaws.yaw) ** 2 * yaws.information
-        return total + (s / (1 + s / ROBUST_YAW**2)).sum()
+        total += (s / (1 + s / ROBUST_YAW**2)).sum() + ((lines[:, 1] / ASKEW) ** 2).sum()
+        for k, wall, n, z, lever, yaw, along, information in zip(*walls, strict=True):
+            off = n @ x[k, :2] + z + lever * wrapped(x[k, 2] - yaw) - lines[wall, 0] - lines[wall, 1] * along
+            total += off**2 * information / (1 + off**2 * information / ROBUST_YAW**2)
+        return float(total)
 
-    def free_of(x: np.ndarray) -> np.ndarray:
-        return np.concatenate([x[:1, 2], x[1:].ravel()])
+    def free_of(x: np.ndarray, lines: np.ndarray) -> np.ndarray:
+        return np.concatenate([x[:1, 2], x[1:].ravel(), lines.ravel()])
 
-    best = minimize(cost, free_of(nodes), method='BFGS', options={'gtol': 1e-6})
-    assert cost(free_of(solution.nodes)) <= best.fun + 1e-3
-    assert free_of(solution.nodes) == pytest.approx(best.x, abs=2e-3)
+    guess = free_of(nodes, np.array([[3.0, 0.0], [1.0, 0.0]]))
+    best = minimize(cost, guess, method='BFGS', options={'gtol': 1e-6})
+    assert free_of(solution.nodes, best.x[-4:]) == pytest.approx(best.x, abs=2e-3)
+    assert solution.nodes != pytest.approx(
+        solve(graph_of(odometry, match, yaws), start, np.zeros(1), 1).nodes, abs=5e-3
+    )
 
 
 def test_false_matches_are_let_go() -> None:
@@ -125,7 +146,7 @@ def test_calibration_is_found_from_matches() -> None:
     first = np.arange(0, 25)
     matches = Edges(first, first + 5, relative(nodes[first], nodes[first + 5]), np.tile(STEP, (25, 1, 1)))
     start = np.array(nodes)
-    graph = Graph(measured, change, np.array([0.1]), matches, no_yaws())
+    graph = Graph(measured, change, np.array([0.1]), matches, no_yaws(), no_walls())
     assert solve(graph, start, np.zeros(1), samples=1).calibration[0] == pytest.approx(0.05, abs=0.002)
 
 
@@ -138,20 +159,38 @@ def test_deviations_are_as_wide_as_odometry_drifts() -> None:
     assert np.abs(solution.samples[:, 0]).max() < 1e-3
 
 
-def test_a_block_alone_is_solved_like_a_graph() -> None:
+def test_a_straight_wall_holds_a_drive_straight() -> None:
+    rng = np.random.default_rng(5)
+    nodes = np.column_stack([np.arange(60) * 0.4, np.zeros((60, 2))])
+    odometry = chain_of(nodes, 0.0)
+    odometry.pose[:, 2] += rng.normal(0, 0.003, 59)
+    walked = [nodes[0]]
+    for motion in odometry.pose:
+        walked.append(compose(walked[-1], motion))
+    start = np.array(walked)
+    node, count = np.arange(60), 60
+    far = np.full(count, 1.3) + rng.normal(0, 0.01, count)
+    # another wall stands 40 cm back, and was taken for the same one
+    far[30:36] += 0.4
+    normal = np.tile([0.0, 1.0], (count, 1))
+    none = np.zeros(count)
+    walls = Walls(node, np.zeros(count, int), normal, far, none, none, nodes[:, 0] - 11.8, np.full(count, 600.0))
+    begin = Yaws(np.array([0]), np.zeros(1), np.array([1e6]))
+    solution = solve(graph_of(odometry, no_edges(), begin, walls), start, np.zeros(1), samples=200)
+    assert np.abs(start[:, 1] - nodes[:, 1]).max() > 0.15
+    assert np.abs(solution.nodes[:, 1] - nodes[:, 1]).max() < 0.06
+    without = solve(graph_of(odometry, no_edges(), begin), start, np.zeros(1), samples=200)
+    assert solution.samples[:, -1, 1].std() < 0.3 * without.samples[:, -1, 1].std()
+
+
+def test_walls_move_with_the_axes_of_the_map() -> None:
     nodes = loop_of(6)
-    odometry = chain_of(nodes, 0.03)
-    yaws = Yaws(np.array([3]), nodes[[3], 2], np.array([2e3]))
-    match = Match(nodes[4] + [0.05, 0.0, 0.01], STEP, 0.0)
-    chain = Chain(odometry.pose, np.linalg.inv(odometry.information), yaws)
-    block = np.arange(1, 6)
-    alone = nodes[block]
-    for _ in range(5):
-        alone = chain.solve(nodes[0], block, alone, [(3, match)])
-    one = Edges(np.array([0]), np.array([4]), relative(nodes[0], match.pose)[None], STEP[None])
-    weak = Yaws(np.array([0, 3]), np.array([0.0, nodes[3, 2]]), np.array([1e9, 2e3]))
-    whole = solve(graph_of(odometry, one, weak), np.array(nodes), np.zeros(1), samples=1)
-    assert alone == pytest.approx(whole.nodes[1:], abs=1e-3)
+    walls = walls_of(nodes)
+    assert walls.total == 2
+    assert walls.places(nodes) == pytest.approx(np.where(walls.wall == 0, 3.0, 1.0) - 0.01 * walls.lever)
+    moved = nodes + np.array([0.3, -0.2, 0.01])
+    assert walls.places(moved) == pytest.approx(np.where(walls.wall == 0, 2.8, 0.7))
+    assert no_walls().total == 0
 
 
 def test_a_graph_moves_as_a_whole() -> None:

@@ -14,7 +14,7 @@ from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.common.readings import Readings
 from forward_grid_mapper.core.mapping import Mapper
 from forward_grid_mapper.core.trajectory.poses import compose, relative, rms_after_alignment
-from forward_grid_mapper.core.trajectory.refinement import Refinement, Refiner, highest, unfit
+from forward_grid_mapper.core.trajectory.refinement import Refinement, Refiner, unfit
 from forward_grid_mapper.core.trajectory.windows import Odometry
 from forward_grid_mapper.simulation.drift import LEVELS, with_drift
 from forward_grid_mapper.simulation.drive import Recording, drive
@@ -100,12 +100,12 @@ def test_cancelling_ends_the_work(bent) -> None:
 
     def watch(stage: str, part: float) -> None:
         stages.append(stage)
-        if stage == 'first pass':
+        if stage == 'matching':
             threading.Thread(target=refiner.cancel).run()
 
     with pytest.raises(Cancelled):
         refiner.run(*bent, watch)
-    assert stages[-1] == 'first pass'
+    assert stages[-1] == 'matching'
 
 
 def still(readings: Readings, odometry: Odometry) -> tuple[Readings, Odometry]:
@@ -175,10 +175,3 @@ def test_a_straight_drive_without_revisits_is_no_worse() -> None:
     true, odometry = odometry_of(recording).pose, odometry_of(bent)
     left = Refiner(Parameters()).run(bent.readings, odometry)
     assert rms_after_alignment(left.trajectory.pose, true) < rms_after_alignment(odometry.pose, true) + 0.02
-
-
-def test_the_highest_value_is_found_beyond_the_ends_and_between() -> None:
-    tried = np.array([-1.0, 0.0, 1.0])
-    assert highest(lambda x: -((x - 0.3) ** 2), tried) == pytest.approx(0.3)
-    assert highest(lambda x: -((x - 2.4) ** 2), tried) == pytest.approx(2.4)
-    assert highest(lambda x: x, tried) == pytest.approx(4.0)

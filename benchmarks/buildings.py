@@ -1,0 +1,83 @@
+#!/usr/bin/env python3
+"""How good maps of real places are: sonars simulated in buildings that a laser measured, and recordings of a robot.
+
+usage: buildings.py [NAME ...]
+
+Of the drives under ../shared/data, or those named, with their right poses: the default's maximum likelihood map and its
+live map, the paper's plain maximum likelihood map, and the standard map with the best of 216 gains for that very drive,
+once for F1 and once for nav_iou, which nobody could know. Figures are those of ../shared/tools/score_map.py.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from types import ModuleType
+from typing import Any, NamedTuple
+
+import numpy as np
+import quality_worlds
+from numpy.typing import NDArray
+from quality_scores import ROBOT_RADIUS, Standard, on_truth
+from quality_worlds import Case, recorded_cases, scoring_tool
+
+from forward_grid_mapper.commands.experiment_maps import GAINS
+from forward_grid_mapper.core.common.grid import Grid
+from forward_grid_mapper.core.common.parameters import Parameters
+from forward_grid_mapper.core.mapping import Mapper
+from forward_grid_mapper.files.parameter_file import load_parameters
+
+PAPER = Path(__file__).resolve().parents[1] / 'config' / 'paper.yaml'
+NAMES = ('building_a', 'building_b', 'building_c', 'office_a', 'office_b')
+FIGURES = ('f1', 'precision', 'recall', 'nav_iou', 'leak', 'blocked', 'beyond')
+
+
+class Map(NamedTuple):
+    """Values are probabilities, NaN where unknown; `probability` is what the log loss is of, if there is one."""
+
+    title: str
+    grid: Grid
+    values: NDArray[Any]
+    probability: NDArray[Any] | None = None
+
+
+def maps_of(case: Case, tool: ModuleType) -> Iterator[Map]:
+    """Yield each way's map."""
+    maps = Mapper(Parameters()).run(case.readings)
+    yield Map('maximum likelihood map', maps.grid, np.where(maps.ml < 0, np.nan, maps.ml), maps.uncertainty)
+    yield Map('live map', maps.grid, maps.live, maps.live)
+    plain = Mapper(Parameters.from_flat(load_parameters(PAPER).values)).run(case.readings)
+    yield Map('paper, plain ML', plain.grid, np.where(plain.ml < 0, np.nan, plain.ml))
+    standard = Standard(case, tool)
+    for title, goal in (('standard, best F1', standard.f1), ('standard, best nav_iou', standard.nav_iou)):
+        grid, ml = standard.map(max(GAINS, key=goal))
+        yield Map(title, grid, np.where(ml < 0, np.nan, ml))
+
+
+def main() -> None:
+    """Run the benchmark."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument('names', nargs='*', default=NAMES, metavar='NAME')
+    tool = scoring_tool()
+    if tool is None:
+        sys.exit('without ../shared/tools/score_map.py there are no figures')
+    quality_worlds.RECORDINGS = tuple(parser.parse_args().names)
+    print(f'{"":38s}' + ''.join(f'{name:>10s}' for name in (*FIGURES, 'log_loss')))
+    for case in recorded_cases(tool):
+        path = tool.path_cells(case.path_xy, np.array(case.origin), case.resolution, case.truth.shape)
+
+        def figures(grid: Grid, values: NDArray[Any], case: Case = case, path: NDArray[Any] = path) -> dict[str, float]:
+            p = on_truth(values, grid, case, tool)
+            return dict(tool.score(p, case.truth, path, case.resolution, ROBOT_RADIUS))
+
+        for made in maps_of(case, tool):
+            scores = figures(made.grid, made.values)
+            row = ''.join(f'{scores[name]:10.3f}' for name in FIGURES)
+            loss = '-' if made.probability is None else f'{figures(made.grid, made.probability)["log_loss"]:.3f}'
+            print(f'{case.group:14s}{made.title:24s}{row}{loss:>10s}', flush=True)
+
+
+if __name__ == '__main__':
+    main()

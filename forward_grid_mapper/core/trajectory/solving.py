@@ -1,0 +1,143 @@
+"""Solving a drive: the pose graph of what straight walls say first, then with matches and places seen before.
+
+Straight walls come first, for local maps follow a bend of the drive and say nothing against it. With their help the
+nodes are right to some centimetres over some metres, and local maps sharp.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+
+from .heading import Heading
+from .loops import Loop, find_loops
+from .odometry_model import (
+    CALIBRATION,
+    CALIBRATION_SIGMA,
+    Noise,
+    calibrated,
+    covariances,
+    motions,
+    sensitivity,
+    with_yaw,
+)
+from .passes import Progress, again, ahead
+from .pose_graph import Edges, Graph, Solution, Walls, Yaws, joined, no_edges, solve
+from .poses import Floats
+from .scans import Scans
+from .wall_distances import Distances
+from .windows import Odometry, Windows
+
+WALL_ROUNDS = 3
+"""Times that distances of walls are measured anew where the nodes have moved to."""
+
+SAMPLES = 40
+"""Deviations that are drawn to know how far places may be off."""
+
+LARGEST_RESIDUAL = 5.0
+"""σ², in the mean over a loop, from which on it does not agree with the rest."""
+
+OF_MATCHES = 0.2
+"""What matches with what lies around count: the map that a block is matched with is off as the block is."""
+
+UNSEEN, LEAST_YAW = 2.0, math.radians(2.0)
+"""Times that the yaw drifts more than walls say, and radians a √metre at least: an echo votes with all others of three
+metres, and what drifts within these is not seen."""
+
+OF_WAYS = np.array([1.0, 1.0, 0.0, 0.0])
+"""The part of a calibration that is left where the yaw is known."""
+
+
+class Solver:
+    """What is known about a drive, and its solutions.
+
+    Parameters
+    ----------
+    odometry : Odometry
+    windows : Windows
+    scans : Scans
+    heading : Heading
+    say : callable
+        Receives a stage, and returns what receives how much of it is done.
+    """
+
+    def __init__(
+        self,
+        odometry: Odometry,
+        windows: Windows,
+        scans: Scans,
+        heading: Heading,
+        say: Callable[[str], Progress],
+    ) -> None:
+        self._odometry, self._windows, self._scans, self._heading = odometry, windows, scans, heading
+        self._say = say
+        drifts = heading.drifts
+        self.first_calibration = np.array([0.0, 0.0, drifts.bias, drifts.turn_scale])
+        self._change = sensitivity(odometry, windows)
+        motion = motions(odometry, windows) + self._change @ self.first_calibration
+        noise = Noise(yaw=max(LEAST_YAW, UNSEEN * drifts.noise))
+        information = np.asarray(np.linalg.inv(covariances(windows, noise)), np.float64)
+        count = np.arange(len(windows))
+        self._steps = Edges(count[:-1], count[1:], motion, information)
+        yaw = windows.node[heading.at, 2] + heading.measured
+        self._yaws = Yaws(heading.at, yaw, heading.information)
+
+    def calibration_of(self, solution: Solution) -> Floats:
+        """Return the whole calibration of the odometry, shape (4,)."""
+        return self.first_calibration + solution.calibration
+
+    def simple(self, calibration: Floats) -> Floats:
+        """Return the nodes of odometry with the heading of walls and a calibration, shape (K, 3)."""
+        w = self._windows
+        turned = with_yaw(self._odometry, w.node_progress[self._heading.at], self._heading.correction)
+        return calibrated(turned, calibration * OF_WAYS).at(w.node_stamp)
+
+    def along_walls(self) -> Solution:
+        """Return what odometry and straight walls say."""
+        self._say('straight walls')
+        nodes, calibration = self.simple(np.zeros(len(CALIBRATION))), np.zeros(len(CALIBRATION))
+        for k in range(WALL_ROUNDS):
+            walls = self._walls(nodes, k == WALL_ROUNDS - 1)
+            solution = solve(self._graph(no_edges(), walls), nodes, calibration, SAMPLES)
+            nodes, calibration = solution.nodes, solution.calibration
+        return solution
+
+    def with_matches(self, solution: Solution) -> tuple[Solution, list[Loop]]:
+        """Return what matches with local maps say as well, and the loops among them."""
+        loops: list[Loop] = []
+        for match, stage in ((ahead, 'matching'), (again, 'matching again')):
+            found = match(self._scans, solution.nodes, self._say(stage))
+            edges = found.edges()
+            edges = edges._replace(information=OF_MATCHES * edges.information)
+            walls = self._walls(solution.nodes, True)
+            solution = solve(self._graph(edges, walls), solution.nodes, solution.calibration, SAMPLES)
+            watch = self._say('places seen before')
+            loops = find_loops(self._scans, solution.nodes, solution.samples, found.usual, watch)
+            walls = self._walls(solution.nodes, True)
+            solution, loops = self._with_loops(walls, edges, loops, solution)
+        return solution, loops
+
+    def _walls(self, nodes: Floats, strict: bool) -> Walls:
+        return Distances(self._windows, self._scans.held_out, nodes).walls(strict)
+
+    def _graph(self, matches: Edges, walls: Walls) -> Graph:
+        return Graph(self._steps, self._change, CALIBRATION_SIGMA, matches, self._yaws, walls)
+
+    def _with_loops(
+        self, walls: Walls, matches: Edges, loops: list[Loop], start: Solution
+    ) -> tuple[Solution, list[Loop]]:
+        """Return the solution with those loops that agree with each other and with the rest."""
+        while True:
+            edges = joined(matches, *(loop.found.edges() for loop in loops))
+            solution = solve(self._graph(edges, walls), start.nodes, start.calibration, SAMPLES)
+            at, agree = len(matches.first), []
+            for loop in loops:
+                end = at + len(loop.found)
+                if solution.squared[at:end].mean() <= LARGEST_RESIDUAL:
+                    agree.append(loop)
+                at = end
+            if len(agree) == len(loops):
+                return solution, loops
+            loops = agree

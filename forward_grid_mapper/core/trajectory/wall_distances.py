@@ -1,0 +1,173 @@
+"""Straight walls as landmarks: how far nodes are from them, and which distances belong to one wall.
+
+An echo of range z from p touches a wall along n where n · p + z is the offset of the wall, and a cone hears the wall
+where n lies within it, wherever in the cone. So once the yaw is known the echoes of a metre of driving tell the
+distance of a wall along an axis to a centimetre or two. Distances that follow each other along the drive and put the
+wall in the same place are of one wall: it holds the drive straight, which local maps cannot, since a map that is bent
+as the drive is bent explains the readings just as well.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .pose_graph import Walls
+from .poses import Floats, compose, wrapped
+from .windows import Windows
+
+BLOCK = 3
+"""Windows whose echoes measure a distance together."""
+
+WIDTH = 0.06
+"""Metres that the echoes of one wall may differ by."""
+
+FEWEST = 3
+"""Echoes of a distance."""
+
+LEAST_TRAVEL = 0.25
+"""Metres of progress that these must be apart: a corner is heard from one place as a wall is."""
+
+FARTHEST = 5.0
+"""Metres; echoes from farther are seldom of a wall."""
+
+PEAKS = 2
+"""Distances of a block along one direction, at the most."""
+
+MARGIN = math.radians(0.5)
+"""Radians that the yaw may be off."""
+
+GATE, GATE_OF_SCALE = (0.08, 0.06), (0.04, 0.02)
+"""Metres by which a wall may seem to have moved since it was last measured, and that a metre nearer or farther, where
+the scale of odometry counts: at first, and once the nodes are known better."""
+
+GATE_PER_METRE = 0.03
+"""The same for a metre of progress without measuring it."""
+
+STEP, LONGEST_GAP = 1.2, 3.7
+"""Metres of progress between blocks, and those after which a wall is another one."""
+
+LEAST_SIGMA, FIRST_SIGMA = 0.015, 0.04
+"""σ of a distance at least, metres: cells and small things at the wall; and as long as the nodes are hardly known."""
+
+
+class Distances:
+    """Distances of nodes along the axes of the map, wall by wall not yet told apart.
+
+    Parameters
+    ----------
+    windows : Windows
+    held_out : bool, shape (K,)
+        Windows whose echoes do not count.
+    nodes : float64, shape (K, 3)
+        In a map whose walls lie along its axes.
+
+    Attributes
+    ----------
+    node, direction : int64, shape (D,)
+        Node, and direction in right angles from the x axis.
+    distance, lever, yaw : float64, shape (D,)
+        As in `pose_graph.Walls`.
+    """
+
+    def __init__(self, windows: Windows, held_out: NDArray[np.bool_], nodes: Floats) -> None:
+        self._windows, self._nodes = windows, nodes
+        readings, first = windows.readings, windows.first
+        self._usable = readings.echo & (readings.z < FARTHEST) & ~np.repeat(held_out, np.diff(first))
+        rows = [row for k in range(0, len(windows), BLOCK) for row in self._measured(k)]
+        table = np.array(rows, np.float64).reshape(-1, 5)
+        self.node, self.direction = table[:, 0].astype(np.int64), table[:, 1].astype(np.int64)
+        self.distance, self.lever, self.yaw = table[:, 2], table[:, 3], table[:, 4]
+
+    def _measured(self, k: int) -> list[tuple[float, ...]]:
+        """Return the rows of the block that begins at window k."""
+        w = self._windows
+        end = min(k + BLOCK, len(w))
+        middle = k + (end - k) // 2
+        which = np.arange(w.first[k], w.first[end])
+        which = which[self._usable[which]]
+        if len(which) < FEWEST:
+            return []
+        sensor = compose(w.corrected(w.progress[which], w.robot[which], self._nodes), w.mount[which])
+        at = self._nodes[middle]
+        rows: list[tuple[float, ...]] = []
+        for direction in range(4):
+            angle = direction * math.pi / 2
+            heard = np.abs(wrapped(sensor[:, 2] - angle)) <= w.readings.half_angle[which] + MARGIN
+            mine = which[heard]
+            off = sensor[heard, :2] - at[:2]
+            c, s = math.cos(angle), math.sin(angle)
+            distance, lever = off @ (c, s) + w.readings.z[mine], off @ (s, -c)
+            for same in agreeing(distance, w.progress[mine]):
+                rows.append((middle, direction, distance[same].mean(), lever[same].mean(), at[2]))
+        return rows
+
+    def tracked(self, strict: bool) -> NDArray[np.int64]:
+        """Return the number of the wall that each distance is of, shape (D,); `strict` where nodes are known well."""
+        gate, of_scale = GATE[strict], GATE_OF_SCALE[strict]
+        progress = self._windows.node_progress[self.node]
+        normal = normals_of(self.direction)
+        robot = (normal * self._nodes[self.node, :2]).sum(1)
+        place = robot + self.distance
+        out, count = np.zeros(len(place), np.int64), 0
+        last: list[dict[int, int]] = [{}, {}, {}, {}]
+        for i, direction in enumerate(self.direction.tolist()):
+            open_walls = last[direction]
+            for wall in [wall for wall, j in open_walls.items() if progress[i] - progress[j] > LONGEST_GAP]:
+                del open_walls[wall]
+            before = {wall: j for wall, j in open_walls.items() if self.node[j] < self.node[i]}
+            wall = min(before, key=lambda wall: abs(place[before[wall]] - place[i]), default=count)
+            if wall in before:
+                j = before[wall]
+                allowed = gate + GATE_PER_METRE * max(progress[i] - progress[j] - STEP, 0.0)
+                if abs(place[j] - place[i]) > allowed + of_scale * abs(robot[j] - robot[i]):
+                    wall = count
+            count += wall == count
+            out[i], open_walls[wall] = wall, i
+        return out
+
+    def walls(self, strict: bool) -> Walls:
+        """Return the walls that were measured more than once."""
+        wall = self.tracked(strict)
+        kept = np.bincount(wall, minlength=1)[wall] > 1
+        wall = np.unique(wall[kept], return_inverse=True)[1].astype(np.int64)
+        node, normal = self.node[kept], normals_of(self.direction[kept])
+        place = self._nodes[node, :2]
+        along = place[:, 1] * normal[:, 0] - place[:, 0] * normal[:, 1]
+        if len(wall):
+            along = along - (np.bincount(wall, along) / np.bincount(wall))[wall]
+        sigma = max(noise_of(wall, (normal * place).sum(1) + self.distance[kept]), 0.0 if strict else FIRST_SIGMA)
+        information = np.full(len(wall), sigma**-2)
+        return Walls(node, wall, normal, self.distance[kept], self.lever[kept], self.yaw[kept], along, information)
+
+
+def normals_of(direction: NDArray[np.int64]) -> Floats:
+    """Return the unit vectors of directions in right angles, shape (D, 2)."""
+    return np.array([(1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0)])[direction]
+
+
+def agreeing(distance: Floats, progress: Floats) -> list[NDArray[np.int64]]:
+    """Return the echoes, by number, of each distance on which enough of them agree, the most first."""
+    left, out = np.arange(len(distance)), []
+    for _ in range(PEAKS):
+        ordered = np.sort(distance[left])
+        together = np.searchsorted(ordered, ordered + WIDTH, side='right') - np.arange(len(ordered))
+        if together.max(initial=0) < FEWEST:
+            break
+        begin = ordered[together.argmax()]
+        same = left[(distance[left] >= begin) & (distance[left] <= begin + WIDTH)]
+        left = left[np.abs(distance[left] - distance[same].mean()) >= WIDTH]
+        if np.ptp(progress[same]) >= LEAST_TRAVEL:
+            out.append(same)
+    return out
+
+
+def noise_of(wall: NDArray[np.int64], place: Floats) -> float:
+    """Return the robust σ, metres, of where the distances of each wall put it, shapes (D,)."""
+    off = []
+    for number in np.flatnonzero(np.bincount(wall, minlength=1) > 2):
+        mine = place[wall == number]
+        off.append(np.abs(mine - np.median(mine)) * math.sqrt(len(mine) / (len(mine) - 1)))
+    return max(LEAST_SIGMA, 1.48 * float(np.median(np.concatenate(off)))) if off else FIRST_SIGMA

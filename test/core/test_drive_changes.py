@@ -1,0 +1,68 @@
+"""Places that drives contradict: a door that is shut in one of them is told, and nothing else is."""
+
+from __future__ import annotations
+
+import dataclasses
+from functools import cache
+
+import numpy as np
+import pytest
+
+from forward_grid_mapper.core.common.parameters import Parameters
+from forward_grid_mapper.core.common.readings import Readings, of_drives
+from forward_grid_mapper.core.drive_changes import change_warnings, changes
+from forward_grid_mapper.core.mapping import Mapper
+from forward_grid_mapper.simulation.drive import corridor_drive, drive
+from forward_grid_mapper.simulation.sonar import NOISY, front_array, sonar_ring
+from forward_grid_mapper.simulation.world import World, rooms_world
+
+DOOR = (5.85, 3.45)
+THROUGH = ((1.5, 1.5), (3.0, 3.45), (9.0, 3.45))
+UP_TO = ((1.5, 1.5), (3.0, 3.45), (5.0, 3.45), (4.0, 3.45), (5.1, 3.45))
+
+
+def shut(world: World) -> World:
+    """The same rooms with their door shut."""
+    leaf = np.array([[5.85, 2.9, 5.85, 4.0]])
+    return dataclasses.replace(
+        world, segments=np.concatenate([world.segments, leaf]), smooth=np.append(world.smooth, False)
+    )
+
+
+@cache
+def driven(open_door: bool, way: tuple[tuple[float, float], ...], seed: int, ring: bool = False) -> Readings:
+    world = rooms_world() if open_door else shut(rooms_world())
+    sonars = sonar_ring() if ring else front_array()
+    return drive(world, np.array(way), 0.1, sonars, NOISY, seed=seed).readings
+
+
+@pytest.mark.parametrize('order', [1, -1])
+def test_a_door_that_was_shut_in_one_drive_is_told(order: int) -> None:
+    drives = [driven(True, THROUGH, 0, True), driven(False, UP_TO, 1, True)][::order]
+    maps = Mapper(Parameters()).run(of_drives(drives))
+    found = changes(maps, 2)
+    assert found
+    for change in found:
+        assert change.drive == (1 if order == 1 else 0)
+        assert abs(change.x - DOOR[0]) < 0.5 and abs(change.y - DOOR[1]) < 0.8
+    (warning, *_) = change_warnings(maps, ['monday', 'tuesday'])
+    assert warning.startswith('something stood at x = 5.') and 'The map shows the place free' in warning
+
+
+@pytest.mark.parametrize('ring', [False, True])
+def test_drives_through_the_same_rooms_contradict_each_other_nowhere(ring: bool) -> None:
+    for seed in range(4):
+        ways = (THROUGH, THROUGH[::-1], UP_TO)
+        drives = [driven(True, way, 10 * seed + k, ring) for k, way in enumerate(ways)]
+        assert changes(Mapper(Parameters()).run(of_drives(drives)), 3) == []
+
+
+def test_a_person_who_walks_behind_the_robot_is_no_change() -> None:
+    """Smooth walls, lost echoes and a person, but not the same ones."""
+    maps = Mapper(Parameters()).run(of_drives([corridor_drive(seed).readings for seed in range(2)]))
+    assert changes(maps, 2) == []
+
+
+def test_one_drive_contradicts_nobody() -> None:
+    maps = Mapper(Parameters()).run(driven(True, THROUGH, 0))
+    assert change_warnings(maps, ['monday']) == [] == changes(maps, 1)

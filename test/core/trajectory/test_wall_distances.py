@@ -1,0 +1,142 @@
+"""Distances of straight walls: against plain Python, and in a corridor whose walls are known."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from forward_grid_mapper.core.common.readings import Readings
+from forward_grid_mapper.core.trajectory.poses import compose
+from forward_grid_mapper.core.trajectory.wall_distances import (
+    FEWEST,
+    FIRST_SIGMA,
+    LEAST_SIGMA,
+    LEAST_TRAVEL,
+    WIDTH,
+    Distances,
+    agreeing,
+    noise_of,
+    normals_of,
+)
+from forward_grid_mapper.core.trajectory.windows import Odometry, Windows, cut
+
+SIDES = np.radians([-90.0, 0.0, 90.0])
+LENGTH = 16.0
+
+
+def corridor(recess: float = 0.0, noise: float = 0.0) -> Windows:
+    """A straight drive between walls at y = −0.8 and 1.2, the second one set back from 8 m on; the end is at 18 m."""
+    rng = np.random.default_rng(2)
+    x = np.arange(0.0, LENGTH, 0.1)
+    stamp = (np.arange(len(x)) * 1e8).astype(np.int64)
+    rows = []
+    for at, when in zip(x.tolist(), stamp.tolist(), strict=True):
+        left = 1.2 + (recess if at > LENGTH / 2 else 0.0)
+        for number, (bearing, z) in enumerate(zip(SIDES, (0.8, 18.0 - at, left), strict=True)):
+            rows.append((at, bearing, min(z + rng.normal(0, 1) * noise, 6.0), when, number))
+    columns = np.array(rows)
+    readings = Readings.from_columns(
+        x=columns[:, 0],
+        y=0.0,
+        yaw=columns[:, 1],
+        z=columns[:, 2],
+        z_max=6.0,
+        half_angle=0.13,
+        stamp=columns[:, 3].astype(np.int64),
+        sensor=columns[:, 4].astype(np.int32),
+    )
+    return cut(readings, Odometry.of(stamp, np.column_stack([x, np.zeros((len(x), 2))])))
+
+
+def measured(windows: Windows, nodes: np.ndarray | None = None) -> Distances:
+    return Distances(windows, np.zeros(len(windows), bool), windows.node if nodes is None else nodes)
+
+
+def test_distances_are_those_of_the_walls() -> None:
+    windows = corridor(noise=0.01)
+    found = measured(windows)
+    for direction, wanted in ((1, 1.2), (3, 0.8)):
+        mine = found.direction == direction
+        assert mine.sum() > 10
+        assert found.distance[mine] == pytest.approx(wanted, abs=0.02)
+    # the end of the corridor counts from 5 m on
+    ahead = found.direction == 0
+    assert found.distance[ahead] == pytest.approx(18.0 - windows.node[found.node[ahead], 0], abs=0.02)
+    assert 2.0 < found.distance[ahead].min() < found.distance[ahead].max() < 5.0
+    assert not (found.direction == 2).any()
+
+
+def test_each_wall_is_one_and_one_that_is_set_back_is_another() -> None:
+    for recess, wanted in ((0.0, 3), (0.3, 4)):
+        walls = measured(corridor(recess)).walls(strict=True)
+        assert walls.total == wanted
+        sides = {tuple(normal) for normal in walls.normal.tolist()}
+        assert sides == {(0.0, 1.0), (0.0, -1.0), (1.0, 0.0)}
+        for number in range(walls.total):
+            mine = walls.wall == number
+            assert np.ptp(walls.places(corridor(recess).node)[mine]) < 1e-6
+            assert walls.along[mine].mean() == pytest.approx(0.0, abs=1e-9)
+
+
+def test_the_lever_is_the_change_with_the_yaw() -> None:
+    windows = corridor()
+    turn = 0.002
+    # all of the drive turned about each node in turn is what the lever tells of the echoes around that node
+    one = measured(windows)
+    for k in range(len(one.node)):
+        middle = windows.node[one.node[k]]
+        turned = compose(middle + np.array([0.0, 0.0, turn]), windows.node - middle)
+        other = measured(windows, turned)
+        same = (other.node == one.node[k]) & (other.direction == one.direction[k])
+        assert other.distance[same] - one.distance[k] == pytest.approx(turn * one.lever[k], abs=1e-5)
+    assert np.abs(one.lever).max() > 0.1
+
+
+def test_nodes_that_are_moved_measure_the_same_distances() -> None:
+    windows = corridor()
+    home = np.array([3.0, -1.0, math.pi / 2])
+    one, other = measured(windows), measured(windows, compose(home, windows.node))
+    first, second = (np.lexsort(((d.direction + more) % 4, d.node)) for d, more in ((one, 1), (other, 0)))
+    assert np.array_equal((one.direction[first] + 1) % 4, other.direction[second])
+    assert one.distance[first] == pytest.approx(other.distance[second], abs=1e-9)
+
+
+def test_held_out_windows_measure_nothing() -> None:
+    windows = corridor()
+    assert len(Distances(windows, np.ones(len(windows), bool), windows.node).node) == 0
+    assert Distances(windows, np.ones(len(windows), bool), windows.node).walls(strict=False).total == 0
+
+
+def test_agreeing_echoes_are_those_of_plain_python() -> None:
+    rng = np.random.default_rng(4)
+    for _ in range(50):
+        distance = np.round(rng.choice([1.0, 2.0, 2.1], 14) + rng.normal(0, 0.04, 14), 4)
+        progress = rng.uniform(0, 1, 14)
+        first = agreeing(distance, progress)
+        best = max(int(((distance >= d) & (distance <= d + WIDTH)).sum()) for d in distance)
+        if best < FEWEST:
+            assert first == []
+        for same in first:
+            assert len(same) >= FEWEST
+            assert np.ptp(distance[same]) <= WIDTH
+            assert np.ptp(progress[same]) >= LEAST_TRAVEL
+        if first and len(first) == 2:
+            assert len(first[0]) == best
+            assert not set(first[0]) & set(first[1])
+
+
+def test_noise_is_told_from_what_each_wall_says() -> None:
+    rng = np.random.default_rng(6)
+    wall = np.repeat(np.arange(40), 8)
+    place = wall * 1.7 + rng.normal(0, 0.03, len(wall))
+    place[::25] += 1.0
+    assert noise_of(wall, place) == pytest.approx(0.03, rel=0.2)
+    assert noise_of(wall, wall * 1.0) == LEAST_SIGMA
+    assert noise_of(np.arange(5), np.arange(5.0)) == FIRST_SIGMA
+
+
+def test_normals_are_right_angles() -> None:
+    angle = np.arange(4) * math.pi / 2
+    assert normals_of(np.arange(4)) == pytest.approx(np.stack([np.cos(angle), np.sin(angle)], 1))

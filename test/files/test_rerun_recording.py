@@ -1,0 +1,138 @@
+"""The recording for Rerun: read back it is the maps and the readings, it is bounded, and the extra is named."""
+
+from __future__ import annotations
+
+import dataclasses
+import subprocess
+import sys
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from made_maps import made_maps
+
+from forward_grid_mapper.core.common.errors import MapperError
+from forward_grid_mapper.core.common.parameters import Parameters
+from forward_grid_mapper.core.mapping import Mapper
+from forward_grid_mapper.core.maps.map_set import MapSet
+from forward_grid_mapper.core.maps.reading_causes import CAUSES, likeliest_causes
+from forward_grid_mapper.files import rerun_recording
+from forward_grid_mapper.files.map_files import occupancy_values
+from forward_grid_mapper.files.rerun_recording import write_rerun
+from forward_grid_mapper.simulation.drive import corridor_drive
+
+PATH = np.array([[0.0, 0.0], [1.0, 0.5], [np.nan, np.nan], [2.0, 0.0], [3.0, 0.0]])
+
+
+@cache
+def drive() -> MapSet:
+    """A drive along a corridor with smooth walls."""
+    return Mapper(Parameters()).run(corridor_drive(0).readings)
+
+
+def written(folder: Path, maps: MapSet, **options: Any) -> dict[str, dict[str, list[Any]]]:
+    """What is in the recording of these maps: columns by entity."""
+    rerun = pytest.importorskip('rerun', reason='the extra rerun is not installed')
+    from rerun.chunk import RrdReader
+
+    rerun.set_strict_mode(True)
+    path = folder / 'drive.rrd'
+    write_rerun(path, maps, 'the report\n', 'a drive', PATH, **options)
+    found: dict[str, dict[str, list[Any]]] = {}
+    for chunk in RrdReader(path).store().stream().to_chunks():
+        batch = chunk.to_record_batch()
+        columns = found.setdefault(chunk.entity_path, {})
+        for name in batch.schema.names:
+            values = batch[name]
+            stamped = name in ('time', 'log_time')
+            columns.setdefault(name, []).extend(values.cast('int64').to_pylist() if stamped else values.to_pylist())
+    return found
+
+
+def column(entity: dict[str, list[Any]], end: str) -> list[Any]:
+    """The rows of the component whose name ends so."""
+    (name,) = [name for name in entity if name.endswith(end)]
+    return [row for row in entity[name] if row is not None]
+
+
+def grid(entity: dict[str, list[Any]], row: int, shape: tuple[int, int]) -> Any:
+    """A map of an entity as cells, its first row that with the smallest y."""
+    return np.array(column(entity, 'GridMap:data')[row][0], np.uint8).astype(np.int8).reshape(shape)[::-1]
+
+
+def test_it_holds_the_maps(tmp_path: Path) -> None:
+    maps = drive()
+    found = written(tmp_path, maps)
+    for name, values in (('maximum_likelihood', maps.ml), ('uncertainty', maps.uncertainty)):
+        np.testing.assert_array_equal(grid(found[f'/map/{name}'], 0, maps.grid.shape), occupancy_values(values))
+    standard = found['/map/standard']
+    order = np.argsort(standard['time'])
+    assert len(order) == rerun_recording.MOST_MOMENTS + 1
+    assert (grid(standard, order[0], maps.grid.shape) == -1).all()
+    np.testing.assert_array_equal(grid(standard, order[-1], maps.grid.shape), occupancy_values(maps.live))
+    assert column(standard, 'cell_size')[0][0] == pytest.approx(maps.grid.resolution)
+    assert column(standard, 'translation')[0][0][:2] == pytest.approx(maps.grid.origin, abs=1e-6)
+    assert len(column(found['/robot/path'], 'strips')[0]) == 2
+    assert column(found['/report'], 'text') == [['the report\n']]
+
+
+def test_it_holds_the_readings_by_sensor_and_cause(tmp_path: Path) -> None:
+    maps = drive()
+    readings, causes, found = maps.readings, likeliest_causes(maps), written(tmp_path, maps)
+    for k, name in enumerate(readings.sensor_names):
+        mine = readings.sensor == k
+        strips = column(found[f'/sonar/{name}'], 'strips')
+        assert len(strips) == mine.sum()
+        ranges = [row[0] for row in column(found[f'/range/{name}'], 'scalars')]
+        np.testing.assert_allclose(ranges, readings.z[mine])
+        first = readings.select(mine)
+        np.testing.assert_allclose(strips[0][0][0][:2], [first.x[0], first.y[0]], atol=1e-5)
+        reach = [np.hypot(x - first.x[0], y - first.y[0]) for x, y, _ in strips[0][0][1:-1]]
+        np.testing.assert_allclose(reach, first.z[0], atol=1e-4)
+        for number, cause in enumerate(CAUSES):
+            these = readings.select(mine & (causes == number))
+            dots = column(found.get(f'/readings/{cause}/{name}', {':positions': []}), ':positions')
+            dots = [dot for row in dots for dot in row]
+            assert len(dots) == len(these)
+            if dots:
+                np.testing.assert_allclose(
+                    [dot[:2] for dot in dots],
+                    np.stack([these.x + these.z * np.cos(these.yaw), these.y + these.z * np.sin(these.yaw)], 1),
+                    atol=1e-4,
+                )
+
+
+def test_it_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    maps = drive()
+    assert len(maps.readings) == 12_000
+    written(tmp_path, maps)
+    assert (tmp_path / 'drive.rrd').stat().st_size < 5_000_000
+    monkeypatch.setattr(rerun_recording, 'MOST_READINGS', 500)
+    monkeypatch.setattr(rerun_recording, 'MOST_CELLS', 3 * maps.grid.size)
+    found = written(tmp_path, maps)
+    assert len(found['/map/standard']['time']) == 3 + 1
+    shown = sum(len(column(entity, 'strips')) for name, entity in found.items() if name.startswith('/sonar/'))
+    assert 400 < shown <= 500
+
+
+@pytest.mark.parametrize('readings', [0, 10])
+def test_few_readings_and_odd_names(tmp_path: Path, readings: int) -> None:
+    maps = made_maps(readings=readings)
+    odd = dataclasses.replace(maps.readings, sensor_names=('a/b c\n', ''))
+    found = written(tmp_path, dataclasses.replace(maps, readings=odd))
+    cones = [name for name in found if name.startswith('/sonar/')]
+    assert len(cones) == (2 if readings else 0)
+
+
+def test_without_rerun_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, 'rerun', None)
+    with pytest.raises(MapperError, match=r'pip install "forward_grid_mapper\[rerun\]"'):
+        write_rerun(tmp_path / 'drive.rrd', made_maps(), '', '')
+    assert not list(tmp_path.iterdir())
+
+
+def test_it_is_imported_only_where_it_is_used() -> None:
+    program = 'import sys, forward_grid_mapper.commands.process_bag; sys.exit("rerun" in sys.modules)'
+    assert subprocess.run([sys.executable, '-c', program], check=False).returncode == 0
