@@ -71,7 +71,7 @@ def turned(readings: Readings) -> Readings:
 @pytest.mark.parametrize('values', [PLAIN, {}], ids=['paper', 'defaults'])
 # the same examples each time: in one of some hundred, two moves of the search gain the same in whole numbers
 @settings(max_examples=12, deadline=None, derandomize=True)
-@given(seed=st.integers(0, 2**32 - 1), count=st.integers(1, 500))
+@given(seed=st.integers(0, 2**31 - 1), count=st.integers(1, 500))
 def test_mirrored_or_turned_readings_give_the_mirrored_or_turned_maps(
     values: dict[str, float], seed: int, count: int
 ) -> None:
@@ -140,7 +140,7 @@ def test_where_the_robot_stands_is_free_before_it_moves() -> None:
     assert maps.uncertainty[place].max() < 0.1
 
 
-@pytest.mark.parametrize('exponent', [0.4, 1.0])
+@pytest.mark.parametrize('exponent', [0.7, 1.0])
 def test_the_objective_is_the_tempered_likelihood_and_the_prior_of_the_map_that_was_found(
     exponent: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:

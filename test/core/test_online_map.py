@@ -87,7 +87,8 @@ def test_a_grid_that_grows_in_the_middle_loses_nothing(monkeypatch: pytest.Monke
     monkeypatch.setattr(online_map, 'REFINE_LEAST', math.inf)
     near = some()
     away = dataclasses.replace(near, x=near.x + 25.0, y=near.y - 18.0, stamp=near.stamp + 10**12)
-    online = in_sweeps(near, Parameters())
+    # few readings, which say enough for walls
+    online = in_sweeps(near, Parameters.from_flat({'p_rand': 0.3, 'p_lost': 0.4}))
     grid, before = online.maps()[:2]
     room = online._evidence.grid
     traversed = online._traversed.copy()
