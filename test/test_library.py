@@ -245,3 +245,35 @@ def test_steep_sensors_are_rejected_in_words() -> None:
         make_maps(**{**arrays, 'sensors': dict.fromkeys(arrays['sensors'], steep)})
     with pytest.raises(InputError, match=r'did you mean radians\(30\)'):
         Sonar(0.0, 0.0, 0.0, 0.3, 4.0, pitch=30.0)
+
+
+@pytest.mark.parametrize(
+    ('degrees', 'speed', 'width'), [(30, 0.25, 0.9), (15, 0.25, 0.7), (15, 0.25, 0.9), (30, 0.1, 0.9), (30, 0.25, 1.2)]
+)
+@pytest.mark.parametrize('seed', range(3))
+def test_a_door_that_readings_without_echo_alone_show_is_open(
+    degrees: float, speed: float, width: float, seed: int
+) -> None:
+    """A sonar of 3 m hears nothing through an open door to a hall: some twenty such readings must do."""
+    t = np.arange(0.0, 5.0 / speed, 0.1)
+    x = speed * t
+    ahead = np.where(6.0 - x - 0.1 < 3.0, 6.0 - x - 0.1, math.inf)
+    # a cone meets the jambs until it fits the opening
+    fits = abs(x - 2.85) < width / 2 - 0.9 * math.tan(math.radians(degrees / 2))
+    left, right = np.where(fits, math.inf, 0.9), np.full_like(x, 0.9)
+    cone = {'field_of_view': math.radians(degrees), 'max_range': 3.0}
+    sensors = {
+        'ahead': Sonar(x=0.1, y=0.0, yaw=0.0, **cone),
+        'left': Sonar(x=0.0, y=0.1, yaw=math.pi / 2, **cone),
+        'right': Sonar(x=0.0, y=-0.1, yaw=-math.pi / 2, **cone),
+    }
+    ranges = np.concatenate([ahead, left, right])
+    ranges += np.random.default_rng(seed).normal(0.0, 0.02, len(ranges))
+    poses = np.column_stack([x, np.zeros_like(x), np.zeros_like(x)])
+    found = make_maps(t, poses, np.tile(t, 3), ranges, sensors, np.repeat(list(sensors), len(t)).tolist())
+    maps = found.maps
+    rows, columns = maps.grid.cells_of(np.full(3, 2.85), np.array([0.9, 1.0, 1.1]))
+    assert (maps.ml[rows, columns] != 1).all()
+    assert maps.uncertainty[rows, columns].max() < 0.2
+    rows, columns = maps.grid.cells_of(np.array([1.5, 4.5]), np.full(2, 1.0))
+    assert (maps.ml[rows, columns] == 1).all()

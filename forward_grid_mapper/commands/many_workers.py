@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import math
+import re
 import shutil
 import sys
 import time
@@ -15,6 +16,7 @@ from typing import Any
 from ..core.common.errors import ParameterError
 from ..core.common.parameters import Parameters
 from ..core.messages.message_types import Pose2
+from ..core.runtime.threads import cores
 from ..files.output_folder import free_name, output_folder, readable
 from ..recordings.drive import Part
 from ..recordings.drives import without_repetition
@@ -29,6 +31,9 @@ MEMORY = 2.0
 
 LEAST_MEMORY = 0.5
 """Gigabytes that a worker takes before it holds anything, and as much again."""
+
+WORKERS_A_CORE = 4
+"""Beyond, they only take each other's time and memory."""
 
 RESERVED = 0.6e9
 """Bytes of a worker that are not for pairs of cells and readings: Python, kernels and the readings of a tile."""
@@ -129,8 +134,12 @@ def _check(options: argparse.Namespace) -> None:
     """Check options that only make sense together, or not together."""
     if options.workers is not None and options.workers < 1:
         raise ParameterError('--workers must be a positive number')
+    if options.workers is not None and options.workers > (most := max(WORKERS_A_CORE * cores(), 8)):
+        raise ParameterError(f'--workers {options.workers}: this machine has {cores()} cores; give at most {most}')
     if options.workers is not None and options.scheduler is not None:
         raise ParameterError('--scheduler has workers of its own; leave out --workers')
+    if options.scheduler is not None and not re.fullmatch(r'(tcp|tls|ws|wss|ucx)://[^\s/]+:\d+', options.scheduler):
+        raise ParameterError(f'--scheduler {options.scheduler!r} is no address of a scheduler: give tcp://HOST:8786')
     memory = options.memory_per_worker
     if memory is not None and not (math.isfinite(memory) and memory >= LEAST_MEMORY):
         raise ParameterError(f'--memory-per-worker {memory:g}: give gigabytes, {LEAST_MEMORY:g} or more')

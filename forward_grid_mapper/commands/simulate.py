@@ -42,7 +42,7 @@ def parser() -> argparse.ArgumentParser:
         COMMAND,
         description='Record a simulated drive: a bag of sonar Range and Odometry, the true map (reference.yaml) and '
         "the robot's path (trajectory.csv).",
-        epilog='example: simulate corridor --passes 3 --drift wheels -o drifting',
+        epilog='example: simulate corridor --drift wheels -o drifting',
     )
     made.add_argument(
         'world',

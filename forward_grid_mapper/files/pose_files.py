@@ -132,7 +132,7 @@ def _columns(path: Path | str, header: Sequence[str]) -> dict[str, int]:
 
 def _lines(path: Path | str) -> list[str]:
     try:
-        return Path(path).read_text(encoding='utf-8').splitlines()
+        return Path(path).read_text(encoding='utf-8-sig').splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f'{path} cannot be read: {error}') from None
 

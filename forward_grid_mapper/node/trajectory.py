@@ -37,6 +37,9 @@ GROWS = 0.5
 LONGEST_STEP = 1.0
 """Metres between two looks at odometry that are driving; more is a jump."""
 
+LEAST_EVERY = 1.0
+"""Metres between two runs that the node begins by itself, so that there is time for run_em between them."""
+
 GROWN = 0.1
 """Part of the drive that must be new for the node to refine by itself: a run looks at all of it, so that runs after
 equal ways would cost more and more."""
@@ -199,7 +202,7 @@ class Trajectory:
         every = self._parameters.node.refine_every
         if not every or not self._parameters.node.refine_poses:
             return
-        if self.driven - self._refined_at >= max(every, GROWN * self.driven) and self.refine():
+        if self.driven - self._refined_at >= max(every, LEAST_EVERY, GROWN * self.driven) and self.refine():
             self._refined_at = self.driven
 
     def _show_path(self) -> None:

@@ -117,7 +117,7 @@ class ModelParameters:
     """The forward sensor model: why a reading is what it is.
 
     p_rand and p_lost are larger than those of any one sonar, and no estimates: together they bound what a single
-    reading can say to about a nat and a half, and one without echo to a tenth of a nat (`sensor.bounds`). So no wall
+    reading can say to about a nat and a half, and one without echo to a seventh of a nat (`sensor.bounds`). So no wall
     hangs on one reading, and smooth walls, which many readings meet without an echo, stand by the few that heard them.
     """
 
@@ -128,9 +128,9 @@ class ModelParameters:
         0.01,
         0.98,
     )
-    p_rand: float = _param(0.3, 'Probability that a reading is random, whatever the map.', 'probability', 1e-4, 0.95)
+    p_rand: float = _param(0.4, 'Probability that a reading is random, whatever the map.', 'probability', 1e-4, 0.95)
     p_lost: float = _param(
-        0.65,
+        0.52,
         "Probability that the echo is lost, whatever the map, as off smooth walls; 0 is the paper's model.",
         'probability',
         0.0,

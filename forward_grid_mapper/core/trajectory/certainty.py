@@ -21,7 +21,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -30,6 +29,7 @@ from numpy.typing import NDArray
 from ..common.parameters import Parameters
 from ..common.readings import Readings
 from .holding_out import blocks_of, foreseen, held_out
+from .local_map import for_matching
 from .odometry_model import CALIBRATION, calibrated, with_yaw
 from .poses import Floats, wrapped
 from .scans import Scans
@@ -151,7 +151,7 @@ def of_ways(
     stop: NDArray[np.uint8],
 ) -> dict[str, Told]:
     """Return scale and heading as readings tell them; what they do not tell is left out."""
-    parameters = replace(parameters, grid=replace(parameters.grid, resolution=0.1))
+    parameters = for_matching(parameters)
     every = max(int(len(readings) / max(DENSITY * odometry.travel[-1], 1.0)), 1)
     windows = cut(thinned(readings, every), odometry)
     scans = Scans(windows, parameters, stop, np.zeros_like(held_out(len(windows))))

@@ -29,6 +29,13 @@ OCCUPIED, FREE = 1 / (1 + math.exp(-3.0)), 1 / (1 + math.exp(4.0))
 UNKNOWN = 0.06
 """Probability of cells that it does not know: the usual fraction of occupied cells."""
 
+RESOLUTION = 0.1
+"""Metres; matches are made on cells of one size, whatever size the maps are to have."""
+
+MODEL = {'p_hit': 0.7, 'p_rand': 0.4, 'p_lost': 0.42}
+"""The sensor model of matches, whatever that of the maps is. With it the errors that matches state are the real ones;
+that of the maps lets a reading say less, since a wall must not hang on one."""
+
 
 class LocalMap(NamedTuple):
     """Probabilities of a local map; what lies outside is unknown.
@@ -57,6 +64,12 @@ class LocalMap(NamedTuple):
     normal_y: NDArray[np.float32]
     cos2_limit: float
     unknown: float
+
+
+def for_matching(parameters: Parameters) -> Parameters:
+    """Return the parameters that scans are matched with: those of the maps but for `RESOLUTION` and `MODEL`."""
+    grid, model = replace(parameters.grid, resolution=RESOLUTION), replace(parameters.model, **MODEL)
+    return replace(parameters, grid=grid, model=model)
 
 
 def at_poses(readings: Readings, poses: Floats) -> Readings:

@@ -21,7 +21,7 @@ from ..common.readings import Readings
 from ..runtime.cancelling import check
 from .heading import NOISES, Heading, heading
 from .holding_out import Gain, blocks_of, foreseen, gain, held_out, held_out_blocks
-from .local_map import at_poses
+from .local_map import at_poses, for_matching
 from .odometry_model import CALIBRATION
 from .passes import BLOCK
 from .poses import Floats, compose, inverse, relative
@@ -29,10 +29,6 @@ from .scans import Scans
 from .solving import Solver
 from .walls import wall_votes
 from .windows import Odometry, Windows, corrected, cut
-
-OF_MATCHES = {'p_hit': 0.7, 'p_rand': 0.4, 'p_lost': 0.42}
-"""The sensor model that scans are matched with, whatever that of the maps is. With it the errors that matches state
-are the real ones; that of the maps lets a reading say less, since a wall must not hang on one."""
 
 SHORTEST = 8.0
 """Metres of a drive below which nothing is refined: its drift is small, and there is little to judge it by."""
@@ -121,9 +117,7 @@ class Refiner:
 
     def __init__(self, parameters: Parameters) -> None:
         """Prepare runs with these parameters; the search and σ are those of the maps."""
-        # matches are made on cells of one size, whatever size the maps are to have
-        grid, model = replace(parameters.grid, resolution=0.1), replace(parameters.model, **OF_MATCHES)
-        self._parameters = replace(parameters, grid=grid, model=model)
+        self._parameters = for_matching(parameters)
         self._stop = np.zeros(1, np.uint8)
         self._watch: Watch = lambda stage, part: None
 

@@ -9,7 +9,6 @@ fine, with steps of the yaw that move the readings as far as those of the place 
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -21,7 +20,7 @@ from ..messages.reading_buffer import bounded
 from ..sensor.density import hit_probability
 from .holding_out import Gain, gain
 from .likelihood import Scan, make_scan, scores
-from .local_map import UNKNOWN, LocalMap, at_poses, local_map
+from .local_map import UNKNOWN, LocalMap, at_poses, for_matching, local_map
 from .matching import grid_around
 from .poses import Floats, compose, relative
 
@@ -86,8 +85,7 @@ def register(
     Cancelled
         If `stop` was set.
     """
-    # as trajectories are found: on cells of one size, whatever size the maps are to have
-    parameters = replace(parameters, grid=replace(parameters.grid, resolution=0.1))
+    parameters = for_matching(parameters)
     model, resolution = parameters.model, parameters.grid.resolution
     around = local_map(bounded(others, ON_MAP), parameters, stop)
     readings = readings.select(np.argsort(readings.stamp, kind='stable'))

@@ -27,9 +27,10 @@ def test_with_the_defaults_no_reading_says_more_than_a_few_nats() -> None:
     bounds = reading_bounds(Parameters().model, 0.1, 5.0)
     assert 1.0 < bounds.echo_for < 3.0
     assert -3.0 < bounds.echo_against_wall < bounds.echo_against_cell < -0.5
-    # smooth walls are met without an echo by ten readings and more for each that hears them
-    assert bounds.echo_for > -10 * bounds.silence_against_wall
-    assert -1.0 < bounds.silence_against_wall < bounds.silence_against_cell < 0.0
+    # smooth walls are met without an echo by several readings for each that hears them; a door that is shown by such
+    # readings alone must open all the same
+    assert bounds.echo_for > -5 * bounds.silence_against_wall
+    assert -1.0 < bounds.silence_against_wall < bounds.silence_against_cell < -0.05
     # three echoes outweigh the ends of a wall, two do not
     assert 2 * bounds.echo_for < 2 * Parameters().search.end_cost < 3 * bounds.echo_for
 
