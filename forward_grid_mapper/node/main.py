@@ -104,7 +104,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if left:
         print(f'mapper: error: {complaints.of_arguments(left)}\n{USAGE}', file=sys.stderr)
         return 2
-    node = None
+    node = executor = None
     try:
         node = MapperNode()
         executor = SingleThreadedExecutor()
@@ -126,6 +126,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if node is not None:
             node.close()
             node.destroy_node()
+        if executor is not None:
+            # or else it finds, when it is collected, that ROS is gone, and prints a traceback
+            executor.shutdown(0.0)
         rclpy.try_shutdown()
     code = 0
     if node is not None and node.failure:
