@@ -186,20 +186,23 @@ def _told(
 def _fitted(outcomes: list[Refinement], parameters: Parameters) -> tuple[list[Refinement], list[str]]:
     """Return the outcomes with the drives that moved where they fit the others, and in words by how much that is.
 
-    Those that odometry keeps are where the map is to be; without any, the first drive is.
+    Those that odometry keeps are where the map is to be, unless their heading was lost; without any, the first drive
+    that moved is.
     """
     out, words = list(outcomes), [''] * len(outcomes)
-    placed = [k for k, outcome in enumerate(outcomes) if not outcome.accepted] or [0]
-    for k, outcome in enumerate(outcomes):
+    moved = [k for k, outcome in enumerate(outcomes) if outcome.accepted]
+    placed = [k for k, outcome in enumerate(outcomes) if not outcome.accepted and not outcome.lost] or moved[:1]
+    for k in moved:
         if k in placed:
             continue
+        outcome = outcomes[k]
         others = of_drives([out[other].readings for other in placed])
         begin = outcome.trajectory.pose[0]
         found = register(outcome.readings, begin, others, parameters, np.zeros(1, np.uint8))
         if found.begin is not begin:
             trajectory = replace(outcome.trajectory, pose=moved_to(found.begin, outcome.trajectory.pose))
-            moved = readings_moved(outcome.readings, begin, found.begin)
-            out[k] = replace(outcome, trajectory=trajectory, readings=moved)
+            there = readings_moved(outcome.readings, begin, found.begin)
+            out[k] = replace(outcome, trajectory=trajectory, readings=there)
             x, y, yaw = relative(begin, found.begin).tolist()
             words[k] = f'turned by {math.degrees(yaw):+.1f}° and moved by {math.hypot(x, y):.2f} m to fit the others'
         placed.append(k)

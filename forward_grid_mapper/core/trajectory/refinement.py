@@ -99,6 +99,9 @@ class Refinement:
         Places that were recognised.
     gain : float
         Nats by which a reading is foreseen better.
+    lost : bool
+        Whether odometry is off by so much that its heading could not be followed: then it stays, but nothing should be
+        fitted to it.
     """
 
     accepted: bool
@@ -110,6 +113,7 @@ class Refinement:
     turned: float = 0.0
     loops: int = 0
     gain: float = 0.0
+    lost: bool = False
 
 
 class Refiner:
@@ -155,7 +159,7 @@ class Refiner:
                 f'the heading was lost somewhere: that it is not off by a right angle is only {walls.certainty:.0%} '
                 f'certain'
             )
-            return Refinement(False, reason, readings, odometry, {})
+            return Refinement(False, reason, readings, odometry, {}, lost=True)
         solver = Solver(odometry, windows, scans, walls, self._say)
         along = solver.along_walls()
         calibration = solver.calibration_of(along)
