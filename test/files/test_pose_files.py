@@ -68,3 +68,11 @@ def test_a_file_that_cannot_be_read_is_named(tmp_path: Path) -> None:
     (tmp_path / 'poses.csv').write_bytes(b'\xff\xfe\x00')
     with pytest.raises(InputError, match='cannot be read'):
         poses_from_csv(tmp_path / 'poses.csv')
+
+
+def test_the_mark_that_spreadsheets_begin_a_file_with_is_no_part_of_a_name(tmp_path: Path) -> None:
+    file = tmp_path / 'poses.csv'
+    file.write_text('stamp,x,y,yaw\n1.5,1,2,0.5\n2.5,2,2,0.5\n', encoding='utf-8-sig')
+    stamps, poses = poses_from_csv(file)
+    assert stamps.tolist() == [1.5, 2.5]
+    assert poses.tolist() == [[1, 2, 0.5], [2, 2, 0.5]]

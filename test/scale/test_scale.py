@@ -319,6 +319,10 @@ def test_without_the_extra_it_says_what_to_install(
     ('options', 'told'),
     [
         (('--workers', 0), '--workers'),
+        (('--workers', 100_000), 'cores; give at most'),
+        (('--scheduler', 'nonsense'), 'is no address of a scheduler'),
+        (('--scheduler', 'http://localhost:8786'), 'is no address of a scheduler'),
+        (('--scheduler', ''), 'is no address of a scheduler'),
         (('--workers', 2, '--scheduler', 'tcp://a:1'), 'leave out --workers'),
         (('--workers', 2, '--memory-per-worker', 0.1), '--memory-per-worker'),
         (('--workers', 2, '--refine-poses'), '--refine-poses'),
