@@ -373,7 +373,10 @@ def begin(robot: Inside) -> None:
     robot.until(lambda: robot.node.trajectory._at is not None)
 
 
-def test_it_refines_by_itself_after_some_way(inside: Callable[..., Inside], quick: Any) -> None:
+def test_it_refines_by_itself_after_some_way(
+    inside: Callable[..., Inside], quick: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(trajectory, 'LEAST_EVERY', 0.1)
     robot = inside(refine_poses=True, refine_every=0.1).start()
     node = robot.node
     begin(robot)
@@ -394,6 +397,14 @@ def test_it_refines_by_itself_after_some_way(inside: Callable[..., Inside], quic
     # a service call begins the way anew
     assert robot.call(node.em.run_em)[0]
     assert node.trajectory.driven - node.trajectory._refined_at < 0.05
+
+
+def test_it_does_not_refine_at_every_step(inside: Callable[..., Inside], quick: Any) -> None:
+    robot = inside(refine_poses=True, refine_every=1e-9).start()
+    begin(robot)
+    robot.drive(1, 100)
+    robot.until(lambda: robot.node.trajectory.driven > 0.095)
+    assert robot.node.em.current is None and robot.node.em.maps is None
 
 
 @pytest.mark.parametrize('options', [{}, {'refine_every': 0.05}])

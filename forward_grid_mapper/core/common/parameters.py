@@ -316,7 +316,8 @@ class NodeParameters:
     refine_every: float = _param(
         0.0,
         'With refine_poses, metres driven after which the node runs EM by itself, so that the transform from map to '
-        'odom follows the drift; later runs wait until the drive has grown by a tenth. 0: only when run_em is called.',
+        'odom follows the drift, a metre at least; later runs wait until the drive has grown by a tenth. 0: only when '
+        'run_em is called.',
         'm',
         0.0,
         1e6,
