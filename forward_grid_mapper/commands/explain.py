@@ -209,7 +209,16 @@ def _what_decides(maps: MapArchive, found: CellEvidence, state: int) -> str:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; return its exit code."""
     given = sys.argv[1:] if arguments is None else arguments
-    return run(parser(), explain, [_positional(word) for word in given])
+    return run(parser(), explain, [_positional(part) for word in given for part in _parted(word)])
+
+
+def _parted(word: str) -> list[str]:
+    """Return the two numbers of a place such as 3.0,1.0, and any other word as it is."""
+    parts = word.split(',')
+    try:
+        return parts if len([float(part) for part in parts]) == 2 else [word]
+    except ValueError:
+        return [word]
 
 
 def _positional(word: str) -> str:

@@ -144,3 +144,13 @@ def test_a_pipe_is_not_waited_for(maps: Path, tmp_path: Path, name: str, capsys:
     os.mkfifo(tmp_path / name)
     assert code_of(explain.main, tmp_path, 0, 0) == 1
     assert f'{name} is no file' in capsys.readouterr().err
+
+
+def test_a_place_may_have_a_comma(maps: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert code_of(explain.main, maps, 3.0, 4.0) == 0
+    apart = capsys.readouterr().out
+    assert code_of(explain.main, maps, '3.0,4.0') == 0
+    assert capsys.readouterr().out == apart
+    for wrong in ('3.0,', '-3.0,4.0', '3.0,nan', 'a,b', '1,2,3'):
+        assert code_of(explain.main, maps, wrong) != 0
+        assert 'explain: error' in capsys.readouterr().err
