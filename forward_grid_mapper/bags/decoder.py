@@ -34,13 +34,19 @@ class Decoder:
 
     Where the bag holds no definition, those of Jazzy and Humble are tried: `sensor_msgs/Range` gained `variance` in
     between, and the length of a message shows which of the two it is.
+
+    Attributes
+    ----------
+    msgtype : str
+    ros1 : bool
+        Whether messages are in ROS 1's encoding.
     """
 
     def __init__(self, msgtype: str, encoding: str, definition_format: str, definition: str) -> None:
-        self._msgtype = msgtype
-        self._ros1 = encoding == 'ros1'
+        self.msgtype = msgtype
+        self.ros1 = encoding == 'ros1'
         embedded = _embedded_store(msgtype, definition_format, definition)
-        self._stores = [embedded] if embedded else default_stores(ros1=self._ros1)
+        self._stores = [embedded] if embedded else default_stores(ros1=self.ros1)
 
     def __call__(self, data: bytes) -> Any:
         """Return the message.
@@ -57,9 +63,19 @@ class Decoder:
                 continue
         return self._decode(self._stores[-1], data)
 
+    def fitting(self, data: bytes) -> Any:
+        """Return the store whose definition decodes a message; None if none does."""
+        for store in self._stores:
+            try:
+                self._decode(store, data)
+                return store
+            except Exception:  # as above
+                continue
+        return None
+
     def _decode(self, store: Any, data: bytes) -> Any:
-        decode = store.deserialize_ros1 if self._ros1 else store.deserialize_cdr
-        return decode(data, self._msgtype)
+        decode = store.deserialize_ros1 if self.ros1 else store.deserialize_cdr
+        return decode(data, self.msgtype)
 
 
 @lru_cache(maxsize=256)

@@ -13,6 +13,7 @@ from ..core.common.errors import BagError
 from ..core.common.shell import quoted
 from . import scan_mcap, scan_rosbag1, scan_sqlite3
 from .bounds import LARGEST_METADATA, Budget, bounded, megabytes, most_unpacked
+from .mcap_chunks import indexed_messages
 from .salvage import Scan
 from .source import RosbagsSource, Source, one_line
 from .unpacking import UnpackedMessages, open_unpacked
@@ -191,7 +192,7 @@ def _open_by_index(file: Path, suffix: str, scan: Callable[[], Source]) -> Sourc
         }
         return RosbagsSource(reader, 'ros1', scan)
     if _has_full_index(reader) and _is_bounded(reader, size):
-        return RosbagsSource(reader, 'cdr', scan)
+        return RosbagsSource(reader, 'cdr', scan, indexed_messages)
     reader.close()
     return None
 

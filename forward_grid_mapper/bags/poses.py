@@ -7,6 +7,7 @@ from typing import Any
 
 from ..core.messages.message_types import OdometryMessage, odometry_message, planar_pose, stamp_of
 from .decoder import TF_MESSAGE
+from .layouts import Path
 
 ODOMETRY = 'nav_msgs/msg/Odometry'
 POSE = 'geometry_msgs/msg/PoseStamped'
@@ -32,13 +33,42 @@ def _stamped(message: Any, pose: Any) -> OdometryMessage:
 
 def _transform(message: Any) -> OdometryMessage | None:
     """Return the pose of the robot's base in its parent frame; None if the message has none."""
+    number = _of_base(message)
+    if number is None:
+        return None
+    item = message.transforms[number]
+    where = planar_pose(item.transform.translation, item.transform.rotation)
+    return OdometryMessage(stamp_of(item.header), str(item.header.frame_id), str(item.child_frame_id), where)
+
+
+def _of_base(message: Any) -> int | None:
+    """Return which of a message's transforms moves the robot's base."""
     for frame in BASE_FRAMES:
-        for item in message.transforms:
-            child = str(item.child_frame_id)
-            if child.lstrip('/') == frame:
-                where = planar_pose(item.transform.translation, item.transform.rotation)
-                return OdometryMessage(stamp_of(item.header), str(item.header.frame_id), child, where)
+        for number, item in enumerate(message.transforms):
+            if str(item.child_frame_id).lstrip('/') == frame:
+                return number
     return None
+
+
+_POSITION = [('position', name) for name in 'xy'] + [('orientation', name) for name in 'xyzw']
+_TRANSFORM = [('translation', name) for name in 'xy'] + [('rotation', name) for name in 'xyzw']
+
+
+def paths_of_pose(message: Any) -> tuple[Path, tuple[Path, ...]]:
+    """Return where the header of a message of `POSES` is, and x, y and the quaternion of its pose.
+
+    Of transforms without the robot's base they are those of the first.
+
+    Raises
+    ------
+    Exception
+        Of many kinds, if it is another message.
+    """
+    if hasattr(message, 'transforms'):
+        item: Path = ('transforms', _of_base(message) or 0)
+        return (*item, 'header'), tuple((*item, 'transform', *name) for name in _TRANSFORM)
+    within: Path = ('pose', 'pose') if hasattr(message.pose, 'pose') else ('pose',)
+    return ('header',), tuple((*within, *name) for name in _POSITION)
 
 
 POSES: dict[str, Callable[[Any], OdometryMessage | None]] = {

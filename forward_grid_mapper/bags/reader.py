@@ -4,21 +4,28 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Sequence
+from itertools import islice
 from pathlib import Path
 from types import TracebackType
 from typing import Any
 
+import numpy as np
+
 from ..core.common.errors import BagError, InputError
+from ..core.messages.message_batch import MessageBatch, joined
 from ..core.messages.message_types import OdometryMessage, RangeMessage, range_message
 from .choice import ODOMETRY, RANGE, Topics, choose_range_topics, choose_topics
+from .columns import Columns
 from .decoder import TF_MESSAGE, decoder_of
 from .opening import open_sources, repair_hint
 from .poses import POSES
-from .source import Channel, Source, one_line
+from .source import Channel, RawMessage, Source, one_line
 from .static_transforms import StaticTransforms
 
 _CONVERSIONS: dict[str, Callable[[Any], RangeMessage | OdometryMessage | None]] = {RANGE: range_message, **POSES}
 _PROGRESS_STEP = 1000
+BATCH = 16
+"""Steps of progress after which what was read is decoded: 12 MB of Odometry."""
 
 
 class Bag:
@@ -116,7 +123,12 @@ class Bag:
     def messages(
         self, topics: Topics, progress: Callable[[int, int], None] | None = None
     ) -> Iterator[RangeMessage | OdometryMessage]:
-        """Yield the messages of the chosen topics by log time, file after file of a split bag.
+        """Yield the messages of the chosen topics one by one, as `batches` has them."""
+        for batch in self.batches(topics, progress):
+            yield from batch.one_by_one()
+
+    def batches(self, topics: Topics, progress: Callable[[int, int], None] | None = None) -> Iterator[MessageBatch]:
+        """Yield the messages of the chosen topics by log time, file after file of a split bag, many at once.
 
         Parameters
         ----------
@@ -133,19 +145,27 @@ class Bag:
         wanted = self._begin(topics)
         total = sum(c.total for c in self._channels() if (c.topic, c.msgtype) in wanted)
         done = decoded = 0
-        for channel, message in self._decoded(wanted):
-            done += 1
-            if progress and done % _PROGRESS_STEP == 0:
+
+        def tell(more: int) -> None:
+            nonlocal done
+            done += more
+            if progress and more and not done % _PROGRESS_STEP:
                 progress(done, max(done, total))
-            if message is not None:
-                try:
-                    converted = _CONVERSIONS[channel.msgtype](message)
-                except Exception:  # a definition of the same name with other fields
-                    self._count_undecodable(channel)
-                    continue
-                decoded += 1
-                if converted is not None:
-                    yield converted
+
+        for channels, columns, raw in self._raw(wanted, tell):
+            bad: list[tuple[int, Channel]] = []
+            parts: list[MessageBatch] = []
+            keys = np.fromiter((key for key, _, _ in raw), np.int64, len(raw))
+            for key, channel in channels.items():
+                places = np.flatnonzero(keys == key)
+                found, wrong = columns[key].decode(places, [raw[k][2] for k in places.tolist()])
+                parts += found
+                bad += [(place, channel) for place in wrong]
+            for _, channel in sorted(bad, key=lambda one: one[0]):
+                self._count_undecodable(channel)
+            decoded += len(raw) - len(bad)
+            if parts:
+                yield joined(parts)
         if not decoded and self.truncated:
             raise BagError(
                 f'{self.path} is damaged or cut off ({self._reasons()}) and nothing of the chosen topics can be read; '
@@ -153,6 +173,31 @@ class Bag:
             )
         if progress:
             progress(done, max(done, total))
+
+    def _raw(
+        self, wanted: Collection[tuple[str, str]], tell: Callable[[int], None]
+    ) -> Iterator[tuple[dict[int, Channel], dict[int, Columns], list[RawMessage]]]:
+        """Yield channels and what decodes them, by key, and some messages; `tell` hears how many have been read."""
+        for source in self._sources:
+            channels = {c.key: c for c in source.channels if (c.topic, c.msgtype) in wanted}
+            if not channels:
+                continue
+            columns = {key: Columns(decoder_of(c), _CONVERSIONS[c.msgtype]) for key, c in channels.items()}
+            held: list[RawMessage] = []
+            messages = source.messages(channels.keys())
+            more = True
+            while more:
+                before = len(held)
+                try:
+                    # what was read before an error stays
+                    held.extend(islice(messages, _PROGRESS_STEP))
+                except Exception as error:  # rosbags lets many kinds through; the next file of a split bag may be sound
+                    source.damage = source.damage or one_line(error)
+                more = len(held) - before == _PROGRESS_STEP
+                tell(len(held) - before)
+                if held and (not more or len(held) >= BATCH * _PROGRESS_STEP):
+                    yield channels, columns, held
+                    held = []
 
     def static_transforms(self) -> StaticTransforms:
         """Return all transforms on `/tf_static`, and on the `tf_static` of any namespace."""

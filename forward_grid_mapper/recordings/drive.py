@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from ..core.common.parameters import Parameters
 from ..core.maps.log_odds_map import LogOddsMap
 from ..core.maps.map_set import MapSet
+from ..core.messages.message_batch import MessageBatch
 from ..core.messages.message_types import NANOSECONDS, Pose2
 from ..core.messages.pose_association import PoseAssociator
 from ..files.quality_warning import thinned
@@ -41,6 +42,57 @@ class Part:
 
 
 WHOLE = Part()
+
+
+class Spans:
+    """Takes the messages of a part of a drive, and tells which stamps there are.
+
+    Parameters
+    ----------
+    part : Part
+        The drive begins with the first message.
+    margin : float
+        Nanoseconds before and after the part whose odometry is taken as well.
+
+    Attributes
+    ----------
+    ranges, odometry, left_out : list of int
+        The first and the last stamp of what is taken, and of what is not; empty where there is nothing.
+    """
+
+    def __init__(self, part: Part, margin: float) -> None:
+        self._part, self._margin = part, margin
+        self._bounds: tuple[float, float] | None = None
+        self.ranges: list[int] = []
+        self.odometry: list[int] = []
+        self.left_out: list[int] = []
+
+    def taken(self, batch: MessageBatch) -> MessageBatch:
+        """Return the messages that are of the part."""
+        ranges, odometry = batch.ranges.stamp, batch.odometry.stamp
+        if self._part.whole:
+            _widen(self.ranges, ranges)
+            _widen(self.odometry, odometry)
+            return batch
+        if self._bounds is None:
+            both = [kind for kind in batch if len(kind.stamp)]
+            first = min(both, key=lambda kind: int(kind.place[0]))
+            self._bounds = self._part.bounds(int(first.stamp[0]))
+        begin, end = self._bounds
+        # as whole numbers, which floats of this size are not all
+        now = np.array([begin <= stamp < end for stamp in ranges.tolist()], np.bool_)
+        near = [begin - self._margin <= stamp < end + self._margin for stamp in odometry.tolist()]
+        moved = np.array(near, np.bool_)
+        _widen(self.ranges, ranges[now])
+        _widen(self.odometry, odometry[moved])
+        _widen(self.left_out, np.concatenate([ranges[~now], odometry[~moved]]))
+        return batch.select(now, moved)
+
+
+def _widen(span: list[int], stamps: NDArray[np.int64]) -> None:
+    if len(stamps):
+        both = [*span, int(stamps.min()), int(stamps.max())]
+        span[:] = min(both), max(both)
 
 
 class LogOddsMapOfAll:

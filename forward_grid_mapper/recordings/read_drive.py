@@ -12,13 +12,15 @@ from ..bags.static_transforms import StaticTransforms, SteepSensorError
 from ..core.common.errors import BagError, InputError, ParameterError
 from ..core.common.parameters import Parameters
 from ..core.common.shell import quoted
+from ..core.messages.batch_association import BatchAssociator
 from ..core.messages.extrinsics import STEEP
-from ..core.messages.message_types import NANOSECONDS, Pose2, RangeMessage
+from ..core.messages.message_batch import batch_of
+from ..core.messages.message_types import NANOSECONDS, Pose2
 from ..core.messages.pose_association import PoseAssociator
 from ..core.messages.rep117 import ODOMETRY_REASONS, REASONS
 from ..files.journal import drive_file
 from ..files.output_folder import readable
-from .drive import WHOLE, Drive, LogOddsMapOfAll, Part, thinning_note
+from .drive import WHOLE, Drive, LogOddsMapOfAll, Part, Spans, thinning_note
 from .given_poses import GivenPoses
 from .journal_drive import read_journal
 
@@ -133,40 +135,26 @@ def read_drive(
         else:
             topics = bag.choose_range_topics(range_topics)
         lookup = Extrinsics(extrinsics, bag.static_transforms())
-        associator = PoseAssociator(lookup, parameters, patient=True)
+        associator = BatchAssociator(lookup, parameters)
         live = LogOddsMapOfAll(associator, parameters)
-        left_out = [math.inf, -math.inf]
-        spans: dict[str, list[int]] = {'ranges': [], 'odometry': []}
-        bounds: tuple[float, float] | None = None
         # the poses before and after a reading place it
         margin = parameters.association.max_pose_gap * NANOSECONDS
-        for message in bag.messages(topics, progress):
-            ranged = isinstance(message, RangeMessage)
-            bounds = bounds or part.bounds(message.stamp)
-            beyond = 0 if ranged else margin
-            if not part.whole and not bounds[0] - beyond <= message.stamp < bounds[1] + beyond:
-                left_out[0], left_out[1] = min(left_out[0], message.stamp), max(left_out[1], message.stamp)
-                continue
-            span = spans['ranges' if ranged else 'odometry']
-            if not span:
-                span += [message.stamp, message.stamp]
-            span[:] = min(span[0], message.stamp), max(span[1], message.stamp)
-            if isinstance(message, RangeMessage):
-                associator.add_range(message)
-            else:
-                associator.add_odometry(message)
-        if poses is not None and spans['ranges']:
-            spans['odometry'] = [int(poses.stamp[0]), int(poses.stamp[-1])]
-            begin, end = spans['ranges']
-            for odometry in poses.between(begin - margin, end + margin, _base_frame(bag)):
-                associator.add_odometry(odometry)
+        spans = Spans(part, margin)
+        for batch in bag.batches(topics, progress):
+            associator.add_batch(spans.taken(batch))
+        if poses is not None and spans.ranges:
+            spans.odometry = [int(poses.stamp[0]), int(poses.stamp[-1])]
+            begin, end = spans.ranges
+            given = poses.between(begin - margin, end + margin, _base_frame(bag))
+            associator.add_batch(batch_of(list(enumerate(given))))
         associator.finish()
         undecodable = dict(bag.undecodable)
         warnings = _warnings(bag, associator, lookup)
     if not len(associator.buffer):
-        if not associator.received and left_out[0] <= left_out[1]:
+        if not associator.received and spans.left_out:
+            first, last = spans.left_out
             raise InputError(
-                f'{path} has no reading in the part {part}; its messages span {(left_out[1] - left_out[0]) / 1e9:.1f} s'
+                f'{path} has no reading in the part {part}; its messages span {(last - first) / 1e9:.1f} s'
             )
         raise _nothing_associated(associator, lookup, spans, undecodable, poses)
     stamps = associator.readings.stamp
@@ -234,12 +222,12 @@ def _base_frame(bag: Bag) -> str:
 def _nothing_associated(
     associator: PoseAssociator,
     lookup: Extrinsics,
-    spans: Mapping[str, Sequence[int]],
+    spans: Spans,
     undecodable: Mapping[str, int],
     poses: GivenPoses | None,
 ) -> Exception:
     """Return the error that says why no reading got a pose, and what to do."""
-    ranges, odometry = spans['ranges'], spans['odometry']
+    ranges, odometry = spans.ranges, spans.odometry
     lost = '; '.join(f'{count} on {topic} do not fit their type' for topic, count in undecodable.items())
     if not ranges or not odometry:
         kind = 'Range' if not ranges else 'Odometry'

@@ -11,9 +11,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 
+import numpy as np
+from numpy.typing import NDArray
+
+from ..common.readings import Floats
 from .message_types import Pose2
 from .quaternions import STEEPEST, elevation_of
-from .rep117 import Measurement
+from .rep117 import Measurement, Measurements
 
 STEEP = 'steep_sensor'
 """The reason of `rep117.REASONS` for sensors that say nothing of the plane."""
@@ -86,3 +90,16 @@ def project(measured: Measurement, elevation: float) -> str:
     # no echo stays no echo: z and z_max are multiplied by the same
     measured.z, measured.z_max, measured.sigma = measured.z * factor, measured.z_max * factor, measured.sigma * factor
     return ''
+
+
+def project_all(measured: Measurements, elevation: float) -> Measurements:
+    """Return many measurements as what they say of the plane, as `project` does with each; a `reason` stays."""
+    factor = math.cos(elevation)
+    if factor == 1.0:
+        return measured
+    angles, of = np.unique(measured.half_angle, return_inverse=True)
+    found = [None if abs(elevation) > STEEPEST else shadow_of(angle, elevation) for angle in angles.tolist()]
+    steep = np.array([shadow is None for shadow in found], np.bool_)[of] & (measured.reason == '')
+    shadows: Floats = np.array([shadow or 0.0 for shadow in found])[of]
+    reason: NDArray[np.str_] = np.where(steep, STEEP, measured.reason)
+    return Measurements(reason, measured.z * factor, measured.z_max * factor, shadows, measured.sigma * factor)

@@ -11,6 +11,7 @@ import math
 import numpy as np
 
 from ..common.readings import Floats
+from .message_batch import Ranges
 from .message_types import RangeMessage
 
 SAMPLES = 1024
@@ -60,6 +61,26 @@ class LimitWatch:
             return
         self._samples[self._held] = message.range, message.min_range, message.max_range
         self._held += 1
+        self._halve()
+
+    def add_all(self, messages: Ranges) -> None:
+        """Look at many messages, as `add` does at each."""
+        values = np.stack([messages.range, messages.min_range, messages.max_range], axis=1)
+        done = 0
+        while done < len(values):
+            # the next one that is looked at, and as many as there is room for
+            skip = self._every - 1 - self._count % self._every
+            taken = values[done + skip :: self._every][: SAMPLES - self._held]
+            if not len(taken):
+                break
+            step = skip + 1 + (len(taken) - 1) * self._every
+            self._samples[self._held : self._held + len(taken)] = taken
+            self._held, self._count, done = self._held + len(taken), self._count + step, done + step
+            self._halve()
+        self._count += len(values) - done
+
+    def _halve(self) -> None:
+        """Look at every other one from here on, where there is no more room."""
         if self._held == SAMPLES:
             self._held //= 2
             self._samples[: self._held] = self._samples[1::2].copy()

@@ -13,8 +13,9 @@ from ..common.constants import arc_depths
 from ..common.parameters import Parameters
 from ..common.readings import Floats, Readings
 from ..sensor.density import CUT
+from .message_batch import REASON
 from .message_types import Pose2
-from .rep117 import Measurement
+from .rep117 import Measurement, Measurements
 
 FARTHEST = 2e7
 """Metres from the origin beyond which no pose can be right: half the way round the Earth."""
@@ -42,6 +43,8 @@ def _reach(
     evaluated = z + CUT * highest(sigma, cell / 2)
     return highest(lowest(evaluated, z_max), z + arc_depths(cell)[1]) + 2 * cell
 
+
+_SIGNS = np.array([[1.0], [-1.0], [1.0], [-1.0]])
 
 Box = tuple[float, float, float, float]
 """Left, right, bottom, top; metres."""
@@ -104,9 +107,42 @@ class MapExtent:
         mine = self._box
         return min(mine[0], left), max(mine[1], right), min(mine[2], bottom), max(mine[3], top)
 
+    def admit_all(self, poses: Floats, measured: Measurements, parameters: Parameters) -> NDArray[np.str_]:
+        """Return `admit` for many readings one after the other; `poses` are those of the sensors, shape (N, 3)."""
+        sigma = np.where(measured.sigma != 0, measured.sigma, parameters.model.sigma)
+        reach = _reach(measured.z, measured.z_max, sigma, parameters, np.maximum, np.minimum)
+        reason = np.full(len(poses), '', REASON)
+        box = self._box_of_all(poses, measured.half_angle, reach, parameters)
+        if box is not None:
+            self._box = box
+            return reason
+        rows = zip(poses.tolist(), measured.half_angle.tolist(), reach.tolist(), strict=True)
+        for number, (pose, half_angle, around) in enumerate(rows):
+            reason[number] = self._admit(Pose2(*pose), around, half_angle, parameters)
+        return reason
+
+    def _box_of_all(self, poses: Floats, half_angle: Floats, reach: Floats, parameters: Parameters) -> Box | None:
+        """Return the box around all readings; None if one of them cannot be admitted, or only just."""
+        x, y, yaw = poses.T
+        if not ((np.abs(x) < FARTHEST) & (np.abs(y) < FARTHEST) & np.isfinite(yaw)).all():
+            return None
+        sides = np.stack([x - reach, -(x + reach), y - reach, -(y + reach)])
+        mine = np.array(self._box) * _SIGNS[:, 0]
+        grown = np.minimum.accumulate(np.concatenate([mine[:, None], sides], axis=1), axis=1) * _SIGNS
+        left, right, bottom, top = grown[:, :-1]
+        away = np.maximum(np.maximum(left - x, x - right), np.maximum(bottom - y, y - top))
+        far = (away > parameters.association.max_jump) & (left <= right)
+        box: Box = tuple(grown[:, -1].tolist())
+        # a power and a product may differ in the last bit
+        large = half_angle * (reach / parameters.grid.resolution) ** 2 > LARGEST_CONE * (1 - 1e-9)
+        # the box only grows
+        return None if far.any() or large.any() or not _fits(box, parameters) else box
+
     def admit(self, sensor: Pose2, measured: Measurement, parameters: Parameters) -> str:
         """Grow to hold a reading and return '', or return the reason (`rep117.REASONS`) why the map cannot."""
-        reach = reach_of(measured, parameters)
+        return self._admit(sensor, reach_of(measured, parameters), measured.half_angle, parameters)
+
+    def _admit(self, sensor: Pose2, reach: float, half_angle: float, parameters: Parameters) -> str:
         cell = parameters.grid.resolution
         if not possible(sensor):
             return 'too_far_away'
@@ -118,7 +154,7 @@ class MapExtent:
         box = self._grown(sensor.x - reach, sensor.x + reach, sensor.y - reach, sensor.y + reach)
         if not _fits(box, parameters):
             return 'too_far_away'
-        if measured.half_angle * (reach / cell) ** 2 > LARGEST_CONE:
+        if half_angle * (reach / cell) ** 2 > LARGEST_CONE:
             return 'large_cone'
         self._box = box
         return ''

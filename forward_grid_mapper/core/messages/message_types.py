@@ -76,8 +76,13 @@ def planar_pose(position: Any, orientation: Any) -> Pose2 | None:
         `yaw` is the heading of the x axis. None if a number is not finite, the quaternion is not normalised, or the x
         axis leaves the plane too steeply (`quaternions`).
     """
-    x, y, q = float(position.x), float(position.y), orientation
-    yaw = yaw_of(float(q.x), float(q.y), float(q.z), float(q.w))
+    q = orientation
+    return planar_pose_of(float(position.x), float(position.y), float(q.x), float(q.y), float(q.z), float(q.w))
+
+
+def planar_pose_of(x: float, y: float, qx: float, qy: float, qz: float, qw: float) -> Pose2 | None:
+    """Return a pose projected on the plane, from its position in metres and its quaternion, as `planar_pose` does."""
+    yaw = yaw_of(qx, qy, qz, qw)
     return Pose2(x, y, yaw) if yaw is not None and math.isfinite(x) and math.isfinite(y) else None
 
 

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -86,6 +87,19 @@ class OdometryRecord:
         self._size = size + 1
         if self._most and self._size > self._most:
             self._thin()
+
+    def extend(self, stamps: Sequence[int], poses: Sequence[Pose2]) -> None:
+        """Add many poses, whose stamps increase; without a bound, and later than all before, in no time."""
+        size, end = self._size, self._size + len(stamps)
+        if self._most or not stamps or (size and stamps[0] <= self._stamp[size - 1]):
+            for stamp, pose in zip(stamps, poses, strict=True):
+                self.add(stamp, pose)
+            return
+        if end > len(self._stamp):
+            rows = max(2 * size, end, 1024)
+            self._stamp, self._pose = _longer(self._stamp, rows), _longer(self._pose, rows)
+        self._stamp[size:end], self._pose[size:end] = stamps, poses
+        self._size = end
 
     def begin_anew(self) -> None:
         """Begin a drive where another one ended: the next reading may be of any time, the drive begins with it."""

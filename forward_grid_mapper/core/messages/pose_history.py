@@ -4,7 +4,14 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_left
+from collections.abc import Sequence
+from typing import NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
+
+from ..common.readings import Floats
+from .message_batch import REASON
 from .message_types import NANOSECONDS, Pose2
 from .odometry_record import MOST_POSES as MOST_RECORDED
 from .odometry_record import OdometryRecord
@@ -34,6 +41,22 @@ def interpolate(before: Pose2, after: Pose2, fraction: float) -> Pose2:
         before.y + fraction * (after.y - before.y),
         before.yaw + fraction * turn,
     )
+
+
+class Poses(NamedTuple):
+    """Poses at many stamps.
+
+    Attributes
+    ----------
+    reason : str, shape (N,)
+        Why there is none (`rep117.REASONS`), and '' where there is one; then the columns count.
+    x, y, yaw : float64, shape (N,)
+    """
+
+    reason: NDArray[np.str_]
+    x: Floats
+    y: Floats
+    yaw: Floats
 
 
 class PoseHistory:
@@ -80,6 +103,12 @@ class PoseHistory:
             stamps.insert(at, stamp)
             poses.insert(at, pose)
 
+    def extend(self, stamps: Sequence[int], poses: Sequence[Pose2]) -> None:
+        """Add many poses, whose stamps increase and are later than all before."""
+        self.record.extend(stamps, poses)
+        self._stamps += stamps
+        self._poses += poses
+
     def trim(self) -> None:
         """Forget poses older than `HISTORY`, and the older half of more than `MOST_POSES`.
 
@@ -118,6 +147,36 @@ class PoseHistory:
         if self._jumped(after - 1, after):
             return 'pose_jump'
         return interpolate(poses[after - 1], poses[after], (stamp - stamps[after - 1]) / gap)
+
+    def at_all(self, stamp: NDArray[np.int64], max_gap: float) -> Poses:
+        """Return the poses at many stamps, shape (N,), as `at` does at each."""
+        if not len(stamp):
+            return Poses(np.zeros(0, REASON), *np.zeros((3, 0)))
+        # those before the first stamp that is asked for have no part in it, but for the last two
+        begin = max(bisect_left(self._stamps, int(stamp.min())) - 2, 0)
+        end = bisect_left(self._stamps, int(stamp.max())) + 1
+        stamps, poses = np.array(self._stamps[begin:end], np.int64), np.array(self._poses[begin:end]).reshape(-1, 3)
+        after = np.searchsorted(stamps, stamp)
+        exact = stamps[after] == stamp
+        reason = np.full(len(stamp), '', REASON)
+        count = range(begin, begin + len(stamps))
+        one = np.array([k > 0 and self._jumped(k - 1, k) for k in count], np.bool_)[after]
+        which, of = np.unique(after[exact], return_inverse=True)
+        two = [k + begin < 2 or self._jumped(k + begin - 2, k + begin) for k in which.tolist()]
+        reason[exact] = np.where(one[exact] & np.array(two, np.bool_)[of], 'pose_jump', '')
+        between = ~exact & (after + begin > 0)
+        reason[~exact & ~between] = 'before_odometry'
+        last, before = after[between], after[between] - 1
+        gap = stamps[last] - stamps[before]
+        found = np.where(one[between], 'pose_jump', '')
+        found[gap > max_gap * NANOSECONDS] = 'pose_gap'
+        reason[between] = found
+        turns = np.array([math.remainder(turn, 2 * math.pi) for turn in np.diff(poses[:, 2]).tolist()])
+        part = (stamp[between] - stamps[before]) / gap
+        at = poses[after]
+        at[between, :2] = poses[before, :2] + part[:, None] * (poses[last, :2] - poses[before, :2])
+        at[between, 2] = poses[before, 2] + part * turns[before]
+        return Poses(reason, *at.T)
 
     def _jumped(self, before: int, after: int) -> bool:
         """Return whether no robot drives from one pose to another so fast."""

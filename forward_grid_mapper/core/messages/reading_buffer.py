@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import threading
 from collections.abc import Callable
 from dataclasses import fields
@@ -73,6 +74,13 @@ class ReadingBuffer:
     def held(self) -> int:
         """Number of readings in memory."""
         return self._size
+
+    @property
+    def room(self) -> int:
+        """Readings that may be appended before the next thinning begins, and that one; a large number without bound."""
+        if not self.bound or self._thinning:
+            return sys.maxsize
+        return max(max(self.bound, self._failed_at) + self.bound // 8 + 1 - self._size, 1)
 
     def clear(self) -> None:
         """Forget every reading and every sensor name."""

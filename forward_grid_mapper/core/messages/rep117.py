@@ -3,8 +3,14 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
 
 from ..common.parameters import AssociationParameters
+from ..common.readings import Floats
+from .message_batch import REASON, Ranges
 from .message_types import RangeMessage
 
 REASONS = {
@@ -75,12 +81,8 @@ def measure(message: RangeMessage, parameters: AssociationParameters) -> Measure
     "nothing". The former says no more than that the range lies in (0, max_range), and is taken as half of it with a
     σ of one twelfth, which spans most of the interval at ±5 σ.
     """
-    if not message.frame_id:
-        return 'empty_frame_id'
-    if len(message.frame_id) > LONGEST_NAME:
-        return 'long_frame_id'
-    if not message.frame_id.isprintable():
-        return 'unprintable_frame_id'
+    if wrong := _of_name(message.frame_id):
+        return wrong
     angle = parameters.field_of_view or message.field_of_view
     if not 0.0 < angle < math.pi:
         return 'bad_field_of_view'
@@ -106,3 +108,62 @@ def measure(message: RangeMessage, parameters: AssociationParameters) -> Measure
             return 'over_range'
         z = z_max
     return Measurement(message, z, z_max, angle / 2, sigma)
+
+
+class Measurements(NamedTuple):
+    """What N Range messages say; the columns are those of `Measurement`.
+
+    Attributes
+    ----------
+    reason : str, shape (N,)
+        Why a message is rejected, and '' where it is not; then the columns count.
+    z, z_max, half_angle, sigma : float64, shape (N,)
+    """
+
+    reason: NDArray[np.str_]
+    z: Floats
+    z_max: Floats
+    half_angle: Floats
+    sigma: Floats
+
+    def select(self, which: NDArray[np.int64]) -> Measurements:
+        """Return those that indices pick."""
+        return Measurements._make(column[which] for column in self)
+
+
+def measure_all(messages: Ranges, parameters: AssociationParameters) -> Measurements:
+    """Apply REP 117 to many messages, as `measure` does to one."""
+    size = messages.range.shape
+    reason = np.array([_of_name(name) for name in messages.frames] or [''], REASON)[messages.frame]
+
+    def reject(why: str, mask: NDArray[np.bool_]) -> None:
+        reason[mask & (reason == '')] = why
+
+    angle = np.full(size, parameters.field_of_view) if parameters.field_of_view else messages.field_of_view
+    reject('bad_field_of_view', ~((angle > 0.0) & (angle < math.pi)))
+    least = messages.min_range
+    fixed = least == messages.max_range
+    z_max = np.full(size, parameters.max_range) if parameters.max_range else messages.max_range
+    reject('bad_limits', ~((z_max > 0.0) & (z_max < math.inf) & (least >= 0.0) & (fixed | (least < z_max))))
+    z = messages.range
+    stated = (messages.variance > 0.0) & (messages.variance < math.inf)
+    sigma = np.sqrt(np.where(stated, messages.variance, 0.0))
+    reject('nan_range', np.isnan(z))
+    near = z == -math.inf
+    reject('too_near', near & ~fixed)
+    z, sigma = np.where(near, z_max / 2, z), np.where(near, z_max / 12, sigma)
+    reject('below_min_range', ~near & (z < np.where(fixed, 0.0, least)))
+    reject('too_near', ~near & (z < NEAREST))
+    over = z >= z_max
+    if parameters.over_range == 'discard':
+        reject('over_range', over)
+    return Measurements(reason, np.where(over, z_max, z), z_max, angle / 2, sigma)
+
+
+def _of_name(frame_id: str) -> str:
+    """Return why messages of a frame are rejected; '' if they are not."""
+    if not frame_id:
+        return 'empty_frame_id'
+    if len(frame_id) > LONGEST_NAME:
+        return 'long_frame_id'
+    return '' if frame_id.isprintable() else 'unprintable_frame_id'

@@ -1,0 +1,215 @@
+"""Pose association for files: what `PoseAssociator` does message by message, for thousands at a time.
+
+The readings, their order, the counts and the state after each batch are the same, bit for bit; sines and remainders are
+those of the math library, since numpy's differ in the last bit. Whatever is not as it usually is, such as odometry out
+of order, is taken message by message.
+"""
+
+from __future__ import annotations
+
+import heapq
+import math
+from collections import Counter
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..common.parameters import Parameters
+from ..common.readings import Floats, Readings
+from .extrinsics import ExtrinsicsLookup, Later, Mount, project_all
+from .map_extent import possible
+from .message_batch import Ints, MessageBatch, Odometry
+from .message_types import Pose2, RangeMessage
+from .pose_association import JUMP, MOST_FRAMES, PoseAssociator
+from .pose_history import Poses
+from .rep117 import LONGEST_NAME, Measurement, Measurements, measure_all
+
+NEVER = np.iinfo(np.int64).max
+"""The place of a message that does not come."""
+
+
+class _Waiting(NamedTuple):
+    """Readings that wait for their pose, columns of shape (N,): those of `Measurement`, and the place of arrival."""
+
+    place: Ints
+    number: Ints
+    stamp: Ints
+    frame: Ints
+    z: Floats
+    z_max: Floats
+    half_angle: Floats
+    sigma: Floats
+
+    def select(self, which: NDArray[Any]) -> _Waiting:
+        return _Waiting(*(column[which] for column in self))
+
+
+class BatchAssociator(PoseAssociator):
+    """A patient associator, as befits a file, that takes messages in batches or one at a time.
+
+    In a batch, an answer of `extrinsics` that is a `Later` is final.
+    """
+
+    def __init__(self, extrinsics: ExtrinsicsLookup, parameters: Parameters | None = None) -> None:
+        super().__init__(extrinsics, parameters, patient=True)
+
+    def add_batch(self, batch: MessageBatch) -> None:
+        """Take messages in the order in which they were recorded."""
+        if self._is_usual(batch.odometry):
+            self._add_at_once(batch)
+            return
+        for message in batch.one_by_one():
+            if isinstance(message, RangeMessage):
+                self.add_range(message)
+            else:
+                self.add_odometry(message)
+
+    def _is_usual(self, odometry: Odometry) -> bool:
+        """Return whether all odometry is accepted, is of one frame and in order of time."""
+        if not len(odometry.stamp):
+            return True
+        pairs = {odometry.frames[k] for k in np.unique(odometry.frame).tolist()}
+        known = (self.map_frame, self.base_frame)
+        if len(pairs) > 1 or (any(known) and pairs != {known}):
+            return False
+        names = next(iter(pairs))
+        if max(map(len, names)) > LONGEST_NAME or not ''.join(names).isprintable() or not any(names):
+            return False
+        newest = self._history.newest
+        in_order = bool((np.diff(odometry.stamp) > 0).all()) and (newest is None or odometry.stamp[0] > newest)
+        return in_order and all(possible(Pose2(*pose)) for pose in odometry.pose.tolist())
+
+    def _add_at_once(self, batch: MessageBatch) -> None:
+        """Take messages whose odometry is as usual."""
+        ranges, odometry = batch
+        newest = self._history.newest
+        self._take_odometry(odometry)
+        self.limits.add_all(ranges)
+        measured = measure_all(ranges, self.parameters)
+        frames = list(ranges.frames)
+        good = measured.reason == ''
+        numbers = self.received + 1 + np.arange(len(good))
+        new = _Waiting(ranges.place, numbers, ranges.stamp, ranges.frame, *measured[1:]).select(good)
+        self.received += len(good)
+        if len(new.stamp):
+            self._newest_range = max(int(new.stamp.max()), self._newest_range or int(new.stamp.max()))
+        waiting = self._with_earlier(new, frames)
+        # a reading is placed when odometry has passed it by JUMP, or as it arrives
+        placed = np.maximum(_first_after(waiting.stamp, odometry, newest), waiting.place)
+        settled = placed < NEVER
+        self._wait(waiting.select(~settled), frames)
+        waiting, placed = waiting.select(settled), placed[settled]
+        order = np.lexsort((waiting.number, waiting.stamp, placed))
+        why = self._keep(waiting.select(order), frames)
+        # rejections in the order in which they come one by one, which is that of reports
+        bad = ~good
+        places = np.concatenate([ranges.place[bad], placed[order]])
+        reasons = np.concatenate([measured.reason[bad], why])
+        of = np.concatenate([ranges.frame[bad], waiting.frame[order]])
+        self._reject_all(places, reasons, [frames[k] for k in of.tolist()])
+
+    def _take_odometry(self, odometry: Odometry) -> None:
+        if not len(odometry.stamp):
+            return
+        self.odometry_received += len(odometry.stamp)
+        self.map_frame, self.base_frame = odometry.frames[odometry.frame[0]]
+        self._other_frame = False
+        poses = [Pose2(*pose) for pose in odometry.pose.tolist()]
+        for pose in poses:
+            self.extend_path(pose[:2])
+        self._history.extend(odometry.stamp.tolist(), poses)
+
+    def _with_earlier(self, new: _Waiting, frames: list[str]) -> _Waiting:
+        """Return those that can be settled now of what waits since earlier batches, and what is new."""
+        newest, earlier = self._history.newest, []
+        while newest is not None and self._waiting and self._waiting[0].stamp <= newest - JUMP:
+            earlier.append(heapq.heappop(self._waiting))
+        if not earlier:
+            return new
+        names = {name: k for k, name in enumerate(frames)}
+        for m in earlier:
+            if m.frame_id not in names:
+                names[m.frame_id] = len(frames)
+                frames.append(m.frame_id)
+        rows = [(-1, m.number, m.stamp, names[m.frame_id]) for m in earlier]
+        values = np.array([(m.z, m.z_max, m.half_angle, m.sigma) for m in earlier])
+        held = _Waiting(*np.array(rows, np.int64).T, *values.T)
+        return _Waiting(*(np.concatenate(pair) for pair in zip(held, new, strict=True)))
+
+    def _wait(self, waiting: _Waiting, frames: list[str]) -> None:
+        """Keep readings until there is more odometry."""
+        columns = (column.tolist() for column in waiting[1:])
+        for number, stamp, frame, z, z_max, half_angle, sigma in zip(*columns, strict=True):
+            message = RangeMessage(stamp, frames[frame], z, 0.0, z_max, 2 * half_angle)
+            held = Measurement(message, z, z_max, half_angle, sigma)
+            held.number = number
+            heapq.heappush(self._waiting, held)
+
+    def _keep(self, waiting: _Waiting, frames: list[str]) -> NDArray[np.str_]:
+        """Place readings in their order, and keep those that can be; return why not, '' for those that are kept."""
+        poses = self._history.at_all(waiting.stamp, self.parameters.max_pose_gap)
+        measured = Measurements(poses.reason, *waiting[4:])
+        sensors = np.zeros((len(poses.reason), 3))
+        known = np.flatnonzero(poses.reason == '')
+        # the first to ask for a sensor's pose decides where the report names it
+        numbers, first = np.unique(waiting.frame[known], return_index=True)
+        for number in numbers[np.argsort(first)].tolist():
+            which = known[waiting.frame[known] == number]
+            mount = self._mount(frames[number], int(waiting.stamp[which[0]]))
+            if isinstance(mount, str):
+                measured.reason[which] = mount
+                continue
+            if isinstance(mount, Mount) and mount.elevation:
+                for column, values in zip(measured, project_all(measured.select(which), mount.elevation), strict=True):
+                    column[which] = values
+            sensors[which] = _composed(poses, which, mount)
+        kept = np.flatnonzero(measured.reason == '')
+        measured.reason[kept] = self._extent.admit_all(sensors[kept], measured.select(kept), self._all)
+        kept = np.flatnonzero(measured.reason == '')
+        self._append(waiting.select(kept), sensors[kept], measured.select(kept), frames)
+        return measured.reason
+
+    def _mount(self, frame_id: str, stamp: int) -> Pose2 | str:
+        """Return the pose of a sensor on the robot, or the reason why there can be no reading of it."""
+        mount = self._extrinsics(self.base_frame, frame_id, stamp)
+        if mount is None or isinstance(mount, Later):
+            return 'unknown_extrinsics' if mount is None else mount.reason
+        self.unknown_frames.discard(frame_id)
+        return mount
+
+    def _append(self, kept: _Waiting, sensors: Floats, measured: Measurements, frames: list[str]) -> None:
+        """Put readings into the buffer, which is thinned where it would be if they came one by one."""
+        numbers, first, of = np.unique(kept.frame, return_index=True, return_inverse=True)
+        order = np.argsort(first)
+        names = tuple(frames[number] for number in numbers[order].tolist())
+        sensor = np.argsort(order).astype(np.int32)[of]
+        (x, y, yaw), (_, z, z_max, half_angle, sigma) = sensors.T, measured
+        readings = Readings(x, y, yaw, z, z_max, half_angle, sigma, kept.stamp, sensor, names)
+        while len(readings):
+            room = self.buffer.room
+            self.buffer.extend(readings.select(slice(room)))
+            readings = readings.select(slice(room, None))
+
+    def _reject_all(self, places: Ints, reasons: NDArray[np.str_], frames: list[str]) -> None:
+        """Count rejections, kind by kind in the order of the first of each."""
+        bad = np.flatnonzero(reasons != '')
+        kinds = Counter((frames[k], str(reasons[k])) for k in bad[np.argsort(places[bad], kind='stable')].tolist())
+        for (frame, reason), count in kinds.items():
+            if reason == 'unknown_extrinsics' and len(self.unknown_frames) < MOST_FRAMES:
+                self.unknown_frames.add(frame)
+            self._reject(frame, reason, count)
+
+
+def _first_after(stamp: Ints, odometry: Odometry, newest: int | None) -> Ints:
+    """Return at which place odometry is JUMP ahead of stamps, shape (N,): -1 if before the batch, or `NEVER`."""
+    places = np.append(odometry.place, NEVER)[np.searchsorted(odometry.stamp, stamp + JUMP)]
+    return places if newest is None else np.where(stamp + JUMP <= newest, -1, places)
+
+
+def _composed(poses: Poses, which: NDArray[np.int64], mount: Pose2) -> Floats:
+    """Return `Pose2.compose` of many poses and that of a sensor, shape (N, 3)."""
+    yaw = poses.yaw[which]
+    c, s = (np.array([turned(v) for v in yaw.tolist()]) for turned in (math.cos, math.sin))
+    x, y = poses.x[which] + c * mount.x - s * mount.y, poses.y[which] + s * mount.x + c * mount.y
+    return np.stack([x, y, yaw + mount.yaw], axis=1)

@@ -1,0 +1,201 @@
+"""Messages of a file in batches give what they give one by one, bit for bit, whatever is wrong with them."""
+
+from __future__ import annotations
+
+import math
+import random
+from collections.abc import Sequence
+from dataclasses import fields
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from forward_grid_mapper.core.common.parameters import Parameters
+from forward_grid_mapper.core.common.readings import Readings
+from forward_grid_mapper.core.messages.batch_association import BatchAssociator
+from forward_grid_mapper.core.messages.extrinsics import STEEP, Mount
+from forward_grid_mapper.core.messages.limit_watch import LimitWatch
+from forward_grid_mapper.core.messages.message_batch import batch_of
+from forward_grid_mapper.core.messages.message_types import NANOSECONDS, OdometryMessage, Pose2, RangeMessage
+from forward_grid_mapper.core.messages.pose_association import PoseAssociator
+from forward_grid_mapper.core.messages.rep117 import measure, measure_all
+
+Message = RangeMessage | OdometryMessage
+
+MOUNTS: dict[str, Pose2 | str | None] = {
+    'front': Pose2(0.2, 0.1, 0.3),
+    'level': Mount(0.1, 0.0, 1.0),
+    'up': Mount(-0.1, 0.05, 2.0, 0.4),
+    'high': Mount(0.0, 0.0, 0.0, 1.04),
+    'steep': STEEP,
+    'nowhere': None,
+}
+NAMES = [*MOUNTS, '', 'x' * 300, 'a\nb']
+RANGES = [0.0, 0.05, 1.0, 3.999, 4.0, 5.0, 900.0, -1.0, math.nan, math.inf, -math.inf]
+
+
+def mount_of(base: str, frame: str, stamp: int) -> Pose2 | str | None:
+    return MOUNTS.get(frame)
+
+
+def drive(seed: int, count: int, trouble: float) -> list[Message]:
+    """A drive in the order of recording, with more gaps, jumps and late stamps the more trouble there is."""
+    rng = random.Random(seed)
+    found: list[Message] = []
+    now, x, y = 10 * NANOSECONDS, 0.0, 0.0
+
+    def bad(times: float = 1.0) -> bool:
+        return rng.random() < trouble * times
+
+    for _ in range(count):
+        now += rng.randrange(10_000_000, 80_000_000)
+        if bad():
+            now += rng.choice([700_000_000, 3 * NANOSECONDS, 0])
+        x, y = x + rng.uniform(-0.1, 0.1), y + rng.uniform(-0.1, 0.1)
+        if rng.random() < 0.3:
+            stamp = now - (rng.randrange(0, 3 * NANOSECONDS) if bad(0.2) else 0)
+            pose: Pose2 | None = Pose2(x, y, rng.uniform(-4, 4))
+            if bad(0.1):
+                pose = rng.choice([None, Pose2(1e9, 0.0, 0.0), Pose2(x + 300.0, y, 0.0)])
+            names = ('odom', 'base') if not bad(0.1) else rng.choice([('map', 'base'), ('o' * 300, 'b'), ('', '')])
+            found.append(OdometryMessage(stamp, *names, pose))
+            continue
+        stamp = now - rng.randrange(0, 50_000_000) + (rng.randrange(-2, 2) * NANOSECONDS if bad() else 0)
+        if found and bad():
+            stamp = found[-1].stamp
+        measured = rng.choice(RANGES) if bad() else rng.uniform(0.2, 4.2)
+        limits = rng.choice([(4.0, 4.0), (0.0, math.inf), (5.0, 4.0), (0.1, 40.0)]) if bad() else (0.1, 4.0)
+        angle = rng.choice([0.0, math.nan, 2.6, 3.2]) if bad() else 0.3
+        name = rng.choice(NAMES) if bad() else rng.choice(('front', 'level', 'up'))
+        variance = rng.choice([0.0, 0.01, math.nan, math.inf, -1.0]) if bad(3) else 0.0
+        found.append(RangeMessage(stamp, name, measured, *limits, angle, variance))
+    return found
+
+
+def one_by_one(messages: Sequence[Message], parameters: Parameters) -> PoseAssociator:
+    made = PoseAssociator(mount_of, parameters, patient=True)
+    for message in messages:
+        if isinstance(message, RangeMessage):
+            made.add_range(message)
+        else:
+            made.add_odometry(message)
+    return made
+
+
+def in_batches(messages: Sequence[Message], parameters: Parameters, seed: int) -> BatchAssociator:
+    rng, made, done = random.Random(seed), BatchAssociator(mount_of, parameters), 0
+    while done < len(messages):
+        size = rng.choice([1, 7, 100, 400])
+        made.add_batch(batch_of(list(enumerate(messages[done : done + size]))))
+        done += size
+    return made
+
+
+def equal(one: Readings, other: Readings) -> bool:
+    names = [f.name for f in fields(Readings) if f.name != 'sensor_names']
+    same = all(np.array_equal(getattr(one, name), getattr(other, name)) for name in names)
+    return same and one.sensor_names == other.sensor_names
+
+
+def told(made: PoseAssociator) -> dict[str, Any]:
+    """All that an associator says, orders included."""
+    return {
+        'received': made.received,
+        'rejected': list(made.rejected.items()),
+        'by frame': [(frame, list(counts.items())) for frame, counts in made.rejected_by_frame.items()],
+        'unknown': sorted(made.unknown_frames),
+        'odometry': (made.odometry_received, list(made.odometry_rejected.items()), made.time_jumps),
+        'frames': (made.map_frame, made.base_frame),
+        'waiting': made.waiting,
+        'path': made.path,
+        'counts': list(made.buffer.counts().items()),
+        'held': made.buffer.held,
+        'warnings': made.limits.warnings(),
+    }
+
+
+@settings(max_examples=80, deadline=None)
+@given(
+    seed=st.integers(0, 2**32),
+    trouble=st.sampled_from([0.0, 0.002, 0.02, 0.2]),
+    bound=st.sampled_from([0, 0, 50]),
+    cells=st.sampled_from([50_000_000, 20_000, 10_000]),
+    over=st.sampled_from(['no_echo', 'discard']),
+)
+def test_batches_give_what_single_messages_give(seed: int, trouble: float, bound: int, cells: int, over: str) -> None:
+    parameters = Parameters.from_flat({'max_readings': bound, 'max_cells': cells, 'over_range': over})
+    messages = drive(seed, 600, trouble)
+    whole, parts = one_by_one(messages, parameters), in_batches(messages, parameters, seed)
+    assert told(whole) == told(parts)
+    assert equal(whole.buffer.snapshot(), parts.buffer.snapshot())
+    whole.finish()
+    parts.finish()
+    assert told(whole) == told(parts)
+    assert equal(whole.readings, parts.readings)
+    for one, other in zip(whole.odometry, parts.odometry, strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_a_drive_without_trouble_is_taken_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    def never(self: PoseAssociator, message: object, sent: int = 0) -> None:
+        raise AssertionError('one message at a time')
+
+    monkeypatch.setattr(BatchAssociator, 'add_range', never)
+    monkeypatch.setattr(BatchAssociator, 'add_odometry', never)
+    made = in_batches(drive(1, 500, 0.0), Parameters(), 1)
+    assert len(made.buffer) > 200
+
+
+def test_readings_that_wait_for_given_poses() -> None:
+    messages = drive(5, 300, 0.01)
+    later = sorted(messages, key=lambda m: isinstance(m, OdometryMessage))
+    whole, parts = one_by_one(later, Parameters()), in_batches(later, Parameters(), 5)
+    assert told(whole) == told(parts)
+    assert equal(whole.readings, parts.readings)
+
+
+@settings(max_examples=60, deadline=None)
+@given(seed=st.integers(0, 2**32), angle=st.sampled_from([0.0, 0.5]), limit=st.sampled_from([0.0, 3.0]))
+def test_many_measurements_are_those_of_each(seed: int, angle: float, limit: float) -> None:
+    parameters = Parameters.from_flat({'field_of_view': angle, 'max_range': limit}).association
+    ranges = [m for m in drive(seed, 200, 0.5) if isinstance(m, RangeMessage)]
+    many = measure_all(batch_of(list(enumerate(ranges))).ranges, parameters)
+    for k, message in enumerate(ranges):
+        one = measure(message, parameters)
+        if isinstance(one, str):
+            assert many.reason[k] == one
+        else:
+            assert many.reason[k] == ''
+            assert (many.z[k], many.z_max[k], many.half_angle[k], many.sigma[k]) == (
+                one.z,
+                one.z_max,
+                one.half_angle,
+                one.sigma,
+            )
+
+
+@pytest.mark.parametrize('sizes', [[10, 5000, 1, 1, 1023, 7000], [1024, 1024, 1, 9000], [20000]])
+def test_limits_are_looked_at_as_one_by_one(sizes: list[int]) -> None:
+    one, many = LimitWatch(), LimitWatch()
+    rng = random.Random(3)
+    for size in sizes:
+        messages = [RangeMessage(0, 's', rng.random(), rng.random(), rng.random(), 0.3) for _ in range(size)]
+        for message in messages:
+            one.add(message)
+        many.add_all(batch_of(list(enumerate(messages))).ranges)
+    assert vars(one).keys() == vars(many).keys()
+    assert (one._held, one._every, one._count) == (many._held, many._every, many._count)
+    np.testing.assert_array_equal(one._samples[: one._held], many._samples[: many._held])
+
+
+def test_a_batch_yields_its_messages_in_their_order() -> None:
+    messages = drive(7, 200, 0.0)
+    batch = batch_of(random.Random(1).sample(list(enumerate(messages)), len(messages)))
+    assert list(batch.one_by_one()) == messages
+    empty = batch_of([])
+    assert list(empty.one_by_one()) == []
+    some = batch.select(np.arange(len(batch.ranges.place)) % 2 == 0, batch.odometry.place < 0)
+    assert list(some.one_by_one()) == [m for m in messages if isinstance(m, RangeMessage)][::2]
