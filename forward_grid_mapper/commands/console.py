@@ -52,9 +52,12 @@ def run(
     except OSError as error:
         # of the work's files the work takes care; what remains is the output itself, or the working directory
         problem = str(error) if _still_printing() else f'standard output: {error}'
-    except KeyboardInterrupt as cancelled:
+    except Cancelled as cancelled:
+        print(cancelled_line(parser.prog, cancelled.left), file=sys.stderr)
+        return cancelled.code
+    except KeyboardInterrupt:
         print(cancelled_line(parser.prog), file=sys.stderr)
-        return cancelled.code if isinstance(cancelled, Cancelled) else 130
+        return 130
     print(f'{parser.prog}: error: {problem}', file=sys.stderr)
     return 1
 

@@ -22,6 +22,7 @@ from ..recordings.drive import Part
 from ..recordings.drives import without_repetition
 from ..recordings.finding import find_recordings
 from .console import Ticker
+from .signals import Cancelled
 
 TILE = 30.0
 """Metres; the edge of a tile where `--tiles` does not give one."""
@@ -101,7 +102,7 @@ def with_workers(
     )
     begun = time.perf_counter()
     with Ticker(options.quiet) as ticker, output_folder(output) as folder:
-        again = work.begin(_described(recordings, of_all, size))
+        again = work.begin(_described(recordings, of_all, size, versions()))
         ticker.say('starting workers')
         try:
             with Cluster(options.workers or 1, options.scheduler, memory) as cluster:
@@ -113,14 +114,16 @@ def with_workers(
                 found = ScaledMapper(cluster, job, ticker.say).run(recordings, [*repeated, *ignored])
                 title = f'{readable(Path(*paths[0].resolve().parts[-2:]))}'
                 title += f' and {len(paths) - 1} more' if len(paths) > 1 else ''
-                report = write_output(folder, job, found, cluster, of_all, title, ticker.say)
-        except BaseException:
-            if work.placed:
-                print(
-                    f'what was done is kept in {readable(work.path)}; the same command goes on there', file=sys.stderr
-                )
-            else:
+                report = write_output(folder, job, found, cluster, parameters, title, ticker.say)
+        except BaseException as error:
+            if not work.placed:
                 shutil.rmtree(work.root, ignore_errors=True)
+                raise
+            kept = f'what was done is kept in {readable(work.path)}; the same command goes on there'
+            if isinstance(error, Cancelled):
+                error.left = f'no results were written, {kept}'
+            else:
+                print(kept, file=sys.stderr)
             raise
     shutil.rmtree(work.root, ignore_errors=True)
     tell(options, report, output)
@@ -163,7 +166,7 @@ def _for_worker(parameters: Parameters, memory: int) -> Parameters:
     return dataclasses.replace(parameters, search=of_search)
 
 
-def _described(recordings: Any, parameters: Parameters, size: float) -> dict[str, Any]:
+def _described(recordings: Any, parameters: Parameters, size: float, made_by: Mapping[str, str]) -> dict[str, Any]:
     """Return what makes a job another one."""
     files = []
     for name in recordings.paths:
@@ -177,4 +180,5 @@ def _described(recordings: Any, parameters: Parameters, size: float) -> dict[str
         'sensors': {frame: list(pose) for frame, pose in recordings.extrinsics.items()},
         'topics': [recordings.range_topics, recordings.odom_topic],
         'part': str(recordings.part),
+        'versions': made_by,
     }

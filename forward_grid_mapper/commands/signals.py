@@ -25,16 +25,25 @@ ENDS_WITH_STDIN = 'FORWARD_GRID_MAPPER_ENDS_WITH_STDIN'
 
 
 class Cancelled(KeyboardInterrupt):
-    """A signal that ends the work; `code` is the exit code, 128 plus the signal's number as shells have it."""
+    """A signal that ends the work.
+
+    Attributes
+    ----------
+    code : int
+        The exit code, 128 plus the signal's number as shells have it.
+    left : str
+        What was left behind; whoever leaves something says so here.
+    """
 
     def __init__(self, number: int) -> None:
         super().__init__()
         self.code = 128 + number
+        self.left = 'nothing was written'
 
 
-def cancelled_line(command: str) -> str:
+def cancelled_line(command: str, left: str = 'nothing was written') -> str:
     """Return the line about a command that a signal ended."""
-    return f'{command}: cancelled; nothing was written'
+    return f'{command}: cancelled; {left}'
 
 
 def _install(handler: Any) -> dict[signal.Signals, Any]:

@@ -22,6 +22,7 @@ from matplotlib.ticker import MaxNLocator
 from matplotlib.transforms import Affine2D
 from numpy.typing import NDArray
 
+from .output_folder import told_apart
 from .panels import DRIVES, PATH, UNKNOWN_COLOUR, Box, Picture, coarse, paths_of
 
 # Free is white and unknown a cool tint, so that they differ to every eye; in between runs a warm scale, so that an
@@ -218,8 +219,8 @@ def _named(picture: Picture) -> list[Line2D]:
     if len(_coloured(picture)) < 2:
         return []
     # a dollar sign would start a formula
-    names = [(Path(name).name or name).replace('$', r'\$') for name in picture.drives[:_MOST_NAMED]]
-    names = [name if len(name) <= _NAME else f'{name[: _NAME - 1]}…' for name in names]
+    names = [name.replace('$', r'\$') for name in told_apart(picture.drives)[:_MOST_NAMED]]
+    names = [name if len(name) <= _NAME else f'…{name[1 - _NAME :]}' for name in names]
     handles = [Line2D([], [], color=DRIVES[k], linewidth=1.6, label=f'{k + 1}: {name}') for k, name in enumerate(names)]
     if count > len(names):
         more = f'and {count - len(names)} more drives' if names else f'paths of {count} drives'

@@ -8,7 +8,7 @@ import os
 import re
 import shutil
 import uuid
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -23,6 +23,17 @@ _WRITE_ONLY = _FULL | {errno.EFBIG, errno.EROFS}
 def readable(path: Path | str) -> str:
     """Return a path as text that can be drawn and written as UTF-8, whatever its bytes are."""
     return os.fsencode(path).decode('utf-8', 'backslashreplace')
+
+
+def told_apart(paths: Sequence[str]) -> list[str]:
+    """Return the end of each path that tells it from the others, as short as can be: two `bag` get their folders."""
+    parts = [Path(path).parts or (path,) for path in paths]
+    names = []
+    for mine in parts:
+        others = {other for other in parts if other != mine}
+        size = next((k for k in range(1, len(mine)) if all(other[-k:] != mine[-k:] for other in others)), len(mine))
+        names.append(str(Path(*mine[-size:])))
+    return names
 
 
 def expanded(path: Path | str) -> Path:

@@ -65,6 +65,7 @@ def write_overview(
     title: str,
     readings: int,
     log_likelihood: float,
+    drives: Sequence[str] = (),
 ) -> None:
     """Draw maps that are too large for their cells to be seen, or whose readings nobody holds.
 
@@ -80,6 +81,8 @@ def write_overview(
     readings : int
         How many the maps were made from.
     log_likelihood : float
+    drives : sequence of str
+        As in `write_picture`.
 
     Raises
     ------
@@ -92,7 +95,7 @@ def write_overview(
         for name, values, edge in layers
     ]
     figures = figures_text(readings, layers[0][2], log_likelihood)
-    _draw(path, Picture(title, figures, panels, panels[0].extent, 1, path_xy, NOWHERE))
+    _draw(path, Picture(title, figures, panels, panels[0].extent, 1, path_xy, NOWHERE, NOWHERE, tuple(drives)))
 
 
 def _draw(path: Path, picture: Picture) -> None:

@@ -30,7 +30,7 @@ from ..core.maps.reading_causes import likeliest_causes
 from ..core.maps.traversed import traversed_cells
 from ..core.messages.message_types import NANOSECONDS
 from ..core.sensor.density import CUT, causes_of
-from .output_folder import output_errors
+from .output_folder import output_errors, told_apart
 from .picture import NOWHERE, figures_of, view_of
 from .report_text import report_text
 
@@ -171,7 +171,7 @@ def page_data(
             'cos2_limit': maps.normals.cos2_limit if len(maps.normals.known) else 0.0,
         },
         'moments': then,
-        'drives': [str(drive.get('bag')) for drive in report.get('drives') or ()][:MOST_DRIVES],
+        'drives': told_apart([str(drive.get('bag')) for drive in report.get('drives') or ()])[:MOST_DRIVES],
         'start': float(stamps.min() / NANOSECONDS) if len(stamps) else 0.0,
         'sensors': [_sensor(name, report) for name in maps.readings.sensor_names or ('',)],
         'arrays': {name: _packed(values) for name, values in arrays.items()},

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import signal
 import uuid
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any
@@ -34,6 +35,11 @@ Work = Callable[..., dict[str, Any]]
 def _memory_of(dask_worker: Any) -> int:
     """Return the bytes that a worker may take, 0 if it has no bound; Dask gives it the worker."""
     return int(dask_worker.memory_manager.memory_limit or 0)
+
+
+def _leave_interrupts() -> None:
+    """Leave Ctrl-C, which a terminal sends to the workers as well, to the client: it ends them without a word."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 class Cluster:
@@ -102,6 +108,9 @@ class Cluster:
                     f'no scheduler answers at {self._scheduler}: {error or "nothing came"}. Is the address right '
                     f'(tcp://HOST:8786), and is dask-scheduler running there?'
                 ) from error
+            if self._scheduler is None:
+                # for workers that come later, too
+                self._client.register_worker_callbacks(_leave_interrupts)
             self._check()
         except BaseException:
             self._open.close()

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from ..core.common.errors import BagError, InputError, MapperError
 from ..core.common.grid import Grid
+from ..core.learning.sensor_health import BINS, SensorHealth, health_of_counts
 from ..core.messages.message_types import Pose2
 from ..core.sensor.cone_table import check_size
 from ..core.tiles.schedule import Schedule
@@ -54,6 +55,8 @@ class Found:
     log_likelihood, objective : float
     counts : int64, shape (drives, sensors, 3)
         Readings, those without echo, and those that the map does not explain.
+    health : dict of SensorHealth
+        By sensor.
     cells : dict of int
         Unknown (-1), free (0) and occupied (1) cells of the ML map.
     statistics : dict
@@ -71,6 +74,7 @@ class Found:
     log_likelihood: float = 0.0
     objective: float = 0.0
     counts: NDArray[np.int64] = field(default_factory=lambda: np.zeros((0, 0, 3), np.int64))
+    health: dict[str, SensorHealth] = field(default_factory=dict)
     cells: dict[str, int] = field(default_factory=dict)
     statistics: dict[str, Any] = field(default_factory=dict)
     tasks: list[tuple[str, int, float, int]] = field(default_factory=list)
@@ -237,6 +241,12 @@ class ScaledMapper:
             cells = {value: cells[value] + told['cells'][value] for value in cells}
         cells['-1'] += found.tiling.grid.size - sum(cells.values())
         found.counts, found.cells = counts, cells
+        sums: dict[str, NDArray[np.int64]] = {}
+        for told in judged:
+            for kind, (*index, numbers) in told['health'].items():
+                size = (len(found.sensor_names), BINS)[: len(index)]
+                np.add.at(sums.setdefault(kind, np.zeros(size, np.int64)), tuple(index), numbers)
+        found.health = health_of_counts(found.sensor_names, sums) if sums else {}
 
 
 def _described(known: dict[str, Any]) -> Described:

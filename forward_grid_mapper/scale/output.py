@@ -12,6 +12,7 @@ Whatever the size, tasks.csv has what every task took.
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Mapping
 from pathlib import Path
@@ -24,6 +25,7 @@ from ..core.common.errors import OutputError
 from ..core.common.grid import UNKNOWN, Grid
 from ..core.common.parameters import Parameters
 from ..core.common.readings import Readings
+from ..core.learning.sensor_health import health_warning
 from ..core.maps.map_set import MapSet
 from ..core.tiles.tiling import Tiling, common_part
 from ..files.map_archive import write_npz
@@ -31,6 +33,7 @@ from ..files.map_files import write_raw, write_trinary
 from ..files.output_folder import output_errors
 from ..files.panels import coarse
 from ..files.picture import write_overview
+from ..files.png import write_png
 from ..files.report import json_text, report_data, write_report
 from .cluster import Cluster
 from .job import Job, plan_of, task
@@ -85,7 +88,9 @@ def write_output(
         panels.append((TITLES[name], np.asarray(shown, np.float32), step * more * grid.resolution))
     try:
         readings = int(found.counts[..., 0].sum())
-        write_overview(folder / 'maps.png', panels, grid.origin, found.path_xy, title, readings, found.log_likelihood)
+        drives = [str(drive['bag']) for drive in found.source.get('drives') or ()]
+        figures = readings, found.log_likelihood
+        write_overview(folder / 'maps.png', panels, grid.origin, found.path_xy, title, *figures, drives)
     except OutputError as error:
         warnings.append(f'no picture was drawn: {error}')
     report = _report(found, parameters, warnings)
@@ -103,6 +108,8 @@ def _write_whole(folder: Path, job: Job, found: Found, parameters: Parameters) -
     write_raw(folder / 'live_map', grid, maps.live)
     write_trinary(folder / 'ml_map', grid, maps.ml)
     write_raw(folder / 'uncertainty_map', grid, maps.uncertainty)
+    for name, values in (('live_map', maps.live), ('uncertainty_map', maps.uncertainty)):
+        write_png(folder / f'{name}.png', values)
     write_npz(folder / 'maps.npz', maps)
     return {'live_map': maps.live, 'ml_map': _shown(maps.ml), 'uncertainty_map': maps.uncertainty}
 
@@ -302,7 +309,12 @@ def _report(found: Found, parameters: Parameters, warnings: list[str]) -> dict[s
             if of[k, 0]
         }
 
-    source = {**found.source, 'warnings': warnings, 'sensors': rows(counts.sum(axis=0))}
+    sensors = {
+        name: {**row, 'health': dataclasses.asdict(found.health[name])}
+        for name, row in rows(counts.sum(axis=0)).items()
+    }
+    warnings = [*warnings, *filter(None, [health_warning(found.health)])]
+    source = {**found.source, 'warnings': warnings, 'sensors': sensors}
     report = report_data(_map_set(found, parameters, none), source)
     for k, drive in enumerate(report.get('drives') or ()):
         drive['sensors'], drive['unexplained'] = rows(counts[k]), int(counts[k, :, 2].sum())

@@ -14,7 +14,7 @@ what it did then: so a task may be run again whenever a worker died or the clien
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from ..core.common.grid import UNKNOWN, Grid
 from ..core.common.readings import Readings, in_canonical_order
 from ..core.evidence.neighbourhood import patterns
+from ..core.learning.sensor_health import health_counts
 from ..core.maps.log_odds_map import LogOddsMap
 from ..core.search.prior import log_prior, wall_prior
 from ..core.tiles import windows
@@ -258,7 +259,13 @@ def judge(job: Job, number: int) -> dict[str, Any]:
         'drive': kinds[0],
         'sensor': kinds[1],
         **counts,
+        'health': _sparse(health_counts(own, found.forward, given.ml, found.unexplained)),
         'cells': {str(value): int((core == value).sum()) for value in (-1, 0, 1)},
     }
     write_arrays(target, {'dynamic': found.dynamic}, outcome)
     return outcome_in(target) or {}
+
+
+def _sparse(counts: Mapping[str, NDArray[np.int64]]) -> dict[str, list[list[int]]]:
+    """Return where counts are not 0, and what they are."""
+    return {kind: [index.tolist() for index in (*np.nonzero(of), of[of != 0])] for kind, of in counts.items()}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -138,6 +139,26 @@ def test_maps_are_those_of_one_process_in_whatever_order(
 
 
 @scaled
+def test_results_are_those_of_one_process_in_all_else(drives: Path, one_process: Path, tmp_path: Path) -> None:
+    folder = made_here(drives, tmp_path, Here())
+    missing = {path.name for path in one_process.iterdir()} - {path.name for path in folder.iterdir()}
+    assert missing == {'report.html', 'readings.npz'}
+    for name in ('live_map.png', 'uncertainty_map.png'):
+        assert (folder / name).read_bytes() == (one_process / name).read_bytes()
+    one, other = (json.loads((f / 'report.json').read_text()) for f in (one_process, folder))
+    assert one['changed_parameters'] == other['changed_parameters']
+    for name, row in one['sensors'].items():
+        mine = other['sensors'][name]
+        assert {**mine, 'health': 0} == {**row, 'health': 0}
+        for kind in ('readings', 'random', 'no_echo', 'missed', 'verdict'):
+            assert mine['health'][kind] == row['health'][kind], (name, kind)
+        # what lies beyond a tile's box is not seen, and ranges are counted in bins
+        assert mine['health']['short'] == pytest.approx(row['health']['short'], abs=0.02)
+        assert mine['health']['same'] == pytest.approx(row['health']['same'], abs=0.1)
+        assert mine['health']['common'] == pytest.approx(row['health']['common'], abs=0.3)
+
+
+@scaled
 def test_an_interrupted_job_goes_on_where_it_stood(drives: Path, one_process: Path, tmp_path: Path) -> None:
     """Interrupted every few tasks, no task but the one of then is done twice."""
     rounds = 0
@@ -217,9 +238,10 @@ def test_large_maps_are_written_in_parts(
 # ---- workers of Dask
 
 
-def started(*arguments: object) -> subprocess.Popen[bytes]:
+def started(*arguments: object, group: bool = False) -> subprocess.Popen[bytes]:
     command = [sys.executable, '-m', 'forward_grid_mapper', 'process_bag', *map(str, arguments)]
-    return subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    pipes = {'stdout': subprocess.PIPE, 'stderr': subprocess.PIPE}
+    return subprocess.Popen(command, cwd=ROOT, start_new_session=group, **pipes)
 
 
 def wait_for(condition: Callable[[], bool], process: subprocess.Popen[bytes]) -> None:
@@ -256,6 +278,77 @@ def test_a_killed_worker_and_a_killed_client_cost_only_what_they_were_at(
     assert client.returncode == 0, error
     assert_same(tmp_path / 'maps', one_process)
     assert not work.exists(), 'what is done needs no work folder'
+
+
+@scaled
+def test_ctrl_c_says_once_what_is_kept(drives: Path, tmp_path: Path) -> None:
+    """A terminal sends it to the workers as well."""
+    work = tmp_path / 'work'
+    client = started(drives, '-o', tmp_path / 'maps', '--tiles', TILE, '--workers', 2, '--work', work, '-q', group=True)
+    wait_for(lambda: any(work.glob('tiles/*/normals.npz')), client)
+    os.killpg(client.pid, signal.SIGINT)
+    output, error = client.communicate()
+    lines = [line for line in error.decode().splitlines() if 'compiling' not in line]
+    assert lines == [
+        f'process_bag: cancelled; no results were written, what was done is kept in {work}; the same command goes on '
+        'there'
+    ]
+    assert client.returncode == 130 and not output
+    assert not (tmp_path / 'maps').exists() and any(work.glob('tiles/*/normals.npz'))
+
+
+SIZES = {'work': '200k', 'maps': '60k'}
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path, full: str) -> Iterator[Path]:
+    """A file system that is too small."""
+    folder = tmp_path / 'disk'
+    folder.mkdir()
+    command = ['mount', '-t', 'tmpfs', '-o', f'size={SIZES[full]}', 'tmpfs', str(folder)]
+    if shutil.which('mount') is None or subprocess.run(command, check=False, capture_output=True).returncode:
+        pytest.skip('only root can mount a small disk')
+    yield folder
+    subprocess.run(['umount', '-l', str(folder)], check=True)
+
+
+@scaled
+@pytest.mark.parametrize('full', [*SIZES])
+def test_a_disk_that_is_really_full(
+    drives: Path, one_process: Path, tmp_path: Path, small_disk: Path, full: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    where = {'work': tmp_path / 'work', 'maps': tmp_path / 'maps', full: small_disk / full}
+    arguments = (drives, '-o', where['maps'], '--tiles', TILE, '--workers', 1, '--work', where['work'], '-q')
+    assert code_of(*arguments) == 1
+    error = capsys.readouterr().err
+    assert f'{where[full]}' in error and 'the disk is full; free some space' in error
+    assert 'the same command goes on there' in error and 'Traceback' not in error
+    assert not where['maps'].exists() and not list(small_disk.rglob('.*partial'))
+    # what is there is whole
+    for path in where['work'].rglob('*.npz'):
+        np.load(path).close()
+    subprocess.run(['mount', '-o', 'remount,size=100M', str(small_disk)], check=True)
+    assert code_of(*arguments) == 0
+    assert_same(where['maps'], one_process)
+
+
+def hungry(job: Job, number: int) -> dict[str, Any]:
+    held = []
+    while True:
+        held.append(np.ones(4_000_000))
+        time.sleep(0.01)
+
+
+@scaled
+def test_a_worker_that_takes_more_than_its_memory(tmp_path: Path) -> None:
+    from forward_grid_mapper.scale import cluster
+
+    job = Job(WorkFolder('nowhere'), Parameters(), TILE, versions())
+    with (
+        cluster.Cluster(1, None, 500_000_000) as given,
+        pytest.raises(ClusterError, match=r'hungry 7 ended its worker .* --memory-per-worker|hungry 7.*memory'),
+    ):
+        list(given.each('hungry', hungry, job, [7]))
 
 
 @scaled
@@ -378,8 +471,6 @@ def test_drives_that_cannot_be_mapped_are_named(drives: Path, tmp_path: Path) ->
 
 @scaled
 def test_the_same_drive_twice_counts_once(drives: Path, one_process: Path, tmp_path: Path) -> None:
-    import shutil
-
     copies = tmp_path / 'copies'
     shutil.copytree(drives, copies)
     shutil.copytree(drives / 'drive_1', copies / 'drive_9')

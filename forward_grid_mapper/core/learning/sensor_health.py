@@ -19,13 +19,14 @@ all are random. It is suspect if it is large by itself *and* well above the medi
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..common.readings import Floats
+from ..common.readings import Floats, Readings
 from ..maps.log_odds_map import LogOddsMap
 from ..maps.map_set import MapSet
 from ..runtime.jit import kernel
@@ -48,6 +49,8 @@ SAME, WINDOW = 0.8, 0.2
 """A sensor that repeats itself has at least this fraction of its readings in a window of so many metres."""
 CLOSE = 0.7
 """If so large a part of the random readings is short, but not always the same, somebody walks there."""
+BIN, BINS = 0.05, 400
+"""Metres and number of the bins of ranges, where readings are counted in parts."""
 ABOVE = 0.25
 """A suspect fraction exceeds the median of the others by at least so much."""
 FREE = 0.35
@@ -141,36 +144,80 @@ def sensor_health(maps: MapSet) -> dict[str, SensorHealth]:
     """Return the table of all sensors, by name in the order of `Readings.sensor_names`."""
     readings = maps.readings
     obstacle = first_obstacles(maps.forward_model(), maps.ml)
-    echo = readings.echo
+    marks = _marks(readings, obstacle, maps.unexplained)
     count = len(readings.sensor_names)
     numbers = np.bincount(readings.sensor, minlength=count)[:count]
-    heard = [readings.z[echo & (readings.sensor == k)] for k in range(count)]
+    heard = [readings.z[readings.echo & (readings.sensor == k)] for k in range(count)]
     common = [commonest_range(z) for z in heard]
     usual_range = np.array([np.median(z) if len(z) else math.nan for z in heard])
-    short = echo & maps.unexplained & (readings.z < NEAR * np.minimum(obstacle, readings.z_max))
     for k, (held, middle) in enumerate(common):
         if held >= max(SAME * numbers[k], 1) and middle < NEAR * _median(np.delete(usual_range, k)):
-            short |= _from_free_space(maps, k)
-    marks = {
-        'random': maps.unexplained,
+            marks['short'] |= _from_free_space(maps, k)
+    counts = {kind: np.bincount(readings.sensor, weights=mark, minlength=count)[:count] for kind, mark in marks.items()}
+    return _table(readings.sensor_names, numbers, counts, common)
+
+
+def _marks(readings: Readings, obstacle: Floats, unexplained: NDArray[np.bool_]) -> dict[str, NDArray[np.bool_]]:
+    """Return which readings count for each column of the table, shape (N,)."""
+    echo = readings.echo
+    return {
+        'random': unexplained,
         'no_echo': ~echo,
         'missed': ~echo & (obstacle < REACH * readings.z_max),
-        'short': short,
+        'short': echo & unexplained & (readings.z < NEAR * np.minimum(obstacle, readings.z_max)),
     }
+
+
+def _table(
+    names: tuple[str, ...],
+    numbers: NDArray[np.int64],
+    counts: Mapping[str, NDArray[Any]],
+    common: Sequence[tuple[int, float]],
+) -> dict[str, SensorHealth]:
+    """Return the table from counts by sensor, shape (S,), and each one's commonest range with how many are of it."""
     with np.errstate(invalid='ignore'):
-        shares: dict[str, Floats] = {
-            name: np.bincount(readings.sensor, weights=mark, minlength=count)[:count] / numbers
-            for name, mark in marks.items()
-        }
+        shares: dict[str, Floats] = {kind: column / numbers for kind, column in counts.items()}
         shares['same'] = np.array([held for held, _ in common], np.float64) / numbers
     made = {}
-    for k, name in enumerate(readings.sensor_names):
+    for k, name in enumerate(names):
         mine = {kind: float(share[k]) for kind, share in shares.items()}
         others = {kind: _median(np.delete(share, k)) for kind, share in shares.items()}
         usual = _median(np.delete(numbers, k).astype(np.float64))
         verdict = _verdict(int(numbers[k]), usual, mine, others)
         made[name] = SensorHealth(int(numbers[k]), **mine, common=common[k][1], verdict=verdict)
     return made
+
+
+# ---- of parts of the readings, whose counts are added up
+
+
+def health_counts(
+    readings: Readings, forward: ForwardModel, ml: NDArray[np.int8], unexplained: NDArray[np.bool_]
+) -> dict[str, NDArray[np.int64]]:
+    """Return counts by sensor of some of the readings, int64, shape (S,): what `health_of_counts` needs of all of them.
+
+    `ranges`, shape (S, B), has the echoes by range, in bins of `BIN` metres; the last one has all beyond.
+    """
+    size = len(readings.sensor_names)
+    marks = _marks(readings, first_obstacles(forward, ml), unexplained)
+    counts = {kind: np.bincount(readings.sensor[mark], minlength=size) for kind, mark in marks.items()}
+    counts['readings'] = np.bincount(readings.sensor, minlength=size)
+    ranges = np.zeros((size, BINS), np.int64)
+    echo = readings.echo
+    np.add.at(ranges, (readings.sensor[echo], np.minimum(readings.z[echo] / BIN, BINS - 1).astype(np.int64)), 1)
+    return {**counts, 'ranges': ranges}
+
+
+def health_of_counts(names: tuple[str, ...], counts: Mapping[str, NDArray[np.int64]]) -> dict[str, SensorHealth]:
+    """Return the table from sums of `health_counts`: as `sensor_health`, without asking a live map of the others."""
+    width = round(WINDOW / BIN)
+    common = []
+    for row in counts['ranges']:
+        held = np.convolve(row, np.ones(width, np.int64), 'valid')
+        best = int(held.argmax())
+        common.append((int(held[best]), (best + width / 2) * BIN if held[best] else math.nan))
+    of = {kind: counts[kind] for kind in ('random', 'no_echo', 'missed', 'short')}
+    return _table(names, counts['readings'], of, common)
 
 
 def _from_free_space(maps: MapSet, sensor: int) -> NDArray[np.bool_]:

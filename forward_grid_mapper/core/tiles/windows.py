@@ -98,6 +98,7 @@ class Judged(NamedTuple):
     log_likelihood: NDArray[np.float64]
     unexplained: NDArray[np.bool_]
     dynamic: NDArray[np.float32]
+    forward: ForwardModel
 
 
 def found_normals(given: Given, parameters: Parameters) -> NDArray[np.float32]:
@@ -184,4 +185,4 @@ def judged(given: Given, parameters: Parameters) -> Judged:
     forward = ForwardModel(own, given.box, parameters.model, normals_from(given.normals, parameters))
     e = forward.expectations(given.ml)
     unexplained = e.random > 0.5
-    return Judged(e.log_likelihood, unexplained, dynamic_echoes(forward, unexplained, given.ml))
+    return Judged(e.log_likelihood, unexplained, dynamic_echoes(forward, unexplained, given.ml), forward)
