@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from ..core.common.errors import Cancelled
 from ..core.common.readings import Readings
+from ..core.messages.message_types import Pose2
 from ..core.trajectory.correction import Correction
 from ..core.trajectory.following import Follower
 from ..core.trajectory.windows import Odometry
@@ -30,7 +31,8 @@ class Following:
         self.follower: Follower | None = None
         self.worker = Worker('following', log.error)
         self._log, self._inbox, self._changed = log, inbox, changed
-        self._busy = False
+        self._seen: Pose2 | None
+        self._busy, self._seen = False, None
 
     @property
     def obstacle(self) -> str:
@@ -40,23 +42,25 @@ class Following:
     def begin(self, follower: Follower | None) -> None:
         """Go on with another follower; with none, end."""
         self.cancel()
-        self.follower, self._busy = follower, False
+        self.follower, self._busy, self._seen = follower, False, None
         self._say()
 
-    def offer(self, readings: Readings, odometry: tuple[NDArray[np.int64], NDArray[np.float64]]) -> None:
-        """Have what there is by now followed, unless the thread is busy with what there was before.
+    def offer(self, at: Pose2, readings: Readings, odometry: tuple[NDArray[np.int64], NDArray[np.float64]]) -> None:
+        """Have what there is by now followed, unless the thread is busy, or the robot has not moved; called often.
 
         Parameters
         ----------
+        at : Pose2
+            The newest pose of odometry.
         readings : Readings
             All that are held, as odometry placed them.
         odometry : (int64, shape (M,), float64, shape (M, 3))
             Stamps and poses.
         """
         follower = self.follower
-        if follower is None or self._busy or follower.obstacle:
+        if follower is None or self._busy or follower.obstacle or at == self._seen:
             return
-        self._busy = True
+        self._busy, self._seen = True, at
 
         def work() -> None:
             try:

@@ -216,8 +216,8 @@ class Trajectory:
     def _drive_on(self, pose: Pose2) -> None:
         """Count the way, and do what is due after it."""
         step = 0.0 if self._at is None else math.dist(self._at[:2], pose[:2])
-        if self.following is not None and self._at != pose and self._parameters.node.refine_poses:
-            self.following.offer(self._associator.buffer.snapshot(), self._associator.record.snapshot())
+        if self.following is not None and self._parameters.node.refine_poses:
+            self.following.offer(pose, self._associator.buffer.snapshot(), self._associator.record.snapshot())
         self._at = pose
         self.driven += step if step <= LONGEST_STEP else 0.0
         if self.driven - self._shown_at >= GROWS and not self._showing:
