@@ -85,7 +85,16 @@ def follow(robot: Inside, least: int = 1) -> Follower:
     return follower
 
 
-def test_map_to_odom_follows_while_the_robot_drives(driving: Callable[..., Inside], told: Told) -> None:
+def test_map_to_odom_follows_while_the_robot_drives(
+    driving: Callable[..., Inside], told: Told, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    by, follow_on = set(), Follower.follow
+
+    def noted(self: Follower, *arguments: Any) -> bool:
+        by.add(threading.get_ident())
+        return follow_on(self, *arguments)
+
+    monkeypatch.setattr(Follower, 'follow', noted)
     robot = driving()
     node = robot.node
     base = node.trajectory.correction
@@ -102,6 +111,7 @@ def test_map_to_odom_follows_while_the_robot_drives(driving: Callable[..., Insid
     robot.hand(told.parts[2])
     follow(robot, follower.windows + 5)
     assert told.off(robot) < 0.35
+    assert by and threading.get_ident() not in by, 'the executor does not do it'
     # what comes goes into the maps where it is followed to
     readings = node.associator.readings
     placed, odometry = node.trajectory.place(readings), odometry_of(robot)
