@@ -167,13 +167,17 @@ class EmService:
     def _start(self, done: Callable[[Outcome], object]) -> None:
         generation, bound = self._publishers.generation, self._associator.buffer.bound
         # what comes while kernels are compiled is mapped as well
-        early = None if self._kernels.has('EM') else queue.SimpleQueue[Taken]()
+        early = not self._kernels.has('EM')
         taken = [self._take()]
 
+        def take_now() -> Taken:
+            asked = queue.SimpleQueue[Taken]()
+            self._inbox.put(lambda: asked.put(self._take()))
+            return _waited_for(asked, run)
+
         def readings() -> Readings:
-            if early is not None:
-                self._inbox.put(lambda: early.put(self._take()))
-                taken[0] = _waited_for(early, run)
+            if early:
+                taken[0] = take_now()
             return bounded(taken[0][1], bound)
 
         def found(maps: MapSet) -> None:
@@ -201,7 +205,11 @@ class EmService:
             # after a restart the journal's readings are all there is of the odometry before
             return Drive(recovered(Odometry.of(*odometry), held, mounts), held)
 
-        mapper, moved = self._trajectory.mapper(parameters, drive), self._trajectory.on
+        def now() -> Drive:
+            _, held, odometry = take_now()
+            return Drive(Odometry.of(*odometry), held)
+
+        mapper, moved = self._trajectory.mapper(parameters, drive, now), self._trajectory.on
         start = self.online.so_far() if self.online and self._trajectory.correction is None else None
         # it comes back if the run ends without a map, since the map so far is shown meanwhile
         before = self._publishers.ml_map

@@ -25,6 +25,7 @@ from .complaints import of_ros
 from .deferred import DeferredService, Reply
 from .diagnostics import Health
 from .em_service import EmService
+from .following import Following
 from .frames import Extrinsics, MapFrame, Transforms
 from .intake import AT_ONCE, Intake
 from .journal_keeper import JournalKeeper
@@ -115,6 +116,7 @@ class MapperNode(ManagedNode):
         self.trajectory = trajectory = Trajectory(self, self.associator, self._steady)
         self.maps = MapPublishers(self, self.parameters.grid.resolution, lambda: trajectory.frame, self._up_to_date)
         trajectory.publishing, trajectory.changed = self.maps.worker, self._map_anew
+        trajectory.following = Following(log, inbox, trajectory.follow) if node.online else None
         trajectory.begin()
         self.live = LiveMap(self.parameters, self._show_live, log.error, lambda: kernels.wait('live map'))
         self.em = EmService(lambda: self.parameters, self.associator, trajectory, self.maps, inbox, kernels, log)
@@ -125,7 +127,7 @@ class MapperNode(ManagedNode):
         self.saver = Saver(self.em, self.live, self._account, log)
         self._aside = Worker('readings', log.error)
         self.workers = [self._aside, self.live.worker, self.maps.worker, self.em.worker.worker]
-        self.workers += [self.saver.worker, *([self.online.worker] if self.online else []), kernels.worker]
+        self.workers += [part.worker for part in (self.saver, self.online, trajectory.following, kernels) if part]
         health = Health()
         self.intake = Intake(self, self.parameters, self.associator, self._map_frame, health.taken)
         self.reporter = Reporter(
@@ -187,6 +189,8 @@ class MapperNode(ManagedNode):
             self.em.close(2.0)
             if self.online:
                 self.online.close(2.0)
+            if self.trajectory.following:
+                self.trajectory.following.close(2.0)
             self.live.worker.close(0.5)
             self.journal.close()
         # kernels are compiled to the end, whoever needs them next

@@ -18,9 +18,11 @@ from ..core.mapping import Mapper, Watch
 from ..core.maps.log_odds_map import LogOddsMap
 from ..core.maps.map_set import MapSet
 from ..core.trajectory.correction import Correction
+from ..core.trajectory.following import Follower
 from ..core.trajectory.refinement import Refinement, Refiner
 from ..core.trajectory.windows import Odometry
 from ..files.trajectory_text import calibration_words
+from .background import reason
 
 BATCH = 20_000
 """Readings after which the live map looks whether it is still wanted."""
@@ -37,12 +39,14 @@ class Found(NamedTuple):
     """What became of a trajectory.
 
     `refinement` is None where none was to be found, `correction` where odometry stays. `live` is the live map of the
-    drive's readings, None where the one that there is need not be replaced.
+    drive's readings, None where the one that there is need not be replaced. `follower` goes on from where the drive is
+    by now; None where it is not to be followed.
     """
 
     refinement: Refinement | None
     correction: Correction | None
     live: LogOddsMap | None
+    follower: Follower | None = None
 
 
 class RefiningMapper:
@@ -54,7 +58,14 @@ class RefiningMapper:
         Set before the maps are made.
     """
 
-    def __init__(self, parameters: Parameters, drive: Callable[[], Drive], refine: bool, bent: bool) -> None:
+    def __init__(
+        self,
+        parameters: Parameters,
+        drive: Callable[[], Drive],
+        refine: bool,
+        bent: bool,
+        now: Callable[[], Drive] | None = None,
+    ) -> None:
         """Prepare a run.
 
         Parameters
@@ -66,8 +77,12 @@ class RefiningMapper:
             Whether to look for a trajectory; without, odometry stays.
         bent : bool
             Whether the live map so far is along another trajectory than odometry's.
+        now : callable, optional
+            Called in the thread of the run, returns the drive so far: what came since the begin is followed.
         """
         self.found: Found | None = None
+        self._now = now
+        self._follower: Follower | None = None
         self._parameters, self._drive = parameters, drive
         self._to_refine, self._bent = refine, bent
         self._mapper, self._refiner = Mapper(parameters), Refiner(parameters)
@@ -77,6 +92,8 @@ class RefiningMapper:
         """Make `run` raise `Cancelled` soon; may be called from any thread."""
         self._cancelled = True
         self._refiner.cancel()
+        if self._follower is not None:
+            self._follower.cancel()
         self._mapper.cancel()
 
     def so_far(self) -> tuple[Grid, NDArray[np.int8]] | None:
@@ -111,8 +128,24 @@ class RefiningMapper:
         if refinement is not None:
             # the readings are kept once
             refinement = replace(refinement, readings=maps.readings)
-        self.found = Found(refinement, correction, live)
+        if refinement is not None and correction is not None and self._now is not None:
+            watch('following', None)
+            self._follow(correction, refinement.calibration, self._now)
+        self.found = Found(refinement, correction, live, self._follower)
         return maps
+
+    def _follow(self, correction: Correction, calibration: dict[str, float], now: Callable[[], Drive]) -> None:
+        """Follow what was driven while the drive before was looked at; without it the maps are as good."""
+        follower = self._follower = Follower(correction, calibration, self._parameters)
+        if self._cancelled:
+            raise Cancelled('the work was cancelled')
+        odometry, readings = now()
+        try:
+            follower.follow(readings, odometry)
+        except Cancelled:
+            raise
+        except Exception as error:
+            follower.obstacle = reason(error)
 
     def _refine(self, readings: Readings, odometry: Odometry, watch: Watch) -> Refinement:
         return self._refiner.run(

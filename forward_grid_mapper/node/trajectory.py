@@ -24,6 +24,7 @@ from ..core.trajectory.windows import Odometry
 from ..files.trajectory_text import calibration_words
 from .background import Worker
 from .diagnostics import status
+from .following import Following
 from .pose_publishers import PERIOD, PosePublishers
 from .refining import Drive, Found, RefiningMapper, outcome_words
 
@@ -63,6 +64,8 @@ class Trajectory:
         readings in it.
     refine : callable
         Called when the drive has grown by `refine_every`; returns whether a run was begun.
+    following : Following or None
+        Goes on with what was found while the robot drives; None where this is not wanted.
     driven : float
         Metres since the drive began, as far as they were looked at.
     """
@@ -78,6 +81,7 @@ class Trajectory:
         self.found: Found | None = None
         self.changed: Callable[[LogOddsMap | None, int], object] = lambda live, count: None
         self.refine: Callable[[], bool] = lambda: False
+        self.following: Following | None = None
         self.driven = self._refined_at = self._shown_at = 0.0
         self._at: Pose2 | None = None
         self._since = -1
@@ -117,6 +121,8 @@ class Trajectory:
     def begin(self) -> None:
         """Begin a drive, with the trajectory of odometry."""
         self.correction = self.found = None
+        if self.following is not None:
+            self.following.begin(None)
         self.driven = self._refined_at = self._shown_at = 0.0
         self._at, newest = None, self._associator.record.newest
         # the path begins with the drive
@@ -126,22 +132,34 @@ class Trajectory:
             self._out.forget()
         self._show_path()
 
-    def mapper(self, parameters: Parameters, drive: Callable[[], Drive]) -> RefiningMapper | Mapper:
-        """Return what makes the maps of a run; `drive` returns what it was begun with."""
+    def mapper(
+        self, parameters: Parameters, drive: Callable[[], Drive], now: Callable[[], Drive]
+    ) -> RefiningMapper | Mapper:
+        """Return what makes the maps of a run; `drive` returns what it was begun with, `now` what there is by then."""
         self._refined_at = self.driven
         refine, bent = parameters.node.refine_poses and not self.obstacle, self.correction is not None
-        return RefiningMapper(parameters, drive, refine, bent) if refine or bent else Mapper(parameters)
+        if not (refine or bent):
+            return Mapper(parameters)
+        return RefiningMapper(parameters, drive, refine, bent, None if self.following is None else now)
 
     def adopt(self, found: Found | None, count: int) -> None:
         """Take what was found for the maps of the first `count` readings; None if they are as odometry has it."""
         before, live = self.frame, found.live if found else None
         self.correction = found.correction if found else None
         # the live map belongs to the one who shows it
-        self.found = found._replace(live=None) if found and found.refinement else None
+        self.found = found._replace(live=None, follower=None) if found and found.refinement else None
+        if self.following is not None:
+            self.following.begin(found.follower if found else None)
+            if self.following.follower is not None:
+                self.correction = self.following.follower.correction
         self._switch(self.found is not None)
         self._show_path()
         if live is not None or self.frame != before:
             self.changed(live, count)
+
+    def follow(self, correction: Correction) -> None:
+        """Take the correction that goes on from the one that was adopted."""
+        self.correction = correction
 
     def outcome(self) -> str:
         """Return what became of the trajectory of the latest maps, in words; empty if it is odometry's anyway."""
@@ -170,7 +188,10 @@ class Trajectory:
                 'correction (x m, y m, yaw deg)': f'{x:.2f}, {y:.2f}, {math.degrees(yaw):.1f}',
                 'wheels': calibration_words(refinement.calibration) or 'nothing worth a word',
             }
-        level = DiagnosticStatus.WARN if self.obstacle else DiagnosticStatus.OK
+        if self.following is not None:
+            values |= self.following.values()
+        troubled = self.obstacle or (self.following is not None and self.following.obstacle)
+        level = DiagnosticStatus.WARN if troubled else DiagnosticStatus.OK
         message = self.outcome() or 'as odometry gives it until run_em is called'
         return [status(f'{name}: trajectory', level, message, name, values)]
 
@@ -195,6 +216,8 @@ class Trajectory:
     def _drive_on(self, pose: Pose2) -> None:
         """Count the way, and do what is due after it."""
         step = 0.0 if self._at is None else math.dist(self._at[:2], pose[:2])
+        if self.following is not None and self._parameters.node.refine_poses:
+            self.following.offer(pose, self._associator.buffer.snapshot(), self._associator.record.snapshot())
         self._at = pose
         self.driven += step if step <= LONGEST_STEP else 0.0
         if self.driven - self._shown_at >= GROWS and not self._showing:

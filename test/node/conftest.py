@@ -79,3 +79,15 @@ def inside(domain: int, tmp_path: Path) -> Iterator[Callable[..., Any]]:
     yield begin
     for node in nodes:
         node.close()
+
+
+@pytest.fixture
+def quick(monkeypatch: pytest.MonkeyPatch) -> type[Any]:
+    """A refiner that is done at once; `quick.accepts = False` makes it refuse."""
+    from drift_samples import QuickRefiner
+
+    from forward_grid_mapper.node import refining
+
+    refiner = type('Quick', (QuickRefiner,), {})
+    monkeypatch.setattr(refining, 'Refiner', refiner)
+    return refiner

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,9 +17,10 @@ from nav_msgs.msg import Odometry
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.parameter import Parameter
+from robot import ros_message
 from sensor_msgs.msg import Range
 
-from forward_grid_mapper.core.messages.message_types import NANOSECONDS
+from forward_grid_mapper.core.messages.message_types import NANOSECONDS, OdometryMessage, RangeMessage
 from forward_grid_mapper.node.mapper_node import MapperNode
 
 
@@ -88,6 +89,21 @@ class Inside:
         self.sent += 1
         info = {'source_timestamp': time.time_ns(), 'publication_sequence_number': number or self.sent}
         intake.on_range(intake.range_losses[0], made, info)
+
+    def hand(self, messages: Sequence[RangeMessage | OdometryMessage]) -> None:
+        """Hand the node messages of a drive, and turn the executor until it has taken them."""
+        for k, message in enumerate(messages):
+            made = ros_message(message)
+            if isinstance(message, RangeMessage):
+                intake = self.node.intake
+                self.sent += 1
+                info = {'source_timestamp': time.time_ns(), 'publication_sequence_number': self.sent}
+                intake.on_range(intake.range_losses[0], made, info)
+            else:
+                self.node.intake.on_odometry(made, {'source_timestamp': time.time_ns()})
+            if k % 50 == 0:
+                self.executor.spin_once(timeout_sec=0.0)
+        self.until(lambda: not self.node.intake.busy)
 
     @staticmethod
     def _stamp(header: Any, seconds: float) -> None:

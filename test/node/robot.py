@@ -81,6 +81,28 @@ class NodeProcess:
             self._file.close()
 
 
+def ros_message(message: RangeMessage | OdometryMessage) -> Any:
+    """Return the message as ROS has it."""
+    out: Any
+    if isinstance(message, RangeMessage):
+        out = Range(
+            range=message.range,
+            min_range=message.min_range,
+            max_range=message.max_range,
+            field_of_view=message.field_of_view,
+            variance=message.variance,
+        )
+    else:
+        out = Odometry(child_frame_id=message.child_frame_id)
+        assert message.pose is not None
+        out.pose.pose.position.x, out.pose.pose.position.y = message.pose.x, message.pose.y
+        half = message.pose.yaw / 2
+        out.pose.pose.orientation.z, out.pose.pose.orientation.w = math.sin(half), math.cos(half)
+    out.header.frame_id = message.frame_id
+    out.header.stamp.sec, out.header.stamp.nanosec = divmod(message.stamp, NANOSECONDS)
+    return out
+
+
 class Robot:
     """Publishes ranges and odometry, calls services, and keeps what the node publishes."""
 
@@ -128,25 +150,8 @@ class Robot:
         self.until(lambda: all(p.get_subscription_count() for p in both), 20.0, 'the node subscribes')
 
     def send(self, message: RangeMessage | OdometryMessage) -> None:
-        if isinstance(message, RangeMessage):
-            out = Range(
-                range=message.range,
-                min_range=message.min_range,
-                max_range=message.max_range,
-                field_of_view=message.field_of_view,
-                variance=message.variance,
-            )
-            publisher = self.range_out
-        else:
-            out = Odometry(child_frame_id=message.child_frame_id)
-            assert message.pose is not None
-            out.pose.pose.position.x, out.pose.pose.position.y = message.pose.x, message.pose.y
-            half = message.pose.yaw / 2
-            out.pose.pose.orientation.z, out.pose.pose.orientation.w = math.sin(half), math.cos(half)
-            publisher = self.odom_out
-        out.header.frame_id = message.frame_id
-        out.header.stamp.sec, out.header.stamp.nanosec = divmod(message.stamp, NANOSECONDS)
-        publisher.publish(out)
+        publisher = self.range_out if isinstance(message, RangeMessage) else self.odom_out
+        publisher.publish(ros_message(message))
 
     def play(self, messages: Sequence[RangeMessage | OdometryMessage], rate: float = 1500.0) -> None:
         """Send messages at a steady rate, and wait until the node has taken them all."""

@@ -24,6 +24,7 @@ from forward_grid_mapper.core.maps.log_odds_map import LogOddsMap
 from forward_grid_mapper.core.messages import reading_buffer
 from forward_grid_mapper.core.messages.reading_buffer import ReadingBuffer
 from forward_grid_mapper.core.online_map import OnlineMap
+from forward_grid_mapper.core.trajectory.following import Follower
 from forward_grid_mapper.node import em, em_service, main, map_publishers, saver
 from forward_grid_mapper.node.intake import AT_ONCE
 
@@ -36,6 +37,7 @@ LONG_WORK: tuple[tuple[Any, str], ...] = (
     *((reading_buffer, name) for name in ('kept', 'bounded')),
     *((em, name) for name in ('sensor_health', 'input_warnings', 'map_grid')),
     (em_service, 'consistency_warnings'),
+    (Follower, 'follow'),
     (map_publishers, 'grid_message'),
     (saver, 'write_results'),
 )

@@ -298,7 +298,7 @@ class NodeParameters:
     online: bool = param(
         False,
         'Keep the maximum likelihood map and the uncertainty map up to date with every reading, and start EM from '
-        'there.',
+        'there. With refine_poses, also follow the trajectory that was found last while the robot drives.',
         read_only=True,
     )
     publish_rate: float = param(

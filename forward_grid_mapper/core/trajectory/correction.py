@@ -49,6 +49,19 @@ class Correction:
         """Metres between odometry and trajectory at the end."""
         return float(np.hypot(*(self.trajectory.pose[-1, :2] - self.odometry.pose[-1, :2])))
 
+    def continued(self, odometry: Odometry, trajectory: Odometry) -> Correction:
+        """Return the correction with what two paths of the same stamps have after its end."""
+        after = int(np.searchsorted(odometry.stamp, self.end, side='right'))
+        return Correction(_joined(self.odometry, odometry, after), _joined(self.trajectory, trajectory, after))
+
+    def until(self, stamp: int) -> Correction:
+        """Return the correction of poses up to a stamp, nanoseconds."""
+        end = max(int(np.searchsorted(self.trajectory.stamp, stamp, side='right')), 1)
+        before, after = self.odometry, self.trajectory
+        return Correction(
+            Odometry(before.stamp[:end], before.pose[:end]), Odometry(after.stamp[:end], after.pose[:end])
+        )
+
     def apply(self, readings: Readings) -> Readings:
         """Return readings that odometry placed where they belong on the map."""
         sensors = np.stack([readings.x, readings.y, readings.yaw], axis=1)
@@ -77,3 +90,9 @@ class Correction:
         later = compose(self.last, pose[after:])
         path = self.trajectory
         return Odometry(np.concatenate([path.stamp, stamp[after:]]), np.concatenate([path.pose, later]))
+
+
+def _joined(path: Odometry, later: Odometry, first: int) -> Odometry:
+    """Return a path, and of a later one what comes from pose `first` on."""
+    stamp = np.concatenate([path.stamp, later.stamp[first:]])
+    return Odometry(stamp, np.concatenate([path.pose, later.pose[first:]]))

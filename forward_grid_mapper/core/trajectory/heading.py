@@ -201,7 +201,7 @@ def _followed(chain: _Chain, belief: Floats) -> tuple[Floats, Floats]:
     return np.unwrap(middle + (inside * off).sum(1) / mass), mass
 
 
-def _measured(votes: Floats, yaw: Floats, correction: Floats) -> tuple[Floats, Floats]:
+def yaws_of_votes(votes: Floats, yaw: Floats, correction: Floats) -> tuple[Floats, Floats]:
     """Return the correction that the votes of each place say by themselves near `correction`, and its information."""
     off = np.arange(-NEAR, NEAR + 1)
     seen = np.degrees(-(yaw + correction))[:, None] - off
@@ -248,7 +248,7 @@ def heading(windows: Windows, at: NDArray[np.int64], votes: Floats, noises: Sequ
     first = chain.grid[int(chain.smooth(best)[0].argmax())]
     start = (np.abs(circle.off(first)) < math.pi / 4).astype(np.float64)
     correction, certain = _followed(circle, circle.smooth(best, start))
-    measured, information = _measured(votes, windows.node[at, 2], correction)
+    measured, information = yaws_of_votes(votes, windows.node[at, 2], correction)
     return Heading(
         at,
         correction,

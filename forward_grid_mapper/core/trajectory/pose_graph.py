@@ -333,7 +333,7 @@ class _Normal:
         """Return deviations of all unknowns, shape (3 K + C + 2 W, count)."""
         roots = np.linalg.cholesky(self.information + 1e-9 * np.eye(3))
         noise = rng.standard_normal((len(roots), 3, count))
-        right = self.j.T @ np.einsum('eij,ejs->eis', roots, noise).reshape(-1, count)
+        right = self.j.T @ np.einsum('eij,ejs->eis', roots, noise).reshape(3 * len(roots), count)
         for j, root in self.pulled:
             right += j.T @ (root[:, None] * rng.standard_normal((len(root), count)))
         right += np.sqrt(self.prior)[:, None] * rng.standard_normal(right.shape)
@@ -375,6 +375,6 @@ def solve(graph: Graph, nodes: Floats, calibration: Floats, samples: int = 0, se
         if np.abs(step[: 3 * len(nodes)]).max() < LEAST_STEP:
             break
     n = len(graph.odometry.first)
-    drawn = normal.draw(samples, np.random.default_rng(seed))[: 3 * len(nodes)].T.reshape(samples, -1, 3)
+    drawn = normal.draw(samples, np.random.default_rng(seed))[: 3 * len(nodes)].T.reshape(samples, len(nodes), 3)
     state = normal.state
     return Solution(state.nodes, state.calibration, normal.squared[n:], normal.squared[:n], drawn)

@@ -80,3 +80,25 @@ def test_readings_tell_the_odometry_that_is_gone(seed: int) -> None:
     assert set(only.stamp[: -len(late.stamp)]) == set(readings.stamp[readings.sensor == 0]) - set(late.stamp)
     assert recovered(late, readings, {}) is late
     assert recovered(odometry, readings, MOUNTS) is odometry
+
+
+@pytest.mark.parametrize('seed', range(10))
+def test_a_correction_goes_on_after_its_end_and_can_be_cut_off(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    odometry, other = some_odometry(rng, 60), some_odometry(rng, 60)
+    begin, end = sorted(rng.integers(1, 59, 2).tolist())
+    first = Correction(
+        Odometry(odometry.stamp[: end + 1], odometry.pose[: end + 1]),
+        Odometry(odometry.stamp[: end + 1], other.pose[: end + 1]),
+    )
+    # what comes overlaps, and what was there stays
+    later = slice(begin, None)
+    moved = Odometry(odometry.stamp[later], other.pose[later] + 1.0)
+    longer = first.continued(Odometry(odometry.stamp[later], odometry.pose[later]), moved)
+    assert np.array_equal(longer.trajectory.stamp, odometry.stamp)
+    assert np.array_equal(longer.odometry.pose, odometry.pose)
+    assert np.array_equal(longer.trajectory.pose, np.concatenate([other.pose[: end + 1], other.pose[end + 1 :] + 1.0]))
+    back = longer.until(first.end)
+    assert np.array_equal(back.trajectory.pose, first.trajectory.pose)
+    assert back.last == pytest.approx(first.last)
+    assert len(longer.until(0).trajectory.stamp) == 1

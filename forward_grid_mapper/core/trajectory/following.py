@@ -1,0 +1,362 @@
+"""Following: the trajectory of a drive that goes on, a window at a time, from where it was found as a whole.
+
+The last windows form a small pose graph, the *tail*. Its first nodes are settled: they stay. The others follow from
+odometry, calibrated as the whole drive has it, from the directions of walls and their distances, as in a whole drive,
+and from places that were mapped before. So a window costs the same however long the drive is.
+
+What is followed has to prove itself. Every few windows a block is foreseen, before its readings are used, once where it
+is followed and once where the correction is kept as it was. Where following foresees clearly better, the correction of
+then is the one to beat from there on; where it foresees worse, that one is in force until it does so no longer.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import fields
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..common.parameters import Parameters
+from ..common.readings import Readings, in_canonical_order
+from ..messages.message_types import NANOSECONDS
+from ..runtime.cancelling import check
+from .correction import Correction
+from .heading import yaws_of_votes
+from .holding_out import gain
+from .likelihood import scores
+from .local_map import at_poses, for_matching, local_map
+from .matching import grid_around, measure
+from .odometry_model import CALIBRATION, Noise, calibrated, covariances, motions
+from .passes import BEHIND, BLOCK
+from .pose_graph import Edges, Graph, Yaws, joined, no_edges, solve
+from .poses import Floats, axes_at, compose, interpolated, relative
+from .refinement import LEAST_SIGMAS, LONGEST_STEP, MOST_WORSE
+from .scans import FEWEST_ON_MAP, Scans
+from .solving import LEAST_YAW, UNSEEN
+from .wall_distances import Distances
+from .walls import wall_votes
+from .windows import TRAVEL, TURN, Odometry, Windows, cut
+
+SETTLED, LONGEST, SHIFT = 12, 44, 8
+"""Windows at the begin of the tail that stay, those of the tail at the most, and those that leave it at once: of five
+metres, from which walls go on, 18 and 3."""
+
+LATE = NANOSECONDS // 5
+"""Nanoseconds that a window waits for readings which come out of order."""
+
+OF_VOTES = 4
+"""Windows before the first that is not settled whose echoes vote with it."""
+
+SIGMA_SETTLED = np.array([0.02, 0.02, math.radians(0.3)])
+"""σ of a settled node: metres, metres, radians."""
+
+RECOGNISING = 2
+"""Windows after a block is judged at which its place is looked for, so that not all is done at once."""
+
+AROUND, MOST_AROUND = 4.0, 1000
+"""Metres around the robot, and readings at the most, that the map of another time is made of."""
+
+REACH, STEPS = np.array([0.6, 0.6, math.radians(7.5)]), (0.2, 0.2, math.radians(3.75))
+"""How far, and in which steps, the robot is looked for on it: metres, metres, radians; 2.5 σ."""
+
+SIGMAS = 2.5
+
+ASKED, MEASURED, CLIMBS = 60, 100, 3
+"""Readings that the search asks, those that measure the best pose, and parabolas that it is moved to the top of."""
+
+GOOD = 0.65
+"""Part of the usual score of a reading that a place must have."""
+
+JUDGED = 12
+"""Blocks that following is judged by at the most: twenty metres."""
+
+
+class _Tail(NamedTuple):
+    """The end of a drive, in the frame whose axes are those of walls.
+
+    Attributes
+    ----------
+    odometry : Odometry
+        From the begin of the first window on.
+    nodes : float64, shape (K, 3)
+        Those of the windows that are whole.
+    settled : int
+        Nodes that stay, the first ones.
+    places : Edges
+        Where places were recognised: from the first node.
+    """
+
+    odometry: Odometry
+    nodes: Floats
+    settled: int
+    places: Edges
+
+
+class Follower:
+    """Extends the trajectory of a whole drive as the robot drives on.
+
+    What it finds depends on odometry and readings, and not on when it is asked, as long as readings come within `LATE`
+    of those of later stamps.
+
+    Parameters
+    ----------
+    correction : Correction
+        Of the whole drive.
+    calibration : mapping of str to float
+        Of its odometry, by the names of `odometry_model`; those that are missing are 0.
+    parameters : Parameters
+
+    Attributes
+    ----------
+    correction : Correction
+        In force.
+    kept : bool
+        Whether it is kept as it was, since what is followed foresees readings worse.
+    windows : int
+        Followed so far.
+    places : int
+        Recognised so far.
+    obstacle : str
+        Why nothing is followed any more, in words; empty while it is.
+    """
+
+    def __init__(self, correction: Correction, calibration: Mapping[str, float], parameters: Parameters) -> None:
+        self.correction = self._before = self._proven = self._now = correction
+        self.kept, self.windows, self.places, self.obstacle = False, 0, 0, ''
+        self._parameters, self._stop = for_matching(parameters), np.zeros(1, np.uint8)
+        self._calibration = np.array([calibration.get(name, 0.0) for name in CALIBRATION])
+        told = parameters.association.odometry_noise
+        self._noise = Noise(yaw=max(LEAST_YAW, UNSEEN * told)) if told else Noise()
+        self._tail: _Tail | None = None
+        self._axes = np.zeros(3)
+        self._past = Readings.from_columns(z=[], x=[], y=[], yaw=[], z_max=[], half_angle=[])
+        self._gains: list[float] = []
+        self._score, self._scored = 0.0, 0
+
+    def cancel(self) -> None:
+        """Make `follow` raise `Cancelled` soon, and from there on; may be called from any thread."""
+        self._stop[0] = 1
+
+    def follow(self, readings: Readings, odometry: Odometry) -> bool:
+        """Go on as far as windows are whole and have their readings; return whether `correction` is another one.
+
+        Parameters
+        ----------
+        readings : Readings
+            Of the drive so far, as odometry placed them; after the first call those since the one before, and of the
+            last windows, are enough.
+        odometry : Odometry
+            Likewise.
+
+        Raises
+        ------
+        Cancelled
+            If `cancel` was called.
+        """
+        was, newest = self.correction, readings.stamp.max(initial=0)
+        tail = self._tail = self._tail or self._begun(readings)
+        while not self.obstacle:
+            check(self._stop)
+            whole = _continued(tail.odometry, odometry)
+            u = _steps(whole)
+            end = int(np.searchsorted(u, len(tail.nodes) + 1))
+            if end == len(u) or whole.stamp[end] + LATE > newest:
+                break
+            longest = np.hypot(*np.diff(whole.pose[: end + 1, :2], axis=0).T).max()
+            if longest > LONGEST_STEP:
+                self.obstacle = f'odometry jumped by {longest:.1f} m'
+                break
+            tail = self._tail = self._step(tail, readings, Odometry(whole.stamp[: end + 1], whole.pose[: end + 1]))
+        return self.correction is not was
+
+    def _begun(self, readings: Readings) -> _Tail:
+        """Return the tail where the whole drive ends, and remember what was mapped before it."""
+        path, odometry = self.correction.trajectory, self.correction.odometry
+        windows = cut(in_canonical_order(readings.select(readings.stamp <= self.correction.end)), odometry)
+        nodes = path.at(windows.node_stamp)
+        self._axes = np.array([0.0, 0.0, direction_of_walls(windows, nodes)])
+        begin = max(len(windows) - SETTLED, 0)
+        sensors = compose(path.at(windows.readings.stamp), windows.mount)
+        past = at_poses(windows.readings, relative(self._axes, sensors))
+        self._past = past.select(slice(0, windows.first[begin]))
+        nodes = relative(self._axes, nodes[begin:])
+        nodes[:, 2] = np.unwrap(nodes[:, 2])
+        return _Tail(_from_step(odometry, begin), nodes, len(nodes), no_edges())
+
+    def _step(self, tail: _Tail, readings: Readings, odometry: Odometry) -> _Tail:
+        """Return the tail with what `odometry` has beyond it, of which the last window has just become whole."""
+        within = (readings.stamp > odometry.stamp[0]) & (readings.stamp <= odometry.stamp[-1])
+        windows = cut(in_canonical_order(readings.select(within)), odometry)
+        count, none = len(windows), np.zeros(len(windows), np.bool_)
+        motion = motions(calibrated(odometry, self._calibration), windows)
+        nodes, places = _ahead(tail.nodes, motion), tail.places
+        if count >= 2 * BLOCK and count % BLOCK in (0, RECOGNISING):
+            scans = Scans(windows, self._parameters, self._stop, none)
+            block = np.arange(count - BLOCK, count)
+            if count % BLOCK:
+                places = joined(places, self._recognised(scans, nodes, block))
+            else:
+                self._judge(scans, _ahead(tail.nodes[: block[0]], motion), block)
+        solution = solve(self._graph(windows, motion, nodes, tail._replace(places=places)), nodes, np.zeros(0))
+        self.windows += count - len(tail.nodes)
+        tail = _Tail(odometry, solution.nodes, tail.settled, places)
+        self._put_in_force(tail, windows)
+        return self._shifted(tail, windows) if count >= LONGEST else tail
+
+    def _graph(self, windows: Windows, motion: Floats, nodes: Floats, tail: _Tail) -> Graph:
+        """Return the pose graph of the tail; `motion` is that of calibrated odometry, shape (K − 1, 3)."""
+        count, none = np.arange(len(windows)), np.zeros(len(windows), np.bool_)
+        information = np.asarray(np.linalg.inv(covariances(windows, self._noise)), np.float64)
+        steps = Edges(count[:-1], count[1:], motion, information)
+        settled = count[: tail.settled]
+        sure = np.broadcast_to(np.diag(SIGMA_SETTLED**-2.0), (len(settled), 3, 3))
+        stay = Edges(np.zeros_like(settled), settled, relative(nodes[0], nodes[settled]), sure)
+        at, votes = wall_votes(windows, count < tail.settled - OF_VOTES)
+        at, votes = at[at >= tail.settled], votes[at >= tail.settled]
+        off, of_votes = yaws_of_votes(votes, windows.node[at, 2], nodes[at, 2] - windows.node[at, 2])
+        yaws = Yaws(
+            np.concatenate([settled, at]),
+            np.concatenate([nodes[settled, 2], windows.node[at, 2] + off]),
+            np.concatenate([np.full(len(settled), SIGMA_SETTLED[2] ** -2.0), of_votes]),
+        )
+        walls = Distances(windows, none, nodes).walls(True)
+        # the calibration is known
+        known = np.zeros((len(motion), 3, 0)), np.zeros(0)
+        return Graph(steps, *known, joined(stay, tail.places), yaws, walls)
+
+    def _recognised(self, scans: Scans, nodes: Floats, block: NDArray[np.int64]) -> Edges:
+        """Return the match of a block with the map of what was driven here before the tail, if it fits as usual."""
+        past, guess = self._past, nodes[block[-1]]
+        joint = scans.joint(block, relative(guess, nodes[block]))
+        near = np.flatnonzero(np.hypot(past.x - guess[0], past.y - guess[1]) < AROUND)
+        if not self._scored or min(len(near), len(joint.readings)) < FEWEST_ON_MAP:
+            return no_edges()
+        near = near[:: -(-len(near) // MOST_AROUND)]
+        sensors = np.stack([past.x[near], past.y[near], past.yaw[near]], axis=1)
+        placed = at_poses(past.select(near), relative(nodes[0], sensors))
+        around = local_map(placed, self._parameters, self._stop)
+        at = relative(nodes[0], guess)
+        poses = grid_around(at, REACH, STEPS)
+        values = scores(joint, around, poses, max(len(joint.readings) // ASKED, 1))
+        off = relative(at, poses) * SIGMAS / REACH
+        best = poses[int((values - 0.5 * (off**2).sum(1)).argmax())]
+        for _ in range(CLIMBS):
+            best = measure(joint, around, best, MEASURED).pose
+        match = measure(joint, around, best, MEASURED)
+        if match.score < GOOD * self._score / self._scored * len(joint.readings):
+            return no_edges()
+        self.places += 1
+        return Edges(np.zeros(1, np.int64), block[-1:], match.pose[None], match.information[None])
+
+    def _judge(self, scans: Scans, followed: Floats, block: NDArray[np.int64]) -> None:
+        """Compare how a block is foreseen where it is followed, shape (K, 3), and by the correction that is proven."""
+        w, proven = scans.windows, self._proven
+        kept = relative(self._axes, compose(proven.last, w.node))
+        early = w.node_stamp <= proven.end
+        kept[early] = followed[early]
+        members = np.flatnonzero(w.node_progress[block[0]] - w.node_progress[: block[0]] < BEHIND)
+        count, place, said = int(scans.count[block].sum()), int(members[-1]), []
+        for nodes in (followed, kept):
+            around = scans.map(members, nodes[place], nodes)
+            if around is None or not count:
+                return
+            at = relative(nodes[place], nodes)
+            said.append(sum(float(scores(scans.scan[k], around, at[k : k + 1])[0]) for k in block))
+        self._score, self._scored = self._score + said[0], self._scored + count
+        self._gains = [*self._gains[1 - JUDGED :], (said[0] - said[1]) / count]
+
+    def _put_in_force(self, tail: _Tail, windows: Windows) -> None:
+        """Set the correction: that of the tail, or the proven one where this foresees readings better."""
+        odometry = tail.odometry
+        pose = windows.corrected(odometry.progress, odometry.pose, tail.nodes)
+        # the first pose is that of a window's begin
+        stamp, path = odometry.stamp[1:], compose(self._axes, pose[1:])
+        now = self._before.continued(Odometry(stamp, odometry.pose[1:]), Odometry(stamp, path))
+        better = gain(np.zeros(len(self._gains)), np.array(self._gains)).sigmas
+        if better > LEAST_SIGMAS:
+            self._proven, self._gains = now, []
+        self.kept = better < (0.0 if self.kept else -MOST_WORSE)
+        self.correction, self._now = (self._proven if self.kept else now), now
+
+    def _shifted(self, tail: _Tail, windows: Windows) -> _Tail:
+        """Return the tail without its first windows; what they read is of another time from here on."""
+        w, end = windows, windows.first[SHIFT]
+        robot = w.corrected(w.progress[:end], w.robot[:end], tail.nodes)
+        leaving = at_poses(w.readings.select(slice(0, end)), compose(robot, w.mount[:end]))
+        self._past = _both(self._past, leaving)
+        odometry = _from_step(tail.odometry, SHIFT)
+        self._before = self._now.until(max(int(odometry.stamp[0]), self._before.end))
+        places = _seen_from(tail.places, relative(tail.nodes[SHIFT], tail.nodes[0]), SHIFT)
+        return _Tail(odometry, tail.nodes[SHIFT:], SETTLED, places)
+
+
+def direction_of_walls(windows: Windows, nodes: Floats) -> float:
+    """Return the direction of walls, radians modulo a right angle, along known nodes, shape (K, 3)."""
+    at, votes = wall_votes(windows, np.zeros(len(windows), np.bool_))
+    count = votes.shape[1]
+    degrees, ends = np.arange(count), np.column_stack([votes, votes[:, :1]])
+    seen = (degrees - np.degrees(nodes[at, 2])[:, None]) % count
+    rows = [np.interp(place, np.arange(count + 1), row) for place, row in zip(seen, ends, strict=True)]
+    direction = math.radians(float(np.sum(rows, axis=0).argmax()))
+    off, sure = yaws_of_votes(votes, nodes[at, 2] - direction, np.zeros(len(at)))
+    return direction - float((off * sure).sum() / max(sure.sum(), 1e-9))
+
+
+def _ahead(nodes: Floats, motion: Floats) -> Floats:
+    """Return nodes and those that follow from the motions behind them, shape (K, 3)."""
+    out = list(nodes)
+    for step in motion[len(nodes) - 1 :]:
+        out.append(compose(out[-1], step))
+    return np.array(out)
+
+
+def _steps(odometry: Odometry) -> Floats:
+    """Return u of each pose, as in `windows`."""
+    out: Floats = odometry.travel / TRAVEL + odometry.turn / TURN
+    return out
+
+
+def _from_step(odometry: Odometry, begin: int) -> Odometry:
+    """Return the odometry from where u is `begin` on."""
+    u = _steps(odometry)
+    first = int(np.searchsorted(u, begin, side='right'))
+    part = (begin - u[first - 1]) / (u[first] - u[first - 1])
+    stamp = odometry.stamp[first - 1] + round(part * (odometry.stamp[first] - odometry.stamp[first - 1]))
+    pose = interpolated(np.array([begin]), u[first - 1 : first + 1], odometry.pose[first - 1 : first + 1])
+    return Odometry(np.append(stamp, odometry.stamp[first:]), np.concatenate([pose, odometry.pose[first:]]))
+
+
+def _continued(tail: Odometry, odometry: Odometry) -> Odometry:
+    """Return the odometry of the tail with what comes after it."""
+    first = int(np.searchsorted(odometry.stamp, tail.stamp[-1], side='right'))
+    stamp = np.concatenate([tail.stamp, odometry.stamp[first:]])
+    return Odometry.of(stamp, np.concatenate([tail.pose, odometry.pose[first:]]))
+
+
+def _seen_from(places: Edges, first: Floats, leaving: int) -> Edges:
+    """Return places without those of settled nodes when so many nodes leave.
+
+    Parameters
+    ----------
+    places : Edges
+        From the first node.
+    first : float64, shape (3,)
+        Pose of this node in the frame of the one that will be the first.
+    leaving : int
+    """
+    stay, axes = places.second >= leaving + SETTLED, axes_at(first[2])
+    information = axes @ places.information[stay] @ axes.T
+    return Edges(places.first[stay], places.second[stay] - leaving, compose(first, places.pose[stay]), information)
+
+
+def _both(one: Readings, other: Readings) -> Readings:
+    """Return readings, and later ones of the same drive."""
+    columns: dict[str, Any] = {
+        column.name: np.concatenate([getattr(one, column.name), getattr(other, column.name)])
+        for column in fields(Readings)
+        if column.name != 'sensor_names'
+    }
+    return Readings(**columns, sensor_names=other.sensor_names)

@@ -1,0 +1,109 @@
+"""Following in the background: the trajectory that a run found goes on with every window that the robot drives."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core.common.errors import Cancelled
+from ..core.common.readings import Readings
+from ..core.messages.message_types import Pose2
+from ..core.trajectory.correction import Correction
+from ..core.trajectory.following import Follower
+from ..core.trajectory.windows import Odometry
+from .background import Inbox, Worker
+
+
+class Following:
+    """Owned by the executor; its methods return at once.
+
+    Attributes
+    ----------
+    follower : Follower or None
+        What follows; its thread changes it.
+    """
+
+    def __init__(self, log: Any, inbox: Inbox, changed: Callable[[Correction], object]) -> None:
+        """Follow nothing yet; `changed` is called by the executor with each correction that is new."""
+        self.follower: Follower | None = None
+        self.worker = Worker('following', log.error)
+        self._log, self._inbox, self._changed = log, inbox, changed
+        self._seen: Pose2 | None
+        self._busy, self._seen = False, None
+
+    @property
+    def obstacle(self) -> str:
+        """Why nothing is followed any more, in words; empty while it is, or was never begun."""
+        return self.follower.obstacle if self.follower else ''
+
+    def begin(self, follower: Follower | None) -> None:
+        """Go on with another follower; with none, end."""
+        self.cancel()
+        self.follower, self._busy, self._seen = follower, False, None
+        self._say()
+
+    def offer(self, at: Pose2, readings: Readings, odometry: tuple[NDArray[np.int64], NDArray[np.float64]]) -> None:
+        """Have what there is by now followed, unless the thread is busy, or the robot has not moved; called often.
+
+        Parameters
+        ----------
+        at : Pose2
+            The newest pose of odometry.
+        readings : Readings
+            All that are held, as odometry placed them.
+        odometry : (int64, shape (M,), float64, shape (M, 3))
+            Stamps and poses.
+        """
+        follower = self.follower
+        if follower is None or self._busy or follower.obstacle or at == self._seen:
+            return
+        self._busy, self._seen = True, at
+
+        def work() -> None:
+            try:
+                follower.follow(readings, Odometry(*odometry))
+            except Cancelled:
+                return
+            self._inbox.put(lambda: self._take(follower))
+
+        def failed(why: str) -> None:
+            follower.obstacle = why
+            self._inbox.put(lambda: self._take(follower))
+
+        self.worker.put(work, failed)
+
+    def cancel(self) -> None:
+        """Have what goes on end soon; nothing of it is taken."""
+        if self.follower is not None:
+            self.follower.cancel()
+            self.follower = None
+
+    def close(self, seconds: float) -> None:
+        """Cancel, and wait so long for the end of the thread."""
+        self.cancel()
+        self.worker.close(seconds)
+
+    def values(self) -> dict[str, str]:
+        """Return what diagnostics say."""
+        follower = self.follower
+        if follower is None:
+            return {}
+        said = f'{follower.windows} windows, {follower.places} places recognised'
+        if follower.kept:
+            said += '; the correction is kept, since readings are foreseen worse where it is followed'
+        return {'followed since the latest run': f'{said}; ended: {follower.obstacle}' if follower.obstacle else said}
+
+    def _take(self, follower: Follower) -> None:
+        if follower is self.follower:
+            self._busy = False
+            self._changed(follower.correction)
+            self._say()
+
+    def _say(self) -> None:
+        if self.obstacle:
+            self._log.warning(
+                f'map to odom is not followed any more: {self.obstacle}; it stays as it is until the next run_em'
+            )

@@ -1,0 +1,317 @@
+"""Following: better than keeping the correction, the same in any portions, and never against what is foreseen."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from forward_grid_mapper.core import warm_up
+from forward_grid_mapper.core.common.errors import Cancelled
+from forward_grid_mapper.core.common.parameters import Parameters
+from forward_grid_mapper.core.common.readings import Readings
+from forward_grid_mapper.core.trajectory import following, likelihood, walls
+from forward_grid_mapper.core.trajectory.correction import Correction
+from forward_grid_mapper.core.trajectory.following import LATE, LONGEST, SETTLED, Follower, direction_of_walls
+from forward_grid_mapper.core.trajectory.pose_graph import Edges, no_edges
+from forward_grid_mapper.core.trajectory.poses import axes_at, compose, relative, wrapped
+from forward_grid_mapper.core.trajectory.windows import Odometry, cut
+from forward_grid_mapper.simulation.drift import LEVELS, with_drift
+from forward_grid_mapper.simulation.drive import Recording, drive
+from forward_grid_mapper.simulation.sonar import NOISY, sonar_ring
+from forward_grid_mapper.simulation.world import building_tour, building_world
+
+KNOWN = 10.0
+"""Metres of the drive whose trajectory is given."""
+
+
+def odometry_of(recording: Recording) -> Odometry:
+    messages = recording.odometry
+    return Odometry.of(np.array([m.stamp for m in messages]), np.array([m.pose for m in messages], np.float64))
+
+
+class Sample:
+    """A drive of 25 m whose odometry drifts, and whose trajectory is known for the first ten."""
+
+    def __init__(self) -> None:
+        exact = drive(building_world(), building_tour()[:10], 0.15, sonar_ring(16), NOISY, seed=3)
+        bent = with_drift(exact, LEVELS['high'], 6)
+        self.readings, self.odometry, self.true = bent.readings, odometry_of(bent), odometry_of(exact)
+        self.known = int(np.searchsorted(self.odometry.travel, KNOWN))
+        begun = slice(0, self.known + 1)
+        stamp = self.odometry.stamp[begun]
+        self.correction = Correction(Odometry(stamp, self.odometry.pose[begun]), Odometry(stamp, self.true.pose[begun]))
+
+    def off(self, correction: Correction) -> np.ndarray:
+        """Metres by which the poses after the known ones are off, as they are said to be in the end."""
+        said = correction.extended(self.odometry.stamp, self.odometry.pose).pose
+        return np.hypot(*(said - self.true.pose)[self.known :, :2].T)
+
+    def until(self, stamp: int) -> tuple[Readings, Odometry]:
+        """What has come when the newest reading has this stamp."""
+        o = self.odometry
+        end = int(np.searchsorted(o.stamp, stamp, side='right'))
+        return self.readings.select(self.readings.stamp <= stamp), Odometry(o.stamp[:end], o.pose[:end])
+
+
+@pytest.fixture(scope='module')
+def sample() -> Sample:
+    return Sample()
+
+
+def follower_of(sample: Sample) -> Follower:
+    return Follower(sample.correction, {}, Parameters())
+
+
+@pytest.fixture(scope='module')
+def followed(sample: Sample) -> Follower:
+    follower = follower_of(sample)
+    assert follower.follow(sample.readings, sample.odometry)
+    return follower
+
+
+def same(one: Correction, other: Correction) -> bool:
+    return np.array_equal(one.trajectory.stamp, other.trajectory.stamp) and np.array_equal(
+        one.trajectory.pose, other.trajectory.pose
+    )
+
+
+def test_it_is_better_than_keeping_the_correction(sample: Sample, followed: Follower) -> None:
+    kept, ours = sample.off(sample.correction), sample.off(followed.correction)
+    assert np.sqrt((kept**2).mean()) > 0.5
+    assert np.sqrt((ours**2).mean()) < 0.15
+    assert ours.max() < 0.3
+    yaw = followed.correction.trajectory.pose[-1, 2] - sample.true.at(followed.correction.trajectory.stamp[-1:])[0, 2]
+    assert abs(wrapped(yaw)) < math.radians(3.0)
+    assert followed.windows > LONGEST - SETTLED, 'the tail was shifted'
+    assert not followed.kept
+    assert not followed.obstacle
+
+
+def test_what_was_found_as_a_whole_stays_and_nothing_is_left_out(sample: Sample, followed: Follower) -> None:
+    correction, count = followed.correction, sample.known + 1
+    assert np.array_equal(correction.trajectory.pose[:count], sample.true.pose[:count])
+    stamp = correction.trajectory.stamp
+    assert np.array_equal(stamp, correction.odometry.stamp)
+    assert (np.diff(stamp) > 0).all()
+    assert np.array_equal(stamp, sample.odometry.stamp[: len(stamp)])
+    assert np.array_equal(correction.odometry.pose, sample.odometry.pose[: len(stamp)])
+    path = correction.trajectory.pose
+    assert np.hypot(*np.diff(path[:, :2], axis=0).T).max() < 0.1, 'no jumps'
+
+
+@pytest.mark.parametrize('every', [1, 7, 150])
+def test_portions_do_not_matter(sample: Sample, followed: Follower, every: int) -> None:
+    stamps = sample.odometry.stamp[sample.known :: every]
+    follower, changes = follower_of(sample), 0
+    for stamp in [*stamps.tolist(), int(sample.readings.stamp.max())]:
+        changes += follower.follow(*sample.until(stamp))
+    assert changes >= min(len(stamps) // 2, 10)
+    assert follower.windows == followed.windows
+    assert same(follower.correction, followed.correction)
+
+
+def test_readings_may_come_out_of_order(sample: Sample) -> None:
+    half = int(sample.odometry.stamp[(sample.known + len(sample.odometry.stamp)) // 2])
+    straight, shuffled = follower_of(sample), follower_of(sample)
+    readings, odometry = sample.until(half)
+    order = np.argsort(readings.stamp + np.random.default_rng(1).integers(0, LATE, len(readings)))
+    straight.follow(readings, odometry)
+    # those that are late are there a fifth of a second later
+    early = readings.select(order[: len(order) - 40])
+    shuffled.follow(early, odometry)
+    shuffled.follow(readings.select(order), odometry)
+    assert straight.windows == shuffled.windows > 5
+    assert same(straight.correction, shuffled.correction)
+
+
+def test_it_waits_for_whole_windows_and_their_readings(sample: Sample) -> None:
+    follower = follower_of(sample)
+    assert not follower.follow(*sample.until(sample.correction.end))
+    assert follower.correction is sample.correction
+    readings, _ = sample.until(sample.correction.end)
+    # odometry alone is not enough
+    assert not follower.follow(readings, sample.odometry)
+    assert follower.windows == 0
+    assert follower.follow(sample.readings, sample.odometry)
+
+
+def test_calibration_is_applied(sample: Sample, monkeypatch: pytest.MonkeyPatch) -> None:
+    # without echoes there is nothing else, and nothing to judge by
+    monkeypatch.setattr(Follower, '_judge', lambda self, *_: None)
+    deaf = replace(sample.readings, z=sample.readings.z_max)
+    ends = []
+    for calibration in ({}, {'bias': 0.05}, {'scale': 0.1}):
+        follower = Follower(sample.correction, calibration, Parameters())
+        assert follower.follow(deaf, sample.odometry)
+        ends.append(follower.correction)
+    plain, turned, longer = ends
+    # settled nodes lie where the trajectory was, and from there on odometry goes on
+    said, kept = sample.off(plain), sample.off(sample.correction)
+    assert abs(said[: len(kept)] - kept).max() < 0.3
+    way = plain.trajectory.travel[-1] - plain.trajectory.travel[sample.known]
+    off = turned.trajectory.pose[-1, 2] - plain.trajectory.pose[-1, 2]
+    assert off == pytest.approx(0.05 * way, rel=0.1)
+    more = longer.trajectory.travel[-1] - longer.trajectory.travel[sample.known]
+    assert more == pytest.approx(1.1 * way, rel=0.03)
+
+
+def test_a_jump_of_odometry_ends_it(sample: Sample) -> None:
+    o = sample.odometry
+    pose, at = o.pose.copy(), (sample.known + len(o.stamp)) // 2
+    pose[at:, 0] += 3.0
+    follower = follower_of(sample)
+    assert follower.follow(sample.readings, Odometry(o.stamp, pose))
+    assert 'odometry jumped by' in follower.obstacle
+    assert follower.correction.end < o.stamp[at]
+    before = follower.correction
+    assert not follower.follow(sample.readings, Odometry(o.stamp, pose))
+    assert follower.correction is before
+
+
+def test_it_can_be_cancelled(sample: Sample) -> None:
+    follower = follower_of(sample)
+    follower.cancel()
+    with pytest.raises(Cancelled):
+        follower.follow(sample.readings, sample.odometry)
+    assert follower.correction is sample.correction
+
+
+def test_what_foresees_worse_is_not_in_force(sample: Sample, monkeypatch: pytest.MonkeyPatch) -> None:
+    # walls that lead astray: the yaw swings by a quarter from place to place
+    real = following.yaws_of_votes
+
+    def astray(votes: Any, yaw: Any, correction: Any) -> Any:
+        found, _ = real(votes, yaw, correction)
+        return found + 0.7 * np.sin(2.0 * np.arange(len(found))), np.full(len(found), 1e5)
+
+    follower = follower_of(sample)
+    follower.follow(*sample.until(sample.correction.end))
+    monkeypatch.setattr(following, 'yaws_of_votes', astray)
+    follower.follow(sample.readings, sample.odometry)
+    assert follower.kept
+    assert follower.correction is sample.correction
+
+
+def test_the_correction_that_has_proved_itself_is_the_one_to_keep(
+    sample: Sample, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    said = [0.1 + 0.01 * (k % 2) for k in range(6)] + [-0.2 - 0.01 * (k % 2) for k in range(6)] + [0.5] * 20
+    ours = iter(said)
+    monkeypatch.setattr(
+        Follower, '_judge', lambda self, *_: setattr(self, '_gains', [*self._gains, next(ours)][-following.JUDGED :])
+    )
+    monkeypatch.setattr(following, 'BLOCK', 2)
+    monkeypatch.setattr(following, 'RECOGNISING', 3)
+    follower, kept, proven = follower_of(sample), [], []
+    for stamp in sample.odometry.stamp[sample.known :].tolist():
+        if follower.follow(*sample.until(stamp)):
+            kept.append(follower.kept)
+            proven.append(follower._proven)
+    assert proven[0] is sample.correction
+    assert any(each is not sample.correction for each in proven)
+    first = kept.index(True)
+    assert not all(kept[first:]), 'and it goes on when it foresees better again'
+    assert proven[first] is not sample.correction
+
+
+@pytest.mark.parametrize('angle', [0.0, 0.3, -0.7, 2.0])
+def test_the_direction_of_walls_turns_with_the_map(sample: Sample, angle: float) -> None:
+    readings, odometry = sample.until(sample.correction.end)
+    windows = cut(readings, odometry)
+    nodes = compose(np.array([1.0, -2.0, angle]), sample.correction.trajectory.at(windows.node_stamp))
+    off = (direction_of_walls(windows, nodes) - angle + math.pi / 4) % (math.pi / 2) - math.pi / 4
+    assert abs(off) < math.radians(1.0)
+
+
+def test_a_map_that_is_turned_is_followed_alike(sample: Sample, followed: Follower) -> None:
+    turn = np.array([3.0, -1.0, 0.4])
+    base = sample.correction
+    turned = Correction(base.odometry, Odometry(base.trajectory.stamp, compose(turn, base.trajectory.pose)))
+    follower = Follower(turned, {}, Parameters())
+    follower.follow(sample.readings, sample.odometry)
+    back = relative(turn, follower.correction.trajectory.pose)[:, :2]
+    assert np.abs(back - followed.correction.trajectory.pose[:, :2]).max() < 0.1
+
+
+def test_places_are_recognised_in_what_was_mapped_before(sample: Sample, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The robot turns around and drives back, and nothing but places tells that the wheels are said to be too small."""
+    there, path = replaced_by_truth(sample), sample.true
+    end, pause = int(path.stamp[-1]), 10**9
+    back = path.pose[::-1] + np.array([0.0, 0.0, math.pi])
+    stamp = end + pause + (end - path.stamp)[::-1]
+    back_path = Odometry.of(stamp, back)
+    whole = Odometry.of(np.concatenate([path.stamp, stamp]), np.concatenate([path.pose, back_path.pose]))
+    # a ring of sonars sees the same when it has turned by half, each by the one across
+    across = {name: k for k, name in enumerate(there.sensor_names)}
+    assert len(across) == 16
+    sensor = (there.sensor + 8) % 16
+    returned = replace(there, stamp=end + pause + (end - there.stamp), sensor=sensor)
+    returned = returned.select(np.argsort(returned.stamp, kind='stable'))
+    both = following._both(there, returned)
+    base = Correction(path, path)
+    drifts = []
+    for recognises in (True, False):
+        follower = Follower(base, {'scale': 0.05}, Parameters())
+        if not recognises:
+            monkeypatch.setattr(Follower, '_recognised', lambda self, *_: no_edges())
+        follower.follow(both, whole)
+        assert (follower.places > 3) == recognises
+        # what is followed, whether it is in force or not
+        path_now = follower._now.trajectory
+        drifts.append(np.hypot(*(path_now.pose - whole.at(path_now.stamp))[:, :2].T).max())
+    assert drifts[0] < 0.3
+    assert drifts[0] < 0.7 * drifts[1]
+
+
+def replaced_by_truth(sample: Sample) -> Readings:
+    o, t = sample.odometry, sample.true
+    r = sample.readings
+    mount = relative(o.at(r.stamp), np.stack([r.x, r.y, r.yaw], 1))
+    x, y, yaw = compose(t.at(r.stamp), mount).T
+    return replace(r, x=x.copy(), y=y.copy(), yaw=yaw.copy())
+
+
+@pytest.mark.parametrize('seed', range(10))
+def test_places_stay_where_they_are_when_the_tail_is_shifted(seed: int) -> None:
+    """Their residuals, and what these count, are the same in the frame of another first node."""
+    rng = np.random.default_rng(seed)
+    old, new, node = rng.normal(0.0, 3.0, (3, 3))
+    measured = relative(old, node) + rng.normal(0.0, 0.05, 3)
+    half = rng.normal(0.0, 1.0, (3, 3))
+    edges = Edges(np.zeros(1, np.int64), np.array([30]), measured[None], (half @ half.T)[None])
+    moved = following._seen_from(edges, relative(new, old), 8)
+
+    def counted(frame: np.ndarray, e: Edges) -> float:
+        r = relative(frame, node) - e.pose[0]
+        r[2] = wrapped(r[2])
+        return float(r @ e.information[0] @ r)
+
+    assert counted(new, moved) == pytest.approx(counted(old, edges))
+    assert (moved.first[0], moved.second[0]) == (0, 22)
+    gone = edges._replace(second=np.array([8 + SETTLED - 1]))
+    assert not len(following._seen_from(gone, relative(new, old), 8).first), 'settled nodes need none'
+    assert axes_at(0.0) == pytest.approx(np.eye(3))
+
+
+def test_odometry_from_a_window_on_has_the_same_windows(sample: Sample) -> None:
+    for begin in (0, 1, 7, 20):
+        rest = following._from_step(sample.odometry, begin)
+        whole, ours = following._steps(sample.odometry), following._steps(rest)
+        assert ours[-1] == pytest.approx(whole[-1] - begin)
+        assert (np.diff(rest.stamp) >= 0).all()
+        one = cut(sample.readings.select(sample.readings.stamp > rest.stamp[0]), rest)
+        other = cut(sample.readings, sample.odometry)
+        assert one.node == pytest.approx(other.node[begin:], abs=1e-6)
+
+
+def test_nothing_is_compiled_while_it_follows(sample: Sample) -> None:
+    warm_up.warm_up_trajectory()
+    kernels = [walls.count_votes, likelihood.score_poses, likelihood._set_unknown]
+    before = [len(kernel.signatures) for kernel in kernels]
+    half = int(sample.odometry.stamp[(sample.known + len(sample.odometry.stamp)) // 2])
+    follower_of(sample).follow(*sample.until(half))
+    assert [len(kernel.signatures) for kernel in kernels] == before

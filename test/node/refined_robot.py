@@ -1,0 +1,57 @@
+"""A node inside the process of the test, whose trajectory a quick refiner finds, and what its live map has to be."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from drift_samples import bend, replaced_by
+from inside import Inside
+
+from forward_grid_mapper.core.common.parameters import Parameters
+from forward_grid_mapper.core.maps.log_odds_map import LogOddsMap
+from forward_grid_mapper.core.trajectory.poses import compose, relative
+from forward_grid_mapper.core.trajectory.windows import Odometry
+
+
+def odometry_of(robot: Inside) -> Odometry:
+    return Odometry.of(*robot.node.associator.odometry)
+
+
+def refined(robot: Inside, *, count: int = 200) -> tuple[Inside, Odometry]:
+    robot.drive(0, count)
+    assert robot.call(robot.node.em.run_em)[0]
+    return robot, odometry_of(robot)
+
+
+def live_of(robot: Inside) -> tuple[Any, np.ndarray]:
+    snapshot = robot.node.live.snapshot()
+    return snapshot.grid, snapshot.probability
+
+
+def expected_live(robot: Inside, bent: Odometry | None) -> tuple[Any, np.ndarray]:
+    """The live map of all readings, each where it was before `bent`, or as odometry has it."""
+    readings = robot.node.associator.readings
+    if bent is not None:
+        then = bend(bent)
+        at = np.clip(readings.stamp, bent.stamp[0], bent.stamp[-1])
+        sensors = np.stack([readings.x, readings.y, readings.yaw], 1)
+        placed = compose(then.at(at), relative(bent.at(at), sensors))
+        readings = replaced_by(readings, placed)
+    live = LogOddsMap(Parameters())
+    live.add(readings)
+    return live.grid, live.probability()
+
+
+def assert_live(robot: Inside, bent: Odometry | None) -> None:
+    robot.node._feed()
+    (grid, ours), (expected_grid, theirs) = live_of(robot), expected_live(robot, bent)
+    assert grid == expected_grid
+    assert np.array_equal(np.isnan(ours), np.isnan(theirs))
+    assert np.nanmax(np.abs(ours - theirs)) < 1e-3
+
+
+def begin(robot: Inside) -> None:
+    """Have the node see where the robot begins to drive."""
+    robot.drive(0, 1)
+    robot.until(lambda: robot.node.trajectory._at is not None)

@@ -1,0 +1,259 @@
+"""The node with `refine_poses` and `online`: map to odom follows while the robot drives."""
+
+from __future__ import annotations
+
+import itertools
+import threading
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip('rclpy', reason='the tests of the node need rclpy')
+
+from drift_samples import bent_drive, exact_drive, in_turn
+from inside import Inside
+from refined_robot import odometry_of
+
+from forward_grid_mapper.core.mapping import Mapper
+from forward_grid_mapper.core.trajectory.following import Follower
+from forward_grid_mapper.core.trajectory.refinement import Refinement, replaced
+from forward_grid_mapper.core.trajectory.windows import Odometry
+from forward_grid_mapper.node import refining
+
+OK, WARN = b'\x00', b'\x01'
+
+
+class Told:
+    """A bent drive in parts, and a refiner that is told where the robot really was."""
+
+    def __init__(self) -> None:
+        self.recording = bent_drive()
+        exact = exact_drive().odometry
+        self.true = Odometry.of(np.array([m.stamp for m in exact]), np.array([m.pose for m in exact], np.float64))
+        messages = in_turn(self.recording)
+        cuts = [0, *(int(part * len(messages)) for part in (0.4, 0.7)), len(messages)]
+        self.parts = [messages[begin:end] for begin, end in itertools.pairwise(cuts)]
+
+    def off(self, robot: Inside) -> float:
+        """Metres by which the robot's newest pose on the map is off."""
+        correction, odometry = robot.node.trajectory.correction, odometry_of(robot)
+        path = correction.extended(odometry.stamp, odometry.pose)
+        return float(np.hypot(*(path.pose[-1] - self.true.at(path.stamp[-1:])[0])[:2]))
+
+
+@pytest.fixture(scope='module')
+def told() -> Told:
+    return Told()
+
+
+@pytest.fixture
+def driving(inside: Callable[..., Inside], told: Told, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Inside]:
+    """Begin the drive, and run EM after the first part of it."""
+
+    class Knows:
+        def __init__(self, parameters: Any) -> None:
+            pass
+
+        def cancel(self) -> None:
+            pass
+
+        def run(self, readings: Any, odometry: Odometry, watch: Any) -> Refinement:
+            path = Odometry(odometry.stamp, told.true.at(odometry.stamp))
+            return Refinement(True, 'told', replaced(readings, odometry, path), path, {}, 1.0, 0.2, 3, 0.1)
+
+    monkeypatch.setattr(refining, 'Refiner', Knows)
+    mounts = {f'sensors.{frame}.pose': list(map(float, pose)) for frame, pose in told.recording.extrinsics}
+
+    def begin(**options: Any) -> Inside:
+        robot = inside(**{'refine_poses': True, 'online': True, **mounts, **options}).start()
+        robot.hand(told.parts[0])
+        assert robot.call(robot.node.em.run_em)[0]
+        return robot
+
+    return begin
+
+
+def follow(robot: Inside, least: int = 1) -> Follower:
+    """Turn the executor until so many windows are followed and nothing is left to do."""
+    part = robot.node.trajectory.following
+    assert part is not None
+    robot.until(lambda: part.follower is not None and part.follower.windows >= least)
+    robot.until(lambda: not part.worker.waiting and not part._busy)
+    follower: Follower = part.follower
+    return follower
+
+
+def test_map_to_odom_follows_while_the_robot_drives(
+    driving: Callable[..., Inside], told: Told, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    by, follow_on = set(), Follower.follow
+
+    def noted(self: Follower, *arguments: Any) -> bool:
+        by.add(threading.get_ident())
+        return follow_on(self, *arguments)
+
+    monkeypatch.setattr(Follower, 'follow', noted)
+    robot = driving()
+    node = robot.node
+    base = node.trajectory.correction
+    robot.hand(told.parts[1])
+    follower = follow(robot, 10)
+    assert node.trajectory.correction is follower.correction
+    assert told.off(robot) < 0.35
+    kept = np.hypot(*(base.last - node.trajectory.correction.last)[:2])
+    assert kept > 0.3, 'the correction has moved on'
+    assert node.em.found.correction is base, 'what the run found stays'
+    values = robot.status('trajectory')
+    assert values['followed since the latest run'].startswith(f'{follower.windows} windows')
+    assert values['level'] == OK
+    robot.hand(told.parts[2])
+    follow(robot, follower.windows + 5)
+    assert told.off(robot) < 0.35
+    assert by and threading.get_ident() not in by, 'the executor does not do it'
+    # what comes goes into the maps where it is followed to
+    readings = node.associator.readings
+    placed, odometry = node.trajectory.place(readings), odometry_of(robot)
+    right = replaced(readings, odometry, Odometry(odometry.stamp, told.true.at(odometry.stamp)))
+    assert np.hypot(placed.x - right.x, placed.y - right.y).max() < 0.35
+    assert not node.live.worker.trouble
+    assert not node.trajectory.following.worker.trouble
+    # the whole is looked at anew
+    assert robot.call(node.em.run_em)[0]
+    assert node.trajectory.following.follower is not follower
+    assert told.off(robot) < 0.1
+
+
+def test_what_is_driven_while_a_run_goes_on_is_followed_when_it_ends(
+    driving: Callable[..., Inside], told: Told, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    robot = driving()
+    before = robot.node.trajectory.following.follower
+    begun, go_on = threading.Event(), threading.Event()
+    run = Mapper.run
+
+    def waits(*arguments: Any) -> Any:
+        begun.set()
+        assert go_on.wait(60.0)
+        return run(*arguments)
+
+    monkeypatch.setattr(Mapper, 'run', waits)
+    answer = robot.begin(robot.node.em.run_em)
+    robot.until(begun.is_set)
+    robot.hand(told.parts[1])
+    follow(robot, 10)
+    assert robot.node.trajectory.following.follower is before, 'the one before goes on meanwhile'
+    go_on.set()
+    robot.until(lambda: answer.sent)
+    assert answer.sent[0][0]
+    after = robot.node.trajectory.following.follower
+    assert after is not before
+    assert after.windows >= 10, 'it is where the robot is as soon as it is in force'
+    assert robot.node.trajectory.correction is after.correction
+    assert told.off(robot) < 0.35
+
+
+def test_it_follows_neither_without_online_nor_when_refine_poses_is_off(
+    driving: Callable[..., Inside], told: Told
+) -> None:
+    robot = driving(online=False)
+    base = robot.node.trajectory.correction
+    assert robot.node.trajectory.following is None
+    robot.hand(told.parts[1])
+    robot.spin(0.3)
+    assert robot.node.trajectory.correction is base
+    other = driving()
+    base = other.node.trajectory.correction
+    other.set(refine_poses=False)
+    other.hand(told.parts[1])
+    other.spin(0.3)
+    assert other.node.trajectory.correction is base
+    assert other.node.trajectory.following.follower.windows == 0
+
+
+def test_reset_ends_it(driving: Callable[..., Inside], told: Told, monkeypatch: pytest.MonkeyPatch) -> None:
+    robot = driving()
+    begun, go_on = threading.Event(), threading.Event()
+    follow_on = Follower.follow
+
+    def waits(self: Follower, *arguments: Any) -> bool:
+        begun.set()
+        assert go_on.wait(60.0)
+        return follow_on(self, *arguments)
+
+    monkeypatch.setattr(Follower, 'follow', waits)
+    robot.hand(told.parts[1])
+    robot.until(begun.is_set)
+    assert robot.call(robot.node.reset)[0]
+    go_on.set()
+    part = robot.node.trajectory.following
+    robot.until(lambda: not part.worker.waiting)
+    robot.spin(0.1)
+    assert part.follower is None
+    assert robot.node.trajectory.correction is None
+    assert not part.worker.trouble
+    assert 'followed since the latest run' not in robot.status('trajectory')
+
+
+def test_it_goes_on_after_a_pause_and_other_parameters(driving: Callable[..., Inside], told: Told) -> None:
+    robot = driving()
+    half = len(told.parts[1]) // 2
+    request = type('Request', (), {'data': True})()
+    robot.call(robot.node.pause, request)
+    robot.hand(told.parts[1][:half])
+    robot.spin(0.2)
+    follower = robot.node.trajectory.following.follower
+    assert follower.windows == 0, 'windows wait for readings'
+    request.data = False
+    robot.call(robot.node.pause, request)
+    robot.set(p_hit=0.6, publish_rate=5.0)
+    robot.hand(told.parts[1][half:])
+    assert follow(robot, 10) is follower
+    assert not follower.obstacle
+    assert robot.node.trajectory.correction is follower.correction
+
+
+def test_a_node_that_follows_can_be_ended(driving: Callable[..., Inside], told: Told) -> None:
+    robot = driving()
+    robot.hand(told.parts[1])
+    part = robot.node.trajectory.following
+    robot.until(lambda: part.worker.waiting or part.follower.windows)
+    robot.close()
+    assert part.worker._thread is None or not part.worker._thread.is_alive()
+
+
+@pytest.mark.parametrize('when', ['driving', 'in a run'])
+def test_a_fault_ends_it_until_the_next_run(
+    driving: Callable[..., Inside], told: Told, monkeypatch: pytest.MonkeyPatch, when: str
+) -> None:
+    robot = driving()
+    node, warned = robot.node, []
+    monkeypatch.setattr(
+        node.trajectory.following, '_log', type('Log', (), {'warning': lambda self, text: warned.append(text)})()
+    )
+    base = node.trajectory.correction
+
+    def fails(self: Follower, *arguments: Any) -> bool:
+        raise MemoryError
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Follower, 'follow', fails)
+        if when == 'in a run':
+            assert robot.call(node.em.run_em)[0], 'the maps are as good without'
+            base = node.trajectory.correction
+        robot.hand(told.parts[1])
+        robot.until(lambda: node.trajectory.following.obstacle)
+        robot.until(lambda: warned)
+        robot.until(lambda: not node.trajectory.following.worker.waiting)
+    assert node.trajectory.correction is base
+    assert 'there is not enough memory' in warned[0] and 'until the next run_em' in warned[0]
+    status = robot.status('trajectory')
+    assert status['level'] == WARN
+    assert 'ended: there is not enough memory' in status['followed since the latest run']
+    robot.hand(told.parts[2][:100])
+    robot.spin(0.2)
+    assert len(warned) == 1
+    assert robot.call(node.em.run_em)[0]
+    assert not node.trajectory.following.obstacle
+    assert robot.status('trajectory')['level'] == OK

@@ -1,0 +1,167 @@
+"""The transform from the map to odometry, and the path, as others get them."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip('rclpy', reason='the tests of the node need rclpy')
+
+from drift_samples import bend
+from inside import Inside
+from refined_robot import odometry_of
+from sensor_msgs.msg import MultiDOFJointState
+
+from forward_grid_mapper.core.trajectory.poses import compose
+from forward_grid_mapper.core.trajectory.windows import Odometry
+
+OK, WARN = b'\x00', b'\x01'
+
+
+class Broadcaster:
+    """Stands in for `tf2_ros.TransformBroadcaster`."""
+
+    sent: list[Any]
+
+    def __init__(self, node: Any, qos: Any = None) -> None:
+        type(self).sent = []
+
+    def sendTransform(self, transform: Any) -> None:  # noqa: N802
+        self.sent.append(transform)
+
+
+def stand_in(monkeypatch: pytest.MonkeyPatch, module: str, **names: Any) -> None:
+    made = ModuleType(module)
+    for name, value in names.items():
+        setattr(made, name, value)
+    monkeypatch.setitem(sys.modules, module, made)
+
+
+@pytest.fixture
+def tf2_ros(monkeypatch: pytest.MonkeyPatch) -> type[Broadcaster]:
+    """What of tf2_ros the node uses; its buffer knows nothing."""
+
+    class Buffer:
+        def clear(self) -> None:
+            pass
+
+        def lookup_transform(self, target: str, source: str, time: Any, timeout: Any = None) -> Any:
+            raise Unknown(source)
+
+    class Unknown(Exception):
+        pass
+
+    class TransformListener:
+        def __init__(self, buffer: Any, node: Any, *, spin_thread: bool = False) -> None:
+            pass
+
+    # a type of message that rclpy knows, with a field `transforms`, as TFMessage has it
+    stand_in(monkeypatch, 'tf2_msgs')
+    stand_in(monkeypatch, 'tf2_msgs.msg', TFMessage=MultiDOFJointState)
+    stand_in(
+        monkeypatch,
+        'tf2_ros',
+        Buffer=Buffer,
+        TransformListener=TransformListener,
+        TransformException=Unknown,
+        TransformBroadcaster=Broadcaster,
+    )
+    return Broadcaster
+
+
+def numbers(transform: Any) -> tuple[float, float, float]:
+    t = transform.transform
+    return t.translation.x, t.translation.y, 2 * np.arctan2(t.rotation.z, t.rotation.w)
+
+
+def seconds_of(transform: Any) -> float:
+    stamp = transform.header.stamp
+    return float(stamp.sec + 1e-9 * stamp.nanosec)
+
+
+def test_the_transform_from_map_to_odom_is_sent(
+    inside: Callable[..., Inside], quick: Any, tf2_ros: type[Broadcaster]
+) -> None:
+    robot = inside(refine_poses=True).start()
+    robot.drive(0, 200)
+    newest = 100.0 + 0.05 * 199
+    robot.until(lambda: tf2_ros.sent and seconds_of(tf2_ros.sent[-1]) > newest)
+    first = tf2_ros.sent[-1]
+    assert (first.header.frame_id, first.child_frame_id) == ('map', 'odom')
+    assert numbers(first) == (0.0, 0.0, 0.0)
+    assert seconds_of(first) == pytest.approx(newest + 0.2)
+    count = len(tf2_ros.sent)
+    for _ in range(20):
+        robot.node.trajectory._tick()
+    assert len(tf2_ros.sent) == count, 'TF warns of transforms that come twice'
+    assert robot.call(robot.node.em.run_em)[0]
+    bent = odometry_of(robot)
+    robot.until(lambda: len(tf2_ros.sent) > count)
+    x, y, yaw = numbers(tf2_ros.sent[-1])
+    # odometry had ended: the stamp is a later one all the same
+    assert tf2_ros.sent[-1].header.stamp.nanosec == first.header.stamp.nanosec + 1
+    was, now = bent.pose[-1], bend(bent).pose[-1]
+    assert compose(np.array([x, y, yaw]), was) == pytest.approx(now)
+    robot.drive(200, 10)
+    robot.until(lambda: tf2_ros.sent[-1].header.stamp.nanosec > first.header.stamp.nanosec + 1)
+    assert numbers(tf2_ros.sent[-1]) == pytest.approx((x, y, yaw))
+    robot.call(robot.node.reset)
+    robot.drive(210, 1)
+    robot.until(lambda: numbers(tf2_ros.sent[-1]) == (0.0, 0.0, 0.0))
+
+
+def test_without_refine_poses_nothing_is_sent(inside: Callable[..., Inside], tf2_ros: type[Broadcaster]) -> None:
+    tf2_ros.sent = []
+    robot = inside().start()
+    robot.drive(0, 20)
+    robot.executor.spin_once(timeout_sec=0.1)
+    assert tf2_ros.sent == []
+    names = {name for name, _ in robot.node.get_publisher_names_and_types_by_node('forward_grid_mapper', '/')}
+    assert not names & {'/tf', '/forward_grid_mapper/path', '/forward_grid_mapper/pose'}
+
+
+def test_with_tf2_msgs_alone_it_goes_there_as_a_message(monkeypatch: pytest.MonkeyPatch) -> None:
+    class TFMessage:
+        def __init__(self, transforms: list[Any]) -> None:
+            self.transforms = transforms
+
+    made, sent = [], []
+    monkeypatch.setitem(sys.modules, 'tf2_ros', None)
+    stand_in(monkeypatch, 'tf2_msgs')
+    stand_in(monkeypatch, 'tf2_msgs.msg', TFMessage=TFMessage)
+
+    class Node:
+        def create_publisher(self, kind: Any, topic: str, qos: Any) -> Any:
+            made.append((kind, topic, qos.depth))
+            return type('Out', (), {'publish': lambda self, message: sent.append(message)})()
+
+    from forward_grid_mapper.node.pose_publishers import transform_sender
+
+    send = transform_sender(Node())
+    assert send is not None
+    send('a transform')  # type: ignore[arg-type]
+    assert made == [(TFMessage, '/tf', 100)]
+    assert sent[0].transforms == ['a transform']
+
+
+def test_the_path_is_bounded_and_begins_and_ends_with_the_drive() -> None:
+    from builtin_interfaces.msg import Time
+
+    from forward_grid_mapper.node.pose_publishers import MOST_POINTS, path_message
+
+    for length, count in ((0.05, 50), (30.0, 4000), (5000.0, 30_000)):
+        x = np.linspace(0.0, length, count)
+        way = Odometry(np.arange(count) * 10**7, np.stack([x, 0 * x, 0 * x + 0.3], 1))
+        path = path_message('/map', way, Time(sec=7))
+        assert path.header.frame_id == 'map'
+        assert len(path.poses) <= MOST_POINTS
+        at = [pose.pose.position.x for pose in path.poses]
+        assert (at[0], at[-1]) == (0.0, length)
+        assert (np.diff(at) > 0).all()
+        assert max(np.diff(at)) < max(0.15, 2 * length / MOST_POINTS)
+    assert path_message('map', None, Time()).poses == []

@@ -1,0 +1,94 @@
+"""The node that refines by itself while it drives, and the path that grows."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip('rclpy', reason='the tests of the node need rclpy')
+
+from drift_samples import bend
+from inside import Inside
+from refined_robot import begin, odometry_of
+
+from forward_grid_mapper.core.trajectory.poses import compose
+from forward_grid_mapper.node import trajectory
+
+OK, WARN = b'\x00', b'\x01'
+
+
+def test_it_refines_by_itself_after_some_way(
+    inside: Callable[..., Inside], quick: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(trajectory, 'LEAST_EVERY', 0.1)
+    robot = inside(refine_poses=True, refine_every=0.1).start()
+    node = robot.node
+    begin(robot)
+    robot.drive(1, 59)
+    robot.until(lambda: node.trajectory.driven > 0.05)
+    assert node.em.current is None and node.em.maps is None, 'it has not driven far enough'
+    robot.drive(60, 80)
+    robot.until(lambda: node.em.maps is not None and node.em.current is None)
+    assert node.trajectory.correction is not None
+    assert len(node.em.maps.readings) <= 140
+    assert 'trajectory refined' in node.em.last_run
+    first = node.em.maps
+    robot.drive(140, 20)
+    robot.until(lambda: node.trajectory._at.x > 0.158)
+    assert node.em.maps is first and node.em.current is None
+    robot.drive(160, 120)
+    robot.until(lambda: node.em.maps is not first and node.em.current is None)
+    # a service call begins the way anew
+    assert robot.call(node.em.run_em)[0]
+    assert node.trajectory.driven - node.trajectory._refined_at < 0.05
+
+
+def test_it_does_not_refine_at_every_step(inside: Callable[..., Inside], quick: Any) -> None:
+    robot = inside(refine_poses=True, refine_every=1e-9).start()
+    begin(robot)
+    robot.drive(1, 100)
+    robot.until(lambda: robot.node.trajectory.driven > 0.095)
+    assert robot.node.em.current is None and robot.node.em.maps is None
+
+
+@pytest.mark.parametrize('options', [{}, {'refine_every': 0.05}])
+def test_without_being_told_it_does_not(inside: Callable[..., Inside], quick: Any, options: dict[str, Any]) -> None:
+    robot = inside(refine_poses=not options, **options).start()
+    if not options:
+        begin(robot)
+    robot.drive(1, 100)
+    if not options:
+        robot.until(lambda: robot.node.trajectory.driven > 0.095)
+    assert robot.node.em.current is None and robot.node.em.maps is None
+
+
+def test_the_path_grows_as_the_robot_drives(
+    inside: Callable[..., Inside], quick: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(trajectory, 'GROWS', 0.02)
+    robot = inside(refine_poses=True).start()
+    shown: list[Any] = []
+    out = robot.node.trajectory._out
+    assert out is not None
+    monkeypatch.setattr(out, 'publish_path', lambda frame, path, stamp: shown.append(path))
+    begin(robot)
+    robot.drive(1, 99)
+    robot.until(lambda: shown and shown[-1].pose[-1, 0] > 0.075)
+    assert np.array_equal(shown[-1].pose[:, 1:], 0 * shown[-1].pose[:, 1:]), 'as odometry has it'
+    assert robot.call(robot.node.em.run_em)[0]
+    bent = odometry_of(robot)
+    robot.until(lambda: shown[-1].pose[-1] == pytest.approx(bend(bent).pose[-1]))
+    robot.drive(100, 100)
+    robot.until(lambda: shown[-1].stamp[-1] > bent.stamp[-1] + 3 * 10**9)
+    path = shown[-1]
+    assert (np.diff(path.stamp) > 0).all()
+    correction = robot.node.trajectory.correction
+    later = path.stamp > bent.stamp[-1]
+    assert path.pose[~later] == pytest.approx(bend(bent).pose)
+    now = odometry_of(robot)
+    assert path.pose[later] == pytest.approx(compose(correction.last, now.at(path.stamp[later])), abs=1e-9)
+    robot.call(robot.node.reset)
+    robot.until(lambda: not len(shown[-1].stamp))
