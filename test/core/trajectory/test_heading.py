@@ -7,13 +7,14 @@ import math
 import numpy as np
 import pytest
 
+from forward_grid_mapper.core.trajectory import heading as module
 from forward_grid_mapper.core.trajectory.heading import LEAST_GAIN, NOISES, heading
 from forward_grid_mapper.core.trajectory.odometry_model import calibrated, motions, sensitivity, with_yaw
 from forward_grid_mapper.core.trajectory.poses import wrapped
 from forward_grid_mapper.core.trajectory.walls import BIN, BINS, DIRECTIONS, count_votes, wall_votes
 from forward_grid_mapper.core.trajectory.windows import Odometry, Windows, corrected, cut
 from forward_grid_mapper.simulation.drift import LEVELS, with_drift
-from forward_grid_mapper.simulation.drive import Recording, drive
+from forward_grid_mapper.simulation.drive import Recording, corridor_drive, drive
 from forward_grid_mapper.simulation.sonar import NOISY, front_array
 from forward_grid_mapper.simulation.world import building_tour, building_world
 
@@ -84,6 +85,38 @@ def test_the_heading_is_found_where_odometry_drifts(bent, true) -> None:
     assert np.sqrt(np.mean(off**2)) < np.sqrt(np.mean(was**2)) / 3
     assert found.certainty > 0.99
     assert found.over_odometry > 20
+
+
+def test_sharper_votes_follow_wheels_that_stray(monkeypatch) -> None:
+    exact = corridor_drive(seed=1)
+    odometry = odometry_of(with_drift(exact, LEVELS['wheels'], 1))
+    windows = cut(with_drift(exact, LEVELS['wheels'], 1).readings, odometry)
+    at, votes = wall_votes(windows, np.zeros(len(windows), bool))
+    errors, over = [], []
+    for power in (module.SHARPER, 1.0):
+        monkeypatch.setattr(module, 'SHARPER', power)
+        found = heading(windows, at, votes)
+        assert found is not None
+        off = wrapped(windows.node[at, 2] + found.correction - odometry_of(exact).at(windows.node_stamp)[at, 2])
+        errors.append(np.degrees(np.sqrt(np.mean(wrapped(off - np.median(off)) ** 2))))
+        over.append(found.over_odometry)
+    assert errors[0] < 0.85 * errors[1]
+    assert errors[0] < 4.5
+    assert over[0] > 2 * over[1]
+
+
+def test_a_vote_counts_by_its_power_over_its_mean(bent) -> None:
+    _, _, windows = bent
+    at, votes = wall_votes(windows, np.zeros(len(windows), bool))
+    chain = module._Chain(windows, at[:3], votes[:3])
+    for k in range(3):
+        for state in (0, 17, 100):
+            place = np.degrees(-(windows.node[at[k], 2] + state * module.STEP)) % DIRECTIONS
+            left = int(place)
+            sharp = [v**module.SHARPER for v in votes[k]]
+            here = sharp[left] + (place - left) * (sharp[(left + 1) % DIRECTIONS] - sharp[left])
+            wanted = module.DOUBT + (1 - module.DOUBT) * here / (sum(sharp) / DIRECTIONS)
+            assert chain.likelihood[k, state] == pytest.approx(wanted)
 
 
 def test_noise_that_is_told_is_not_looked_for(bent) -> None:
