@@ -109,19 +109,22 @@ class Places:
 
 def candidates(nodes: Floats, samples: Floats, progress: Floats, middle: int) -> list[tuple[int, Floats]]:
     """Return places where a block may have been before or after, and σ of its pose there, shape (3,)."""
-    drawn = relative(nodes + samples, (nodes + samples)[:, middle : middle + 1])
-    mean = relative(nodes, nodes[middle])
+    places = np.arange(0, len(nodes), SHARED)
+    there = nodes[places] + samples[:, places]
+    drawn = relative(there, (nodes[middle] + samples[:, middle])[:, None])
+    mean = relative(nodes[places], nodes[middle])
     off = drawn - mean
     off[..., 2] = wrapped(off[..., 2])
     sigma = np.sqrt((off**2).mean(0))
     far = np.hypot(mean[:, 0], mean[:, 1])
     wide = np.hypot(sigma[:, 0], sigma[:, 1])
-    possible = (np.abs(progress - progress[middle]) > APART) & (far < REACH + np.minimum(wide, LARGEST[0]))
-    possible &= np.arange(len(nodes)) % SHARED == 0
+    away = np.abs(progress[places] - progress[middle])
+    possible = (away > APART) & (far < REACH + np.minimum(wide, LARGEST[0]))
     out: list[tuple[int, Floats]] = []
-    for node in np.argsort(np.where(possible, far + wide, np.inf))[: possible.sum()]:
+    for k in np.argsort(np.where(possible, far + wide, np.inf))[: possible.sum()]:
+        node = int(places[k])
         if all(abs(progress[node] - progress[other]) > AROUND for other, _ in out):
-            out.append((int(node), sigma[node]))
+            out.append((node, sigma[k]))
             if len(out) == CANDIDATES:
                 break
     return out

@@ -13,7 +13,9 @@ wall that they seem to touch, t · p for t at right angles to n, they are spread
 φ half of its opening, the variance of a point that lies anywhere in it is (φ z)² / 3. Together with the width of the
 things that stand about, v = (φ z)² / 3 + `THING`, and pairs count
 
-    N (N − 1) · max(0, 1 − 2 mean(v) / var(t · p))
+    N' (N' − 1) · max(0, 1 − 2 mean(v) / var(t · p))          N' = N − λ − 2 √λ
+
+where λ echoes are in each bin if ranges are random: sensors do not vote for their own axes, whatever they hear.
 """
 
 from __future__ import annotations
@@ -48,6 +50,9 @@ FARTHEST = 3.5
 FEWEST = 9
 """Echoes that it takes to vote."""
 
+CHANCE = 2.0
+"""Standard deviations of the echoes that a bin has by chance, beyond their mean, that do not count."""
+
 POINT = 2.0
 """Times the variance of a thing from where on echoes may be of a wall."""
 
@@ -77,6 +82,7 @@ def count_votes(echoes: Any, counts: Any, votes: Any) -> None:
         angle = math.radians(degree)
         c, s = math.cos(angle), math.sin(angle)
         counts[:] = 0.0
+        heard = 0
         for t in range(len(echoes)):
             off = (echoes[t, 2] - angle + math.pi) % (2.0 * math.pi) - math.pi
             if abs(off) > echoes[t, 3]:
@@ -84,6 +90,7 @@ def count_votes(echoes: Any, counts: Any, votes: Any) -> None:
             at = (echoes[t, 4] + c * echoes[t, 0] + s * echoes[t, 1]) / BIN + BINS // 2
             below = int(math.floor(at))
             if 0 <= below < BINS - 1:
+                heard += 1
                 part = at - below
                 along = c * echoes[t, 1] - s * echoes[t, 0]
                 thing = (echoes[t, 3] * echoes[t, 4]) ** 2 / 3.0 + THING
@@ -92,13 +99,14 @@ def count_votes(echoes: Any, counts: Any, votes: Any) -> None:
                     counts[k, 1] += weight * along
                     counts[k, 2] += weight * along * along
                     counts[k, 3] += weight * thing
-        total = 0.0
+        total, even = 0.0, heard * BIN / FARTHEST
+        chance = even + CHANCE * math.sqrt(even)
         for k in range(BINS):
             count = counts[k, 0]
-            if count > 1.0:
+            if count > 1.0 + chance:
                 spread = counts[k, 2] - counts[k, 1] ** 2 / count
                 if spread > POINT * counts[k, 3]:
-                    total += count * (count - 1.0) * (1.0 - POINT * counts[k, 3] / spread)
+                    total += (count - chance) * (count - chance - 1.0) * (1.0 - POINT * counts[k, 3] / spread)
         votes[degree % DIRECTIONS] += total
 
 

@@ -10,7 +10,17 @@ import pytest
 from forward_grid_mapper.core.trajectory.heading import LEAST_GAIN, NOISES, heading
 from forward_grid_mapper.core.trajectory.odometry_model import calibrated, motions, sensitivity, with_yaw
 from forward_grid_mapper.core.trajectory.poses import wrapped
-from forward_grid_mapper.core.trajectory.walls import BIN, BINS, DIRECTIONS, POINT, THING, count_votes, wall_votes
+from forward_grid_mapper.core.trajectory.walls import (
+    BIN,
+    BINS,
+    CHANCE,
+    DIRECTIONS,
+    FARTHEST,
+    POINT,
+    THING,
+    count_votes,
+    wall_votes,
+)
 from forward_grid_mapper.core.trajectory.windows import Odometry, Windows, corrected, cut
 from forward_grid_mapper.simulation.drift import LEVELS, with_drift
 from forward_grid_mapper.simulation.drive import Recording, drive
@@ -55,12 +65,15 @@ def test_votes_are_those_of_plain_python() -> None:
                 row = (math.cos(angle) * y - math.sin(angle) * x, (half * z) ** 2 / 3 + THING)
                 bins.setdefault(below, []).append((1 - (at - below), *row))
                 bins.setdefault(below + 1, []).append((at - below, *row))
+        even = sum(len(rows) for rows in bins.values()) / 2 * BIN / FARTHEST
         for rows in bins.values():
             weight, along, point = np.array(rows).T
             n = weight.sum()
+            more = n - even - CHANCE * math.sqrt(even)
             spread = (weight * (along - (weight * along).sum() / n) ** 2).sum() / n
-            if n > 1:
-                wanted[degree % DIRECTIONS] += n * (n - 1) * max(0.0, 1 - POINT * (weight * point).sum() / n / spread)
+            if more > 1:
+                part = max(0.0, 1 - POINT * (weight * point).sum() / n / spread)
+                wanted[degree % DIRECTIONS] += more * (more - 1) * part
     assert (wanted > 0).any()
     votes = np.empty(DIRECTIONS)
     count_votes(echoes, np.empty((BINS, 4)), votes)
@@ -87,6 +100,19 @@ def test_a_wall_is_voted_for_and_a_post_is_not() -> None:
     )
     assert votes[0].argmax() == 0
     assert votes[1].max() < 0.05 * votes[0].max()
+
+
+def test_random_ranges_vote_for_nothing_much() -> None:
+    rng = np.random.default_rng(0)
+    sensors = np.radians([-90, -50, -30, -10, 10, 30, 50, 90])
+    x, bearing = (grid.ravel() for grid in np.meshgrid(np.arange(-1.5, 1.5, 0.1), sensors))
+    echoes = np.column_stack([x, 0 * x, bearing, 0 * x + 0.26, rng.uniform(0.3, 3.5, len(x))])
+    wall, votes = np.empty(DIRECTIONS), np.empty(DIRECTIONS)
+    count_votes(echoes, np.empty((BINS, 4)), votes)
+    echoes[np.abs(bearing) > 1.5, 4] = 1.2
+    count_votes(echoes, np.empty((BINS, 4)), wall)
+    assert wall.argmax() == 0
+    assert votes.max() < 0.1 * wall.max()
 
 
 def test_windows_hold_every_reading_once(bent) -> None:
