@@ -25,6 +25,7 @@ from forward_grid_mapper.core.common.readings import Readings
 from forward_grid_mapper.core.trajectory.poses import rms_after_alignment
 from forward_grid_mapper.core.trajectory.refinement import Refiner
 from forward_grid_mapper.core.trajectory.windows import Odometry
+from forward_grid_mapper.core.warm_up import warm_up
 from forward_grid_mapper.recordings.read_drive import read_drive
 from forward_grid_mapper.simulation.drift import LEVELS, with_drift
 from forward_grid_mapper.simulation.drive import Recording, drive
@@ -188,6 +189,7 @@ def main() -> None:
     parser.add_argument('--shared', type=Path, help='folder of recordings with corrected odometry, instead')
     parser.add_argument('--distance', type=float, nargs='+', help='metres of longer and longer drives, instead')
     options = parser.parse_args()
+    warm_up()
     if options.distance:
         for robot in options.robot or ['front']:
             for level in options.level or ['middle']:

@@ -121,7 +121,7 @@ def _log_ratio(reading: Any, weight: float, around: LocalMap, pose: tuple[float,
             wide += 1
             step = 2.0 * reading.half / (rays - 1)
             c1, s1 = math.cos(step), math.sin(step)
-        best, distance = 0.0, d
+        best, off_x, off_y = 0.0, d, 0.0
         u, v = axis_x, axis_y
         for _ in range(rays):
             column, row = int(math.floor(x + d * u)), int(math.floor(y + d * v))
@@ -134,9 +134,10 @@ def _log_ratio(reading: Any, weight: float, around: LocalMap, pose: tuple[float,
                     if nx * nx + ny * ny > 0.5 and along * along < around.cos2_limit:
                         here = 0.0
                 if here > best:
-                    distance = math.hypot(column + 0.5 - x, row + 0.5 - y)
+                    off_x, off_y = column + 0.5 - x, row + 0.5 - y
             best = max(best, here)
             u, v = u * c1 - v * s1, u * s1 + v * c1
+        distance = math.sqrt(off_x * off_x + off_y * off_y)
         error = (reading.z - distance * resolution) / reading.sigma
         if abs(error) <= CUT:
             hit += survival * best * density(error, reading.sigma)

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from .likelihood import scores
+from .likelihood import Scan, scores
 from .local_map import LocalMap
 from .matching import grid_around, measure
 from .passes import FEWEST, Found, Progress
@@ -43,6 +43,15 @@ STEPS = (0.15, 0.15, math.radians(2.5))
 
 ASKED = 60
 """Readings that the search asks."""
+
+FIRST_ASKED, FOLLOWED = 20, 0.1
+"""Readings that it asks at all poses of a large search first, and the part of the poses where it asks the others."""
+
+LARGE = 500
+"""Poses of a large search."""
+
+SHARED = 4
+"""Windows between places, so that blocks, and each time the robot comes by, share maps."""
 
 MEASURED = 150
 """Readings that measure the best pose of the search."""
@@ -100,21 +109,36 @@ class Places:
 
 def candidates(nodes: Floats, samples: Floats, progress: Floats, middle: int) -> list[tuple[int, Floats]]:
     """Return places where a block may have been before or after, and σ of its pose there, shape (3,)."""
-    drawn = relative(nodes + samples, (nodes + samples)[:, middle : middle + 1])
-    mean = relative(nodes, nodes[middle])
+    places = np.arange(0, len(nodes), SHARED)
+    there = nodes[places] + samples[:, places]
+    drawn = relative(there, (nodes[middle] + samples[:, middle])[:, None])
+    mean = relative(nodes[places], nodes[middle])
     off = drawn - mean
     off[..., 2] = wrapped(off[..., 2])
     sigma = np.sqrt((off**2).mean(0))
     far = np.hypot(mean[:, 0], mean[:, 1])
     wide = np.hypot(sigma[:, 0], sigma[:, 1])
-    possible = (np.abs(progress - progress[middle]) > APART) & (far < REACH + np.minimum(wide, LARGEST[0]))
+    away = np.abs(progress[places] - progress[middle])
+    possible = (away > APART) & (far < REACH + np.minimum(wide, LARGEST[0]))
     out: list[tuple[int, Floats]] = []
-    for node in np.argsort(np.where(possible, far + wide, np.inf))[: possible.sum()]:
+    for k in np.argsort(np.where(possible, far + wide, np.inf))[: possible.sum()]:
+        node = int(places[k])
         if all(abs(progress[node] - progress[other]) > AROUND for other, _ in out):
-            out.append((int(node), sigma[node]))
+            out.append((node, sigma[k]))
             if len(out) == CANDIDATES:
                 break
     return out
+
+
+def searched(joint: Scan, around: LocalMap, poses: Floats, prior: Floats) -> Floats:
+    """Return Σ log ratio at each pose, shape (P,); of a large search only roughly where it is low."""
+    asked = FIRST_ASKED if len(poses) > LARGE else ASKED
+    values = scores(joint, around, poses, max(len(joint.readings) // asked, 1))
+    if len(poses) > LARGE:
+        count = max(int(FOLLOWED * len(poses)), LARGE)
+        best = np.argpartition(prior - values, count - 1)[:count]
+        values[best] = scores(joint, around, poses[best], max(len(joint.readings) // ASKED, 1))
+    return values
 
 
 def find_loop(
@@ -127,10 +151,9 @@ def find_loop(
     guess = relative(nodes[place], nodes[middle])
     reach = np.clip(SIGMAS * sigma, LEAST, LARGEST)
     poses = grid_around(guess, reach, STEPS)
-    stride = max(len(joint.readings) // ASKED, 1)
-    values = scores(joint, around, poses, stride)
     off = relative(guess, poses)
     prior = 0.5 * ((off / np.maximum(sigma, LEAST / 2)) ** 2).sum(1)
+    values = searched(joint, around, poses, prior)
     total = values - prior
     best = poses[int(total.argmax())]
     for _ in range(CLIMBS):

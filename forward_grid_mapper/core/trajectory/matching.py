@@ -70,7 +70,7 @@ class Match(NamedTuple):
 
 def measure(scan: Scan, around: LocalMap, pose: Floats, most: int = ENOUGH) -> Match:
     """Return where a scan fits near a pose; of more readings than `most`, some are asked, evenly."""
-    stride = max(len(scan.readings) // most, 1)
+    stride = max(math.ceil(len(scan.readings) / most), 1)
     values = scores(scan, around, pose + NEIGHBOURS * CURVED, stride)
     fit = _PARABOLA @ values
     xx, yy, tt, xy, xt, yt = -fit[4:]

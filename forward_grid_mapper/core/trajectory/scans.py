@@ -17,6 +17,9 @@ from .windows import Windows, corrected
 FEWEST_ON_MAP = 30
 """Readings that a local map is made from at least."""
 
+MOST_ON_MAP = 800
+"""Readings that it is made from at most, drawn from all: more take time, and hardly change the map."""
+
 
 class Scans:
     """Scans and local maps of windows.
@@ -25,7 +28,7 @@ class Scans:
     ----------
     windows : Windows
     scan : list of Scan
-        The readings of each window in the frame of its node.
+        The readings of each window in the frame of its node, in any order.
     count : int64, shape (K,)
         How many of them may be used; none of windows that are held out.
     held_out : bool, shape (K,)
@@ -42,8 +45,11 @@ class Scans:
         local = relative(np.repeat(windows.node, np.diff(first), axis=0), sensors)
         unknown = UNKNOWN * hit_probability(parameters.model, resolution)
         whole = make_scan(windows.readings, local, parameters.model, resolution, unknown)
+        # in any order, so that every so-manieth reading is not of the same few sensors
+        window = np.repeat(np.arange(len(windows)), np.diff(first))
+        mixed = whole.readings[np.lexsort((np.random.default_rng(0).random(len(window)), window))]
         self.count = np.where(held_out, 0, np.diff(first))
-        self.scan = [Scan(whole.readings[begin:end], whole.weight) for begin, end in itertools.pairwise(first.tolist())]
+        self.scan = [Scan(mixed[begin:end], whole.weight) for begin, end in itertools.pairwise(first.tolist())]
 
     def joint(self, members: NDArray[np.int64], poses: Floats) -> Scan:
         """Return the readings of several windows as one scan, given their nodes' poses, shape (len(members), 3)."""
@@ -72,6 +78,9 @@ class Scans:
         if self.count[members].sum() < FEWEST_ON_MAP:
             return None
         which = np.concatenate([np.arange(w.first[k], w.first[k + 1]) for k in members if not self.held_out[k]])
+        if len(which) > MOST_ON_MAP:
+            # sensors take turns, so every so-manieth reading may be of a few of them only
+            which = np.sort(np.random.default_rng(len(which)).choice(which, MOST_ON_MAP, replace=False))
         robot = corrected(w.progress[which], w.robot[which], w.node_progress[:known], w.node[:known], nodes)
         placed = relative(origin, compose(robot, w.mount[which]))
         return local_map(at_poses(w.readings.select(which), placed), self._parameters, self._stop)

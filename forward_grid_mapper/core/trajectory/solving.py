@@ -25,7 +25,7 @@ from .odometry_model import (
 )
 from .passes import Progress, again, ahead
 from .pose_graph import Edges, Graph, Solution, Walls, Yaws, joined, no_edges, solve
-from .poses import Floats
+from .poses import Floats, rms_after_alignment
 from .scans import Scans
 from .wall_distances import Distances
 from .windows import Odometry, Windows
@@ -41,6 +41,9 @@ LARGEST_RESIDUAL = 5.0
 
 OF_MATCHES = 0.2
 """What matches with what lies around count: the map that a block is matched with is off as the block is."""
+
+SETTLED = 0.1
+"""Metres, in the root mean square, by which matching must have moved the nodes for it to be done again: a cell."""
 
 UNSEEN, LEAST_YAW = 2.0, math.radians(2.0)
 """Times that the yaw drifts more than walls say, and radians a √metre at least: an echo votes with all others of three
@@ -108,6 +111,7 @@ class Solver:
         """Return what matches with local maps say as well, and the loops among them."""
         loops: list[Loop] = []
         for match, stage in ((ahead, 'matching'), (again, 'matching again')):
+            before = solution.nodes
             found = match(self._scans, solution.nodes, self._say(stage))
             edges = found.edges()
             edges = edges._replace(information=OF_MATCHES * edges.information)
@@ -117,6 +121,9 @@ class Solver:
             loops = find_loops(self._scans, solution.nodes, solution.samples, found.usual, watch)
             walls = self._walls(solution.nodes, True)
             solution, loops = self._with_loops(walls, edges, loops, solution)
+            # maps from nodes that hardly moved are the same again
+            if rms_after_alignment(before, solution.nodes) < SETTLED:
+                break
         return solution, loops
 
     def _walls(self, nodes: Floats, strict: bool) -> Walls:

@@ -11,7 +11,17 @@ from forward_grid_mapper.core.trajectory import heading as module
 from forward_grid_mapper.core.trajectory.heading import LEAST_GAIN, NOISES, heading
 from forward_grid_mapper.core.trajectory.odometry_model import calibrated, motions, sensitivity, with_yaw
 from forward_grid_mapper.core.trajectory.poses import wrapped
-from forward_grid_mapper.core.trajectory.walls import BIN, BINS, DIRECTIONS, count_votes, wall_votes
+from forward_grid_mapper.core.trajectory.walls import (
+    BIN,
+    BINS,
+    CHANCE,
+    DIRECTIONS,
+    FARTHEST,
+    POINT,
+    THING,
+    count_votes,
+    wall_votes,
+)
 from forward_grid_mapper.core.trajectory.windows import Odometry, Windows, corrected, cut
 from forward_grid_mapper.simulation.drift import LEVELS, with_drift
 from forward_grid_mapper.simulation.drive import Recording, corridor_drive, drive
@@ -44,7 +54,7 @@ def bent(tour: Recording) -> tuple[Recording, Odometry, Windows]:
 def test_votes_are_those_of_plain_python() -> None:
     rng = np.random.default_rng(0)
     echoes = np.column_stack(
-        [rng.normal(0, 1, (12, 2)), rng.uniform(-4, 4, 12), rng.choice([0.13, 0.3], 12), rng.uniform(0.3, 3, 12)]
+        [rng.normal(0, 1, (60, 2)), rng.uniform(-4, 4, 60), rng.choice([0.13, 0.3], 60), rng.uniform(0.3, 3, 60)]
     )
     wanted = np.zeros(DIRECTIONS)
     for degree in range(360):
@@ -53,12 +63,57 @@ def test_votes_are_those_of_plain_python() -> None:
             if abs(wrapped(bearing - angle)) <= half:
                 at = (z + math.cos(angle) * x + math.sin(angle) * y) / BIN + BINS // 2
                 below = math.floor(at)
-                bins[below] = bins.get(below, 0.0) + 1 - (at - below)
-                bins[below + 1] = bins.get(below + 1, 0.0) + at - below
-        wanted[degree % DIRECTIONS] += sum(n * max(n - 1, 0) for n in bins.values())
+                row = (math.cos(angle) * y - math.sin(angle) * x, (half * z) ** 2 / 3 + THING)
+                bins.setdefault(below, []).append((1 - (at - below), *row))
+                bins.setdefault(below + 1, []).append((at - below, *row))
+        even = sum(len(rows) for rows in bins.values()) / 2 * BIN / FARTHEST
+        for rows in bins.values():
+            weight, along, point = np.array(rows).T
+            n = weight.sum()
+            more = n - even - CHANCE * math.sqrt(even)
+            spread = (weight * (along - (weight * along).sum() / n) ** 2).sum() / n
+            if more > 1:
+                part = max(0.0, 1 - POINT * (weight * point).sum() / n / spread)
+                wanted[degree % DIRECTIONS] += more * (more - 1) * part
+    assert (wanted > 0).any()
     votes = np.empty(DIRECTIONS)
-    count_votes(echoes, np.empty(BINS), votes)
+    count_votes(echoes, np.empty((BINS, 4)), votes)
     assert votes == pytest.approx(wanted)
+
+
+def echoes_along_a_way(touched) -> np.ndarray:
+    """Return the echoes of 16 sensors along 3 m, where `touched` gives bearing and range of what is heard."""
+    rows = []
+    for x in np.arange(-1.5, 1.5, 0.1):
+        bearing, z = touched(x)
+        sensor = round(bearing / (math.pi / 8)) * math.pi / 8
+        rows.append((x, 0.0, sensor, math.pi / 16, z))
+    return np.array(rows)
+
+
+def test_a_wall_is_voted_for_and_a_post_is_not() -> None:
+    votes = np.empty((2, DIRECTIONS))
+    count_votes(echoes_along_a_way(lambda x: (math.pi / 2, 1.2)), np.empty((BINS, 4)), votes[0])
+    count_votes(
+        echoes_along_a_way(lambda x: (math.atan2(1.0, 2.5 - x), math.hypot(1.0, 2.5 - x))),
+        np.empty((BINS, 4)),
+        votes[1],
+    )
+    assert votes[0].argmax() == 0
+    assert votes[1].max() < 0.05 * votes[0].max()
+
+
+def test_random_ranges_vote_for_nothing_much() -> None:
+    rng = np.random.default_rng(0)
+    sensors = np.radians([-90, -50, -30, -10, 10, 30, 50, 90])
+    x, bearing = (grid.ravel() for grid in np.meshgrid(np.arange(-1.5, 1.5, 0.1), sensors))
+    echoes = np.column_stack([x, 0 * x, bearing, 0 * x + 0.26, rng.uniform(0.3, 3.5, len(x))])
+    wall, votes = np.empty(DIRECTIONS), np.empty(DIRECTIONS)
+    count_votes(echoes, np.empty((BINS, 4)), votes)
+    echoes[np.abs(bearing) > 1.5, 4] = 1.2
+    count_votes(echoes, np.empty((BINS, 4)), wall)
+    assert wall.argmax() == 0
+    assert votes.max() < 0.1 * wall.max()
 
 
 def test_windows_hold_every_reading_once(bent) -> None:
