@@ -52,15 +52,13 @@ JUDGED_ON, HELD_OUT = 60, 40
 LEAST_SIGMAS = 2.3
 """Standard errors by which readings must be foreseen better than with odometry: by chance it is so in one of 100."""
 
-LEAST_OVER_ODOMETRY, LEAST_SIGMAS_WITH_WALLS = 10.0, -1.0
-"""Nats by which the votes of walls must be likelier than with odometry's yaw to be a witness of their own, and the
-standard errors that are then enough: readings must not be foreseen worse. Little drift hardly shows in a few metres."""
+LEAST_WITNESS, LEAST_SIGMAS_WITH_WALLS = 10.0, -1.0
+"""Nats that the votes of walls must say against odometry's yaw, beyond what sensors say by where they look, to be a
+witness of their own, and the standard errors that are then enough: readings must not be foreseen worse. Little drift
+hardly shows in a few metres."""
 
 MOST_WORSE = 1.0
 """Standard errors by which matching may foresee what was held out worse."""
-
-OVER_CHANCE = 1.7
-"""Times that votes must agree better than they would if ranges were random."""
 
 LEAST_CERTAINTY = 0.9
 """Probability that the heading did not get lost by a right angle."""
@@ -151,7 +149,7 @@ class Refiner:
             return Refinement(False, reason, readings, odometry, {})
         windows = cut(readings, odometry)
         scans = Scans(windows, self._parameters, self._stop, held_out(len(windows)))
-        walls = self._heading(windows, scans)
+        walls, witness = self._heading(windows, scans)
         if walls is None:
             return Refinement(False, NO_WALLS, readings, odometry, {})
         if walls.certainty < LEAST_CERTAINTY:
@@ -167,7 +165,7 @@ class Refiner:
         better = self._compare(scans, windows.node, simple)
         said = f'readings are foreseen {better.mean:+.3f} ± {better.error:.3f} nats a reading better than with odometry'
         named = dict(zip(CALIBRATION, calibration.tolist(), strict=True))
-        least = LEAST_SIGMAS_WITH_WALLS if walls.over_odometry > LEAST_OVER_ODOMETRY else LEAST_SIGMAS
+        least = LEAST_SIGMAS_WITH_WALLS if witness > LEAST_WITNESS else LEAST_SIGMAS
         if better.sigmas < least:
             reason = f'{said}: not enough to tell that odometry is off'
             return Refinement(False, reason, readings, odometry, named, gain=better.mean)
@@ -191,19 +189,22 @@ class Refiner:
         progress(0.0)
         return progress
 
-    def _heading(self, windows: Windows, scans: Scans) -> Heading | None:
+    def _heading(self, windows: Windows, scans: Scans) -> tuple[Heading | None, float]:
+        """Return what walls say about the yaw, and the nats by which they say that odometry's is wrong."""
         self._say('directions of walls')
         told = self._parameters.association.odometry_noise
         noises = (told,) if told else NOISES
         found = heading(windows, *wall_votes(windows, scans.held_out), noises)
         if found is None:
-            return None
-        # sensors have directions of their own, which vote with whatever ranges
+            return None, 0.0
+        # sensors have directions of their own, which vote with whatever ranges: a robot that drives and looks along
+        # two axes seems to know of walls
         readings, rng = windows.readings, np.random.default_rng(0)
         drawn = np.where(readings.echo, rng.random(len(readings)) * readings.z_max, readings.z)
         by_chance = replace(windows, readings=replace(readings, z=drawn))
         chance = heading(by_chance, *wall_votes(by_chance, scans.held_out), noises)
-        return found if chance is None or found.gain > OVER_CHANCE * chance.gain else None
+        looks = 0.0 if chance is None else max(chance.over_odometry, 0.0)
+        return found, found.over_odometry - looks
 
     def _compare(self, scans: Scans, before: Floats, after: Floats) -> Gain:
         """Return by how much one trajectory foresees readings better than another, all over the drive."""

@@ -14,10 +14,12 @@ from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.common.readings import Readings
 from forward_grid_mapper.core.mapping import Mapper
 from forward_grid_mapper.core.trajectory import refinement
-from forward_grid_mapper.core.trajectory.heading import NOISES
+from forward_grid_mapper.core.trajectory.heading import NOISES, Drifts, Heading
+from forward_grid_mapper.core.trajectory.holding_out import held_out
 from forward_grid_mapper.core.trajectory.poses import compose, relative, rms_after_alignment
 from forward_grid_mapper.core.trajectory.refinement import Refinement, Refiner, unfit
-from forward_grid_mapper.core.trajectory.windows import Odometry
+from forward_grid_mapper.core.trajectory.scans import Scans
+from forward_grid_mapper.core.trajectory.windows import Odometry, cut
 from forward_grid_mapper.simulation.drift import LEVELS, with_drift
 from forward_grid_mapper.simulation.drive import Recording, drive
 from forward_grid_mapper.simulation.sonar import NOISY, front_array, sonar_ring
@@ -189,3 +191,15 @@ def test_the_noise_of_odometry_is_estimated_or_told(bent, monkeypatch) -> None:
     for told in ({}, {'odometry_noise': 0.04}):
         assert not Refiner(Parameters.from_flat(told)).run(*bent).accepted
     assert seen == [NOISES, (0.04,)]
+
+
+@pytest.mark.parametrize(('by_chance', 'witness'), [(45.0, 5.0), (-20.0, 50.0), (None, 50.0)])
+def test_what_sensors_say_by_where_they_look_is_no_witness(bent, monkeypatch, by_chance, witness) -> None:
+    readings, odometry = bent
+    nothing = np.zeros(0)
+    found = Heading(nothing.astype(int), nothing, nothing, nothing, Drifts(0.0, 0.0, 0.02), 1.0, 1.0, 50.0)
+    answers = [found, None if by_chance is None else replace(found, over_odometry=by_chance)]
+    monkeypatch.setattr(refinement, 'heading', lambda *rest: answers.pop(0))
+    refiner, windows = Refiner(Parameters()), cut(readings, odometry)
+    scans = Scans(windows, Parameters(), np.zeros(1, np.uint8), held_out(len(windows)))
+    assert refiner._heading(windows, scans) == (found, witness)
