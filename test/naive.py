@@ -397,7 +397,8 @@ def noticing(passes: np.ndarray, p_hit: float, max_incidence_angle: float) -> np
         off = np.abs((bearings - normal + math.pi / 2) % math.pi - math.pi / 2)
         share = [np.mean(off[nearest == way] < max_incidence_angle) for way in range(4)]
         out += (1 - p_hit) ** (np.array(share) @ passes) / 4
-    return np.log(out) / math.log(1 - p_hit)
+    with np.errstate(divide='ignore'):
+        return np.log(out) / math.log(1 - p_hit)
 
 
 def evidence(

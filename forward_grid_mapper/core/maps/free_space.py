@@ -28,8 +28,8 @@ from ..sensor.cone_table import cone_of
 from ..sensor.density import density
 
 DIRECTIONS = 4
-"""Directions of looking, apart by 45°: along the rows, the columns and both diagonals, either way. Of eight, figures are
-the same."""
+"""Directions of looking, apart by 45°: along the rows, the columns and both diagonals, either way. Of eight, figures
+are the same."""
 
 EIGHTH = math.tan(math.pi / 8)
 """Of the angle up to which a direction is that of the nearer axis of the lattice."""
@@ -58,7 +58,10 @@ def noticed_by(max_incidence_angle: float) -> Floats:
     out = np.zeros(off.shape)
     # either way round
     for middle in (off, off - math.pi):
-        low, high = np.maximum(middle - wide / 2, -max_incidence_angle), np.minimum(middle + wide / 2, max_incidence_angle)
+        low, high = (
+            np.maximum(middle - wide / 2, -max_incidence_angle),
+            np.minimum(middle + wide / 2, max_incidence_angle),
+        )
         out += np.maximum(high - low, 0.0) / wide
     return out
 
@@ -137,7 +140,9 @@ def add_passes(s: State, begin: int, end: int, random: Floats, lost: Floats, occ
                     weight = strength(axis_x, axis_y, sine2, u, v)
                     way = direction_of(u, v)
                     if runs.inner <= column <= runs.outer:
-                        passed[way, start + column] += int(weight * (hidden if blocking and square > near else in_front))
+                        passed[way, start + column] += int(
+                            weight * (hidden if blocking and square > near else in_front)
+                        )
                     else:
                         k = 0
                         while k < n and squares[k] <= square:
