@@ -151,8 +151,8 @@ def add_passes(s: State, begin: int, end: int, random: Floats, lost: Floats, occ
 
 
 @allocating_kernel
-def count(passed: Any, noticed: Any, p_hit: float, out: Any) -> None:
-    """Write how many readings that any surface would have noticed say as much as those that passed each cell.
+def count(passed: Any, noticed: Any, p_hit: float, whole: Any, out: Any) -> None:
+    """Write how many readings passed each cell, and how many that any surface would have noticed say as much.
 
     Parameters
     ----------
@@ -162,12 +162,14 @@ def count(passed: Any, noticed: Any, p_hit: float, out: Any) -> None:
         As of `noticed_by`.
     p_hit : float
         Of the surface.
-    out : float64, shape (cells,)
+    whole, out : float64, shape (cells,)
+        Both.
     """
     each, miss = np.empty(len(noticed)), math.log(1.0 - p_hit)
     for c in range(len(out)):
-        least = np.inf
+        least, whole[c] = np.inf, 0.0
         for j in range(len(noticed)):
+            whole[c] += passed[j, c] * UNIT
             each[j] = 0.0
             for k in range(len(noticed)):
                 each[j] += noticed[j, k] * passed[k, c]
@@ -214,7 +216,7 @@ class Passes(NamedTuple):
 
 def expected_passes(evidence: Evidence, occupied: NDArray[np.uint8]) -> Passes:
     """Return how many readings passed each cell of a map, which is uint8, shape (cells,)."""
-    model, out = evidence.model, np.empty(evidence.grid.size)
-    passed = passes_by_direction(evidence, occupied)
-    count(passed, noticed_by(model.max_incidence_angle), model.p_hit, out)
-    return Passes(np.multiply(passed.sum(axis=0), UNIT, dtype=np.float64), out)
+    model, passed = evidence.model, passes_by_direction(evidence, occupied)
+    out = Passes(np.empty(evidence.grid.size), np.empty(evidence.grid.size))
+    count(passed, noticed_by(model.max_incidence_angle), model.p_hit, *out)
+    return out

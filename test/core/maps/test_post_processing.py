@@ -79,9 +79,10 @@ def test_what_any_surface_would_have_noticed_is_that_of_the_twin(seed: int, angl
     rng = np.random.default_rng(seed)
     passes = np.where(rng.random((4, 50)) < 0.3, 0.0, rng.gamma(0.7, 3.0, (4, 50)))
     passes[:, :2] *= 1000.0
-    passed, out = np.round(passes / UNIT).astype(np.int64), np.empty(50)
+    passed, whole, out = np.round(passes / UNIT).astype(np.int64), np.empty(50), np.empty(50)
     p_hit = rng.choice([0.05, 0.65, 0.98])
-    count(passed, noticed_by(angle), p_hit, out)
+    count(passed, noticed_by(angle), p_hit, whole, out)
+    assert np.array_equal(whole, passed.sum(axis=0) * UNIT)
     expected = naive.noticing(passed * UNIT, p_hit, angle)
     finite = np.isfinite(expected)
     assert finite[2:].all()
