@@ -111,11 +111,10 @@ def compare(options: argparse.Namespace) -> None:
     # not imported in another checkout, which need not have all of it
     from measuring import PLAIN, machine
 
-    from forward_grid_mapper.commands.demo import SURFACE_DEPTH
     from forward_grid_mapper.core.sensor.forward_model import log_likelihood
     from forward_grid_mapper.recordings.read_drive import read_drive
     from forward_grid_mapper.simulation import drive
-    from forward_grid_mapper.simulation.score import score_map, visible_surface
+    from forward_grid_mapper.simulation.score import SURFACE_DEPTH, score_map, visible_surface
     from forward_grid_mapper.simulation.sonar import NOISY
 
     def cases() -> Iterator[tuple[str, Readings, drive.Recording | None]]:

@@ -24,7 +24,6 @@ from numpy.typing import NDArray
 from quality_scores import score
 from quality_worlds import recorded_cases, scoring_tool
 
-from forward_grid_mapper.commands.demo import SURFACE_DEPTH
 from forward_grid_mapper.core import online_map
 from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.common.readings import Readings
@@ -33,7 +32,7 @@ from forward_grid_mapper.core.online_map import OnlineMap
 from forward_grid_mapper.core.sensor.forward_model import log_likelihood
 from forward_grid_mapper.core.warm_up import warm_up
 from forward_grid_mapper.simulation.drive import Recording, building_drive, corridor_drive
-from forward_grid_mapper.simulation.score import score_map, visible_surface
+from forward_grid_mapper.simulation.score import SURFACE_DEPTH, score_map, visible_surface
 from forward_grid_mapper.simulation.sonar import NOISY, measure, sonar_ring
 from forward_grid_mapper.simulation.world import corridor_world
 

@@ -14,6 +14,7 @@ from functools import cache
 from pathlib import Path
 
 from forward_grid_mapper.__main__ import COMMANDS
+from forward_grid_mapper.core.common import former_parameters
 from forward_grid_mapper.core.common import parameters as table
 from forward_grid_mapper.core.messages.rep117 import ODOMETRY_REASONS, REASONS
 
@@ -29,7 +30,7 @@ SHOWN = r'(?:benchmarks|config|docs|launch|rviz|scripts|test|core|files|bags|nod
 
 PARAMETERS = {parameter.name: parameter for parameter in table.TABLE}
 
-DEPRECATED = {*table.DEPRECATED, *table.RENAMED}
+DEPRECATED = {*former_parameters.DEPRECATED, *former_parameters.RENAMED}
 """Former names of parameters, which a page may give only where it says so."""
 
 SAYS_SO = re.compile(r'deprecated|former|was called|old name|until the next version', re.IGNORECASE)

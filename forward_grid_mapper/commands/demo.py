@@ -16,15 +16,13 @@ from ..files.panels import Tile
 from ..files.results import write_results
 from ..recordings.read_drive import read_drive
 from ..simulation.drive import Recording
-from ..simulation.score import Scores, score_map, threshold, visible_surface
+from ..simulation.score import SURFACE_DEPTH, Scores, score_map, threshold, visible_surface
 from .console import Ticker, run
 from .desktop import show
 from .options import add_mapping_options, add_show_option, chosen_parameters
-from .simulate import SONARS, record, write_recording
+from .simulate import SONARS, WORLD_OPTIONS, fill_in, record, write_recording
 
 COMMAND = 'demo'
-SURFACE_DEPTH = 0.2
-"""A wall cell counts as visible if a ray meets it at most so many metres beyond the nearest one of its cone."""
 
 
 def parser() -> argparse.ArgumentParser:
@@ -37,7 +35,7 @@ def parser() -> argparse.ArgumentParser:
     )
     made.add_argument('-o', '--output', metavar='DIR', help='new folder (default: demo_output)')
     made.add_argument('--world', choices=('door', 'corridor'), default='door', help='default: door')
-    made.add_argument('--seen', type=int, default=3, metavar='N', help='sweeps in front of the door (default 3)')
+    made.add_argument('--seen', type=int, metavar='N', help='door: sweeps in front of it (default 3)')
     made.add_argument('--rate', type=float, default=10.0, metavar='R', help='speed of the replay (default 10)')
     made.add_argument('--offline', action='store_true', help='map the bag with process_bag instead, without ROS')
     made.add_argument('--seed', type=int, default=0, help='of the noise (default 0)')
@@ -118,6 +116,7 @@ def demo(options: argparse.Namespace) -> int:
         raise MapperError('ROS 2 is not there: source its setup.bash, pip install .[ros], or use --offline')
     if not 0.1 <= options.rate <= 100:
         raise ParameterError('--rate must lie between 0.1 and 100')
+    fill_in(options, {'door': WORLD_OPTIONS['door'], 'corridor': {}})
     with Ticker() as ticker, output_folder(output) as folder:
         ticker.say('simulating')
         recording = record(options.world, options.seen, 1, False, options.seed, SONARS['ring']())

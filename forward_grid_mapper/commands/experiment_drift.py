@@ -21,11 +21,10 @@ from ..core.trajectory.windows import Odometry
 from ..files.panels import Box, Tile
 from ..simulation.drift import LEVELS, with_drift
 from ..simulation.drive import Recording, corridor_drive, drive
-from ..simulation.score import score_map, visible_surface
+from ..simulation.score import SURFACE_DEPTH, score_map, visible_surface
 from ..simulation.sonar import NOISY, sonar_ring
 from ..simulation.world import World, building_tour, building_world
 from .console import Ticker
-from .demo import SURFACE_DEPTH
 
 WORLDS: dict[str, Callable[[int], Recording]] = {
     'corridor': lambda seed: corridor_drive(seed, 2),

@@ -15,10 +15,9 @@ from ..core.mapping import Mapper
 from ..core.maps.log_odds_map import LogOddsMap
 from ..files.panels import Tile
 from ..simulation.drive import Recording, corridor_drive, door_drive, passing_drive
-from ..simulation.score import Mask, Scores, score_map, threshold, visible_surface
+from ..simulation.score import SURFACE_DEPTH, Mask, Scores, score_map, threshold, visible_surface
 from ..simulation.sonar import NOISE_FREE, NOISY
 from .console import Ticker
-from .demo import SURFACE_DEPTH
 
 GAINS = tuple(
     {'live_p_occupied': occupied, 'live_p_free': free, 'live_p_free_no_echo': silent, 'depth': depth}

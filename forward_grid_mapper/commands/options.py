@@ -9,7 +9,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 from ..core.common.errors import ParameterError
-from ..core.common.parameters import DEPRECATED, Parameters, find
+from ..core.common.former_parameters import DEPRECATED
+from ..core.common.parameters import Parameters, find
 from ..core.common.shell import quoted
 from ..core.messages.message_types import Pose2
 from ..files.output_folder import readable

@@ -116,6 +116,8 @@ def process(options: argparse.Namespace) -> int:
         raise ParameterError('--work and --memory-per-worker are for --workers or --scheduler, which are not given')
     if options.rerun:
         check_rerun()
+    if parameters.association.odometry_noise and not options.refine_poses:
+        ignored.append('odometry_noise has an effect with --refine-poses alone, which is not given')
     mapper = Mapper if options.tiles is None else partial(TiledMapper, size=options.tiles)
     given = _given(options.odometry_calibration)
     output = Path(options.output) if options.output else free_name(Path.cwd(), f'{_stem(options.bags)}_maps')

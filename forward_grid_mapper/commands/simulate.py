@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
 from multiprocessing import get_context
@@ -32,6 +32,13 @@ REFERENCE = 'reference.tum'
 
 T = TypeVar('T')
 
+WORLD_OPTIONS = {
+    'door': {'seen': 3},
+    'corridor': {'passes': 1},
+    'campus': {'drives': 4, 'buildings': 4, 'readings': 40_000, 'jobs': cores()},
+}
+"""Options that one world alone has, and their defaults."""
+
 FORMATS = {'mcap': 'bag', 'sqlite3': 'bag', 'ros1': 'drive.bag'}
 SONARS: dict[str, Callable[[], SonarArray]] = {'ring': sonar_ring, 'front': front_array}
 
@@ -51,16 +58,12 @@ def parser() -> argparse.ArgumentParser:
         'and a person walking behind the robot (Fig. 6); campus: many drives through many buildings',
     )
     made.add_argument('-o', '--output', required=True, metavar='DIR', help='new folder for the recording')
-    made.add_argument('--seen', type=int, default=3, metavar='N', help='door: sweeps taken in front of it (default 3)')
-    made.add_argument('--passes', type=int, default=1, metavar='N', help='corridor: times along it (default 1)')
-    made.add_argument('--drives', type=int, default=4, metavar='N', help='campus: drives (default 4)')
-    made.add_argument('--buildings', type=int, default=4, metavar='N', help='campus: buildings (default 4)')
-    made.add_argument(
-        '--readings', type=int, default=40_000, metavar='N', help='campus: readings of each drive (default 40000)'
-    )
-    made.add_argument(
-        '--jobs', type=int, default=cores(), metavar='N', help='campus: drives made at once (default: as many as cores)'
-    )
+    made.add_argument('--seen', type=int, metavar='N', help='door: sweeps taken in front of it (default 3)')
+    made.add_argument('--passes', type=int, metavar='N', help='corridor: times along it (default 1)')
+    made.add_argument('--drives', type=int, metavar='N', help='campus: drives (default 4)')
+    made.add_argument('--buildings', type=int, metavar='N', help='campus: buildings (default 4)')
+    made.add_argument('--readings', type=int, metavar='N', help='campus: readings of each drive (default 40000)')
+    made.add_argument('--jobs', type=int, metavar='N', help='campus: drives made at once (default: as many as cores)')
     made.add_argument('--noise-free', action='store_true', help='no random readings, no noise, nobody walking')
     made.add_argument(
         '--drift',
@@ -77,28 +80,28 @@ def parser() -> argparse.ArgumentParser:
     return made
 
 
-def check_numbers(seen: int, passes: int, seed: int) -> None:
-    """Check the numbers that `record` takes.
+def fill_in(options: argparse.Namespace, known: Mapping[str, Mapping[str, int]]) -> None:
+    """Give the options that one world alone has their defaults; `known` is a table such as `WORLD_OPTIONS`.
 
     Raises
     ------
     ParameterError
-        If a number is not positive, or the seed is negative.
+        If an option of another world is given, or a number is not positive.
     """
-    for name, value in (('--seen', seen), ('--passes', passes), ('--seed', seed + 1)):
-        if value < 1:
-            raise ParameterError(f'{name} must be a positive number (for --seed, or 0)')
+    for world, defaults in known.items():
+        for name, default in defaults.items():
+            given = getattr(options, name)
+            if given is not None and world != options.world:
+                raise ParameterError(f'--{name} is an option of the world {world}, and the world is {options.world}')
+            if given is not None and given < 1:
+                raise ParameterError(f'--{name} must be a positive number')
+            setattr(options, name, default if given is None else given)
+    if options.seed < 0:
+        raise ParameterError('--seed must be a positive number or 0')
 
 
 def record(world: str, seen: int, passes: int, noise_free: bool, seed: int, sonars: SonarArray) -> Recording:
-    """Simulate the drive that the options ask for.
-
-    Raises
-    ------
-    ParameterError
-        If a number is not positive, or the seed is negative.
-    """
-    check_numbers(seen, passes, seed)
+    """Simulate the drive that the options ask for."""
     noise = NOISE_FREE if noise_free else NOISY
     if world == 'door':
         return door_drive(seen, noise, seed, sonars)
@@ -221,10 +224,7 @@ def at_once(work: Callable[[int], T], numbers: Iterable[int], jobs: int) -> Iter
 def simulate(options: argparse.Namespace) -> int:
     """Do what the command line asks for."""
     with Ticker(options.quiet) as ticker:
-        check_numbers(options.seen, options.passes, options.seed)
-        for name in ('drives', 'buildings', 'readings', 'jobs'):
-            if getattr(options, name) < 1:
-                raise ParameterError(f'--{name} must be a positive number')
+        fill_in(options, WORLD_OPTIONS)
         if options.world == 'campus':
             simulate_campus(options, ticker)
             return 0

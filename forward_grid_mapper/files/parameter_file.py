@@ -11,7 +11,9 @@ from typing import Any, NamedTuple
 import yaml
 
 from ..core.common.errors import ParameterError
-from ..core.common.parameters import DEPRECATED, Parameter, find
+from ..core.common.former_parameters import DEPRECATED
+from ..core.common.parameter import Parameter
+from ..core.common.parameters import find
 from ..core.messages.message_types import Pose2
 from .small_text import read_text
 

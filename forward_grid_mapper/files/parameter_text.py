@@ -10,7 +10,8 @@ from typing import Any
 
 import yaml
 
-from ..core.common.parameters import TABLE, Parameter, Parameters
+from ..core.common.parameter import Parameter
+from ..core.common.parameters import TABLE, Parameters
 from ..core.sensor.bounds import reading_bounds
 
 _WIDTH = 100

@@ -12,7 +12,9 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
 
 from ..core.common.errors import ParameterError
-from ..core.common.parameters import DEPRECATED, RENAMED, TABLE, Parameter, Parameters, deprecation
+from ..core.common.former_parameters import DEPRECATED, RENAMED, deprecation
+from ..core.common.parameter import Parameter
+from ..core.common.parameters import TABLE, Parameters
 from ..core.messages.message_types import Pose2
 
 ROS_OWN = ('use_sim_time', 'start_type_description_service', 'qos_overrides')

@@ -22,6 +22,9 @@ Mask = NDArray[np.bool_]
 
 VISIBLE_RAYS = 31
 
+SURFACE_DEPTH = 0.2
+"""A wall cell counts as visible if a ray meets it at most so many metres beyond the nearest one of its cone."""
+
 
 @dataclass(frozen=True)
 class Scores:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -159,8 +161,21 @@ def test_demo_through_the_node(tmp_path: Path, capsys: pytest.CaptureFixture[str
     assert (tmp_path / 'out' / 'maps' / 'report.txt').is_file()
 
 
+def test_experiments_take_no_bags(tmp_path: Path) -> None:
+    code = (
+        'import sys; sys.modules["rosbags"] = None; from forward_grid_mapper.commands.experiment import main; '
+        'sys.exit(main(sys.argv[1:]))'
+    )
+    subprocess.run([sys.executable, '-c', code, 'density', '-o', str(tmp_path / 'out')], check=True)
+
+
 def test_demo_with_wrong_options(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    for options in (('--seen', 0), ('--seed', -1), ('--params', tmp_path / 'absent.yaml')):
+    for options in (
+        ('--seen', 0),
+        ('--seed', -1),
+        ('--world', 'corridor', '--seen', 2),
+        ('--params', tmp_path / 'absent.yaml'),
+    ):
         assert code_of(demo.main, '-o', tmp_path / 'out', *options) == 1
         assert 'demo: error: ' in capsys.readouterr().err
     assert everything_in(tmp_path) == []

@@ -65,7 +65,9 @@ def test_a_drive_that_is_left_alone_gives_the_same_maps(tmp_path: Path) -> None:
 
 def test_without_the_option_nothing_is_said(tmp_path: Path) -> None:
     write_tape(tmp_path / 'bag', tape())
-    assert 'trajectory' not in mapped(tmp_path / 'bag', tmp_path / 'maps')['input']
+    report = mapped(tmp_path / 'bag', tmp_path / 'maps', '--set', 'odometry_noise=2deg')
+    assert 'trajectory' not in report['input']
+    assert 'odometry_noise has an effect with --refine-poses alone, which is not given' in report['warnings']
     assert code_of(process_bag.main, tmp_path / 'bag', '-o', tmp_path / 'maps', '--refine-poses') != 0
 
 

@@ -83,6 +83,8 @@ def test_the_corridor_can_be_mapped(tmp_path: Path, capsys: pytest.CaptureFixtur
         (('door', '--seen', 0), 1, '--seen'),
         (('corridor', '--passes', -1), 1, '--passes'),
         (('door', '--seed', -1), 1, '--seed'),
+        (('door', '--drives', 3), 1, '--drives is an option of the world campus'),
+        (('campus', '--passes', 1), 1, '--passes is an option of the world corridor'),
         (('office',), 2, 'door'),
         (('door', '--format', 'zip'), 2, 'mcap'),
     ],

@@ -12,7 +12,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from forward_grid_mapper.core.common.errors import ParameterError
-from forward_grid_mapper.core.common.parameters import TABLE, Parameter, Parameters
+from forward_grid_mapper.core.common.parameter import Parameter
+from forward_grid_mapper.core.common.parameters import TABLE, Parameters
 from forward_grid_mapper.core.messages.message_types import Pose2
 from forward_grid_mapper.files.parameter_file import ParameterFile, load_parameters, parse_sensor, parse_setting
 from forward_grid_mapper.files.parameter_text import dump_parameters, parameters_markdown

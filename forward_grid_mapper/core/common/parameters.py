@@ -9,68 +9,43 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import logging
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, get_origin, get_type_hints
 
-import numpy as np
-
 from .errors import ParameterError
+from .former_parameters import DEPRECATED, RENAMED, deprecation
+from .parameter import Parameter, param
 
 LOG = logging.getLogger('forward_grid_mapper')
-
-
-def _param(
-    default: Any,
-    help: str,
-    unit: str = '',
-    low: float = -math.inf,
-    high: float = math.inf,
-    choices: tuple[str, ...] = (),
-    read_only: bool = False,
-) -> Any:
-    return dataclasses.field(
-        default=default,
-        metadata={
-            'help': help,
-            'unit': unit,
-            'low': low,
-            'high': high,
-            'choices': choices,
-            'read_only': read_only,
-        },
-    )
 
 
 @dataclass(frozen=True)
 class AssociationParameters:
     """From messages to readings in the map frame."""
 
-    max_pose_gap: float = _param(
+    max_pose_gap: float = param(
         1.0,
         'Longest gap between two odometry messages that is bridged; readings in a longer one are rejected.',
         's',
         0.001,
         60.0,
     )
-    pose_timeout: float = _param(
+    pose_timeout: float = param(
         2.0,
         'How long, in message time, a reading waits for odometry that has stopped; keep it above max_pose_gap.',
         's',
         0.01,
         600.0,
     )
-    over_range: str = _param(
+    over_range: str = param(
         'no_echo',
         'What +inf and ranges at or beyond max_range mean: no echo within max_range (informative), or nothing.',
         choices=('no_echo', 'discard'),
     )
-    field_of_view: float = _param(
-        0.0, "Full cone angle used instead of the messages'; 0 takes theirs.", 'rad', 0.0, 3.1
-    )
-    max_range: float = _param(0.0, "Largest range used instead of the messages'; 0 takes theirs.", 'm', 0.0, 1000.0)
-    max_jump: float = _param(
+    field_of_view: float = param(0.0, "Full cone angle used instead of the messages'; 0 takes theirs.", 'rad', 0.0, 3.1)
+    max_range: float = param(0.0, "Largest range used instead of the messages'; 0 takes theirs.", 'm', 0.0, 1000.0)
+    max_jump: float = param(
         1000.0,
         'A reading farther than this from all that was mapped before is rejected, so that no wild pose makes the map '
         'huge.',
@@ -78,7 +53,7 @@ class AssociationParameters:
         1.0,
         1e7,
     )
-    max_readings: int = _param(
+    max_readings: int = param(
         500_000,
         'Readings that are kept to map from; of more, the oldest go where a sensor looked most often from one place '
         'in one direction. 0 keeps all.',
@@ -87,7 +62,7 @@ class AssociationParameters:
         100_000_000,
         read_only=True,
     )
-    odometry_noise: float = _param(
+    odometry_noise: float = param(
         0.0,
         'How far the yaw of odometry strays at random in one metre of driving (standard deviation; it grows with the '
         'square root of the way), for refine_poses. Usual wheels stray by 0.01 to 0.08; 0 estimates it from the drive.',
@@ -101,8 +76,8 @@ class AssociationParameters:
 class GridParameters:
     """The lattice of cells; its extent follows the readings."""
 
-    resolution: float = _param(0.1, 'Edge length of a cell.', 'm', 0.005, 2.0, read_only=True)
-    max_cells: int = _param(
+    resolution: float = param(0.1, 'Edge length of a cell.', 'm', 0.005, 2.0, read_only=True)
+    max_cells: int = param(
         50_000_000,
         'Bound on the cells of a map; a reading that would make the grid larger is rejected.',
         'cells',
@@ -121,22 +96,22 @@ class ModelParameters:
     hangs on one reading, and smooth walls, which many readings meet without an echo, stand by the few that heard them.
     """
 
-    p_hit: float = _param(
+    p_hit: float = param(
         0.65,
         'Probability that 0.1 m of a surface in the cone returns the echo; the same for cells of any size.',
         'probability',
         0.01,
         0.98,
     )
-    p_rand: float = _param(0.4, 'Probability that a reading is random, whatever the map.', 'probability', 1e-4, 0.95)
-    p_lost: float = _param(
+    p_rand: float = param(0.4, 'Probability that a reading is random, whatever the map.', 'probability', 1e-4, 0.95)
+    p_lost: float = param(
         0.52,
         "Probability that the echo is lost, whatever the map, as off smooth walls; 0 is the paper's model.",
         'probability',
         0.0,
         0.95,
     )
-    likelihood_exponent: float = _param(
+    likelihood_exponent: float = param(
         1.0,
         'Weight of the readings against the prior: the exponent of p(Z | m). Readings are not independent, so together '
         'they say less than their sum; 1 is the paper.',
@@ -144,14 +119,14 @@ class ModelParameters:
         0.01,
         1.0,
     )
-    sigma: float = _param(
+    sigma: float = param(
         0.1,
         'Standard deviation of a range where the message states none; never below half a cell.',
         'm',
         0.001,
         5.0,
     )
-    max_incidence_angle: float = _param(
+    max_incidence_angle: float = param(
         0.7,
         'Incidence angle off the normal of a surface, from which on readings do not contradict the surface; with pi/2 '
         'all do.',
@@ -159,7 +134,7 @@ class ModelParameters:
         0.1,
         1.5708,
     )
-    surface_offset: float = _param(
+    surface_offset: float = param(
         0.3,
         'How far before the center of its cell the surface of an obstacle lies; 0 is the paper.',
         'cells',
@@ -179,7 +154,7 @@ class ModelParameters:
 class SearchParameters:
     """The search for the maximum likelihood map, and its uncertainty."""
 
-    prior: float = _param(
+    prior: float = param(
         0.4,
         'Prior probability of an occupied cell in the first part of the search, which takes cells as independent; 0.5 '
         "is the paper's plain ML, less removes dots and thins walls.",
@@ -187,10 +162,8 @@ class SearchParameters:
         1e-6,
         0.5,
     )
-    wall_cost: float = _param(
-        1.0, 'What a metre of wall costs in the second part of the search.', 'nats/m', 0.0, 1000.0
-    )
-    end_cost: float = _param(
+    wall_cost: float = param(1.0, 'What a metre of wall costs in the second part of the search.', 'nats/m', 0.0, 1000.0)
+    end_cost: float = param(
         1.3,
         'What the end of a wall costs in the second part of the search, or a corner; a single cell has two ends. With '
         '0 there is no second part, gaps stay open and walls are not extended, as in the paper.',
@@ -198,14 +171,14 @@ class SearchParameters:
         0.0,
         100.0,
     )
-    least_passed: float = _param(
+    least_passed: float = param(
         0.88,
         'Readings that are expected to have passed through a cell for it to be known as free; 0 takes all cells seen.',
         'readings',
         0.0,
         100.0,
     )
-    least_noticed: float = _param(
+    least_noticed: float = param(
         1.5,
         'Readings that must speak as much for free space around there as if they would have noticed a surface whatever '
         'way it faces (max_incidence_angle); 0 takes readings that see at a slant alone for enough.',
@@ -213,18 +186,18 @@ class SearchParameters:
         0.0,
         100.0,
     )
-    max_iterations: int = _param(
+    max_iterations: int = param(
         200, 'Bound on the iterations of the search; the report says when it was reached.', 'iterations', 1, 100_000
     )
-    threads: int = _param(0, 'Threads of a search, 0 for one a core; the maps do not depend on it.', 'threads', 0, 256)
-    max_memory: int = _param(
+    threads: int = param(0, 'Threads of a search, 0 for one a core; the maps do not depend on it.', 'threads', 0, 256)
+    max_memory: int = param(
         4000,
         'Memory for pairs of cells and readings; beyond it they are made anew each time: the same maps, but slower.',
         'MB',
         0,
         1_000_000,
     )
-    alpha: float = _param(
+    alpha: float = param(
         1.0,
         'Weight of the evidence in the uncertainty map, (45) of the paper. It, neighbour_weight and uncertainty_prior '
         'are the coefficients of a logistic calibration, fitted to simulated worlds.',
@@ -232,7 +205,7 @@ class SearchParameters:
         0.0,
         1.0,
     )
-    neighbour_weight: float = _param(
+    neighbour_weight: float = param(
         0.6,
         'Weight of what the neighbours of a cell say in the uncertainty map, by the prior of walls (the second '
         'coefficient of the calibration); 0 is the paper.',
@@ -240,7 +213,7 @@ class SearchParameters:
         0.0,
         1.0,
     )
-    uncertainty_prior: float = _param(
+    uncertainty_prior: float = param(
         0.38,
         'Occupancy that the uncertainty map states without evidence and without neighbours (the offset of the '
         'calibration).',
@@ -254,7 +227,7 @@ class SearchParameters:
 class LiveMapParameters:
     """The standard map: log odds ((3), (4), (14)-(16) of the paper), updated reading by reading."""
 
-    live_p_occupied: float = _param(
+    live_p_occupied: float = param(
         0.99,
         'Occupancy of a cell on the axis at the measured range, given one reading whose arc is no longer than '
         'live_echo_width.',
@@ -263,7 +236,7 @@ class LiveMapParameters:
         0.999,
         read_only=True,
     )
-    live_p_free: float = _param(
+    live_p_free: float = param(
         0.01,
         'Occupancy of a cell on the axis before the measured range, given one reading.',
         'probability',
@@ -271,10 +244,10 @@ class LiveMapParameters:
         0.5,
         read_only=True,
     )
-    live_p_free_no_echo: float = _param(
+    live_p_free_no_echo: float = param(
         0.34, 'The same for a reading without echo, which may be a lost one.', 'probability', 0.001, 0.5, read_only=True
     )
-    live_echo_width: float = _param(
+    live_echo_width: float = param(
         0.2,
         'Length of surface that an echo speaks for; of each cell of a longer arc it says as much less. With 1000 it '
         'says all of every cell.',
@@ -283,7 +256,7 @@ class LiveMapParameters:
         1000.0,
         read_only=True,
     )
-    live_directions: int = _param(
+    live_directions: int = param(
         4,
         'Directions of looking, over half a turn, whose readings are summed apart, so that readings at a slant do not '
         "wipe out walls; 1 is the paper's one sum.",
@@ -298,30 +271,30 @@ class LiveMapParameters:
 class NodeParameters:
     """Topics, frames and output of the node; the offline tool has options for them."""
 
-    range_topics: tuple[str, ...] = _param(('sonar',), 'Topics of sensor_msgs/Range, one or many.', read_only=True)
-    odom_topic: str = _param('odom', 'Topic of nav_msgs/Odometry.', read_only=True)
-    range_reliability: str = _param(
+    range_topics: tuple[str, ...] = param(('sonar',), 'Topics of sensor_msgs/Range, one or many.', read_only=True)
+    odom_topic: str = param('odom', 'Topic of nav_msgs/Odometry.', read_only=True)
+    range_reliability: str = param(
         'best_effort',
         'Quality of service of the Range subscriptions; reliable repeats what the network loses, and needs reliable '
         'publishers.',
         choices=('best_effort', 'reliable'),
         read_only=True,
     )
-    odom_reliability: str = _param(
+    odom_reliability: str = param(
         'best_effort', 'The same for odometry.', choices=('best_effort', 'reliable'), read_only=True
     )
-    map_frame: str = _param(
+    map_frame: str = param(
         '',
         "Frame of the maps, if another than odometry's: TF gives its transform to odometry's frame, or with "
         "refine_poses this node does, by default from 'map'.",
         read_only=True,
     )
-    refine_poses: bool = _param(
+    refine_poses: bool = param(
         False,
         'Take the drift out of odometry when run_em is called, and publish the transform from map to odom. Needs walls '
         "at right angles; odometry's poses stay where readings that were held out do not speak for others.",
     )
-    refine_every: float = _param(
+    refine_every: float = param(
         0.0,
         'With refine_poses, metres driven after which the node runs EM by itself, so that the transform from map to '
         'odom follows the drift, a metre at least; later runs wait until the drive has grown by a tenth. 0: only when '
@@ -330,88 +303,27 @@ class NodeParameters:
         0.0,
         1e6,
     )
-    online: bool = _param(
+    online: bool = param(
         False,
         'Keep the maximum likelihood map and the uncertainty map up to date with every reading, and start EM from '
         'there.',
         read_only=True,
     )
-    publish_rate: float = _param(
+    publish_rate: float = param(
         1.0, 'Largest rate of live maps, of online maps, and of maps seen while EM runs.', 'Hz', 0.01, 50.0
     )
-    journal: str = _param(
+    journal: str = param(
         '',
         'Folder of the journal, which keeps every accepted reading on disk and gives them back after a restart; empty: '
         'none.',
         read_only=True,
     )
-    autostart: bool = _param(
+    autostart: bool = param(
         True,
         'Start at once; if not, a lifecycle manager configures and activates the node.',
         read_only=True,
     )
-    save_directory: str = _param('~/forward_grid_mapper', 'Folder in which save_maps makes a new folder at each call.')
-
-
-@dataclass(frozen=True)
-class Parameter:
-    """One row of the table; `low` and `high` are infinite where there is no bound.
-
-    `type` is float, int, bool, str or tuple (of str); `read_only` rows cannot change while the node runs.
-    """
-
-    name: str
-    group: str
-    type: type
-    default: Any
-    unit: str
-    low: float
-    high: float
-    choices: tuple[str, ...]
-    help: str
-    read_only: bool
-
-    @property
-    def range(self) -> str:
-        """The admitted values, for people."""
-        if self.choices:
-            return ' | '.join(self.choices)
-        if self.type is bool:
-            return 'true | false'
-        if self.type is str:
-            return 'text'
-        if self.type is tuple:
-            return 'list of text'
-        return f'{self.low:g} … {self.high:g}'
-
-    def check(self, value: Any) -> Any:
-        """Return `value` as this parameter's type.
-
-        Raises
-        ------
-        ParameterError
-            If it has the wrong type or is out of range.
-        """
-        wanted = {
-            float: 'a number',
-            int: 'a whole number',
-            bool: 'true or false',
-            str: 'text',
-            tuple: 'a list of text, none of it empty',
-        }[self.type]
-        if isinstance(value, np.generic):
-            value = value.item()
-        if self.type is tuple and isinstance(value, list) and all(isinstance(v, str) and v for v in value):
-            value = tuple(value)
-        if self.type is float and isinstance(value, int) and not isinstance(value, bool):
-            value = float(value)
-        if type(value) is not self.type:
-            raise ParameterError(f'{self.name}: {value!r} is not {wanted}; admitted: {self.range} {self.unit}'.rstrip())
-        if self.choices and value not in self.choices:
-            raise ParameterError(f'{self.name}: {value!r} is not one of {", ".join(self.choices)}')
-        if isinstance(value, (int, float)) and not self.low <= value <= self.high:
-            raise ParameterError(f'{self.name}: {value!r} is out of range; admitted: {self.range} {self.unit}'.rstrip())
-        return value
+    save_directory: str = param('~/forward_grid_mapper', 'Folder in which save_maps makes a new folder at each call.')
 
 
 @dataclass(frozen=True)
@@ -453,34 +365,6 @@ class Parameters:
     def flat(self) -> dict[str, Any]:
         """Return every value by name, in the table's order."""
         return {row.name: getattr(getattr(self, row.group), row.name) for row in TABLE}
-
-
-DEPRECATED = {
-    'bridges': 'no longer a parameter: gaps of up to 1 m are closed where end_cost is above 0',
-    'cell_distance': 'no longer a parameter: distances are to the centers of cells; see surface_offset',
-    'cut': 'no longer a parameter: the noise density is cut off at 4 sigma',
-    'driven_cost': 'no longer a parameter: cells over which a sensor was moved are never occupied',
-    'extend': 'no longer a parameter: straight walls are extended by up to 0.4 m where end_cost is above 0',
-    'isolated_cost': 'no longer a parameter: a single cell costs two ends of a wall, twice end_cost',
-    'line_bonus': 'replaced by wall_cost: what a metre of wall costs, not what a cell of it gains',
-    'live_depth': 'no longer a parameter: an echo marks an arc of 0.05 m, or half a cell, before and behind its range',
-    'shift_moves': 'no longer a parameter: occupied cells are always tried to be moved to a neighbor',
-}
-"""Parameters of the version before: what became of each. They are accepted with a warning and have no effect."""
-
-
-RENAMED = {
-    'grazing_angle': 'max_incidence_angle',
-    'max_sweeps': 'max_iterations',
-}
-"""Parameters of the version before that have another name now. They are accepted with a warning."""
-
-
-def deprecation(name: str) -> str:
-    """Return the warning for a name of `DEPRECATED` or `RENAMED`."""
-    if name in RENAMED:
-        return f'parameter {name} is called {RENAMED[name]} now; the next version does not know the old name'
-    return f'parameter {name} is ignored: it is {DEPRECATED[name]}'
 
 
 def _read_table() -> tuple[Parameter, ...]:

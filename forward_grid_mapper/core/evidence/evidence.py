@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,27 +14,22 @@ from ..common.grid import UNKNOWN, Grid, Window, united
 from ..common.parameters import ModelParameters
 from ..common.readings import Readings
 from ..runtime.cancelling import check
-from ..runtime.jit import kernel
 from ..runtime.memory import THREAD_MEMORY
 from ..runtime.threads import parts, run_each
-from ..sensor.cone import rows_of, runs_of
-from ..sensor.cone_table import CONE, Cones, Floats, cone_of, cone_table
-from ..sensor.density import causes_of, hit_probability
+from ..sensor.cone_table import CONE, Cones, Floats, cone_table
+from ..sensor.density import hit_probability
 from ..sensor.surface_normals import SurfaceNormals, gather, no_normals, normals_of, on_larger_grid, renewed, touched
 from .fixed_point import QUANTUM
+from .indexing import BAND, FREE, LARGEST, UNSTORED, UNUSED, WORDS, insert_readings, reading_state_table
 from .neighbourhood import set_patterns
-from .pairs import WORD, WORDS_PER_BAND_PAIR, WORDS_PER_RUN, Lattice, empty_pairs, workspace_for
+from .pairs import WORD, WORDS_PER_BAND_PAIR, Lattice, empty_pairs, workspace_for
 from .renewal import box_of, find_changed, renew
 from .state import READING_STATE, Maps, Model, State
-from .tile_index import SHIFT, insert, more_chunks, no_tiles
+from .tile_index import more_chunks, no_tiles
 from .updates import add_multiplicity, evaluate_all, forget
 
 NO_INCIDENCE_LIMIT = 1.5707
 """Radians off the normal from where on no reading exceeds the incidence angle."""
-
-FREE, BAND, LARGEST, WORDS, UNSTORED, UNUSED = range(6)
-"""Of the totals: pairs in free zones and in bands, cells of the largest cone, words given to readings, readings not
-stored, and those of the words that no reading uses any more."""
 
 MOST_UNUSED = 0.25
 """Part of the words given to readings that may be out of use before all pairs are packed anew."""
@@ -51,72 +46,7 @@ Work = Callable[[State, int, int, NDArray[np.int64]], None]
 """Takes the readings from one to another, and adds to an array."""
 
 
-@kernel
-def _index(s: State, limits: tuple[int, int, int], totals: Any) -> int:
-    """Count the pairs of readings, and insert these into the tiles; return the reading at which chunks ran out.
-
-    Parameters
-    ----------
-    limits
-        The first reading, the last one plus one, and the words that stored pairs may take.
-    totals : int64, shape (6,)
-        Added to.
-    """
-    begin, end, words = limits
-    cones, lattice, tiles, seen, before = s.cones, s.lattice, s.tiles, s.maps.seen, s.normals.before
-    for t in range(begin, end):
-        reading, times = cones[t], s.reading_states[t].multiplicity
-        cone = cone_of(reading)
-        bottom, end_row = rows_of(cone, lattice.height)
-        across = min(2 * int(cone.reach) + 3, lattice.width)
-        most = (((end_row - bottom) >> SHIFT) + 2) * ((across >> SHIFT) + 2)
-        if s.stop[0] or tiles.used[0] + most > len(tiles.chunks):
-            return t
-        count, free, band = 0, 0, 0
-        for row in range(bottom, end_row):
-            runs = runs_of(cone, row, lattice.width)
-            for left, right in ((runs.first, runs.last), (runs.first2, runs.last2)):
-                if left > right:
-                    continue
-                insert(tiles, row, left, right, t)
-                inner, outer = max(left, runs.inner), min(right, runs.outer)
-                inside = max(outer - inner + 1, 0)
-                count += inside > 0
-                if s.normals.cos2_limit > 0.0 and inside > 0:
-                    # a cell that is left out may cut a run in two
-                    count += before[row, outer + 1] - before[row, inner]
-                for c in range(np.uint64(row * lattice.width + left), np.uint64(row * lattice.width + right + 1)):
-                    seen[c] += times
-                free += inside
-                band += right - left + 1 - inside
-        reading_state = s.reading_states[t]
-        size = WORDS_PER_RUN * count + WORDS_PER_BAND_PAIR * band
-        reading_state.at = totals[WORDS]
-        reading_state.room = size
-        reading_state.stored = totals[WORDS] + size <= words
-        if reading_state.stored:
-            totals[WORDS] += size
-        else:
-            totals[UNSTORED] += 1
-        totals[FREE] += free
-        totals[BAND] += band
-        totals[LARGEST] = max(totals[LARGEST], free + band)
-    return end
-
-
-def reading_state_table(
-    readings: Readings, sigma: Floats, model: ModelParameters, resolution: float
-) -> NDArray[np.void]:
-    """Return records of `READING_STATE`, shape (N,), with what no map changes; arguments are those of `causes_of`."""
-    reading_states = np.zeros(len(readings), READING_STATE)
-    causes = causes_of(readings, sigma, model, resolution)
-    reading_states['floor'] = causes.random + causes.lost
-    reading_states['max_range'] = causes.max_range
-    reading_states['multiplicity'] = 1
-    return reading_states
-
-
-class _Index(NamedTuple):
+class _Before(NamedTuple):
     """What is kept for readings by cells, and must be put back if readings are not taken after all."""
 
     head: NDArray[np.int32]
@@ -482,24 +412,24 @@ class Evidence:
         self.state.maps.evidence[:] = 0
         evaluate_all(self.state._replace(stop=NEVER), 0, end, new)
 
-    def _index_so_far(self) -> _Index:
+    def _index_so_far(self) -> _Before:
         s = self.state
         tiles = s.tiles
         lists = tiles.head.copy(), tiles.fill.copy(), tiles.latest.copy()
-        return _Index(*lists, int(tiles.used[0]), self._totals.copy(), s.normals)
+        return _Before(*lists, int(tiles.used[0]), self._totals.copy(), s.normals)
 
     def _insert(self, begin: int, end: int) -> None:
         """Index readings whose cones are in place, and make room for their pairs."""
         self._indexed = begin
         while self._indexed < end:
             s = self.state
-            self._indexed = _index(s, (self._indexed, end, self._words), self._totals)
+            self._indexed = insert_readings(s, (self._indexed, end, self._words), self._totals)
             check(s.stop)
             if self._indexed < end:
                 self.state = s._replace(tiles=more_chunks(s.tiles))
         self._make_room(int(self._totals[WORDS]))
 
-    def _take_out(self, begin: int, before: _Index) -> None:
+    def _take_out(self, begin: int, before: _Before) -> None:
         """Undo what was indexed from reading `begin` on."""
         s = self.state
         forget(s, begin, self._indexed)

@@ -64,6 +64,9 @@ STUCK, MOVED = 0.97, 2.0
 TURNED = 0.5
 """Radians that the robot turned meanwhile as well: along a straight wall a range may stay the same for long."""
 
+FASTEST = 15.0
+"""Metres a second that no robot with sonars drives; one that does 0.2 m/s seems to do 20 in centimetres."""
+
 NARROW, WIDE = math.radians(3.0), math.radians(90.0)
 """Fields of view that no sonar has."""
 
@@ -91,7 +94,7 @@ def input_warnings(readings: Readings) -> list[str]:
     if len(readings) < ENOUGH:
         return []
     by_time = readings.select(np.argsort(readings.stamp, kind='stable'))
-    checks = (_copies, _shared_frame, _standing, _stuck, _field_of_view, _reach, _extent)
+    checks = (_copies, _shared_frame, _speed, _standing, _stuck, _field_of_view, _reach, _extent)
     return [text for check in checks if (text := check(by_time))]
 
 
@@ -140,6 +143,23 @@ def _shared_frame(readings: Readings) -> str:
     return (
         f'the readings of frame {_listed(suspects)} take turns as those of several sensors do: do all sensors have one '
         f'frame_id? Give each its own in its driver, with its own pose, or all readings are mapped from one pose'
+    )
+
+
+def _speed(readings: Readings) -> str:
+    """Look for poses in other units than metres: the robot seems to drive far too fast, most of the time it drives."""
+    speeds = []
+    for _, mine in _sensors(readings):
+        seconds = np.diff(mine.stamp) / 1e9
+        way = np.hypot(np.diff(mine.x), np.diff(mine.y))
+        drives = (way > STILL[0]) & (seconds > 0.0)
+        speeds.append(way[drives] / seconds[drives])
+    driven = np.concatenate(speeds) if speeds else np.zeros(0)
+    if len(driven) < ENOUGH or np.median(driven) < FASTEST:
+        return ''
+    return (
+        f'the poses move at {np.median(driven):.0f} m/s: are they in millimetres or centimetres, or their stamps in '
+        f'another unit? Poses are in metres, and stamps in seconds: correct the odometry, or the file of poses'
     )
 
 

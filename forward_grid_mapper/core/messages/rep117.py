@@ -24,7 +24,7 @@ REASONS = {
     'after_odometry': 'the recording ended before odometry reached the stamp',
     'no_odometry': 'odometry, or its transform to map_frame, did not reach the stamp within pose_timeout',
     'pose_gap': 'odometry has a gap longer than max_pose_gap here',
-    'pose_jump': 'odometry jumps here, faster than anything drives',
+    'pose_jump': 'odometry jumps here, faster than anything drives (are its poses in millimetres? They are in metres)',
     'from_the_future': 'odometry went on for pose_timeout and is still before the stamp; is the sensor ahead?',
     'time_jump': 'the clock jumped back while the reading waited for its pose',
     'too_many_waiting': 'too many readings waited for odometry at once',

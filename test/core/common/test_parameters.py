@@ -5,7 +5,8 @@ from __future__ import annotations
 import pytest
 
 from forward_grid_mapper.core.common.errors import ParameterError
-from forward_grid_mapper.core.common.parameters import DEPRECATED, RENAMED, TABLE, Parameters, deprecation, find
+from forward_grid_mapper.core.common.former_parameters import DEPRECATED, RENAMED, deprecation
+from forward_grid_mapper.core.common.parameters import TABLE, Parameters, find
 
 
 @pytest.mark.parametrize('row', TABLE, ids=lambda row: row.name)

@@ -15,8 +15,9 @@ from forward_grid_mapper.core.common.errors import Cancelled
 from forward_grid_mapper.core.common.grid import Grid
 from forward_grid_mapper.core.common.parameters import GridParameters, ModelParameters
 from forward_grid_mapper.core.common.readings import Readings
-from forward_grid_mapper.core.evidence.evidence import Evidence, reading_state_table
+from forward_grid_mapper.core.evidence.evidence import Evidence
 from forward_grid_mapper.core.evidence.fixed_point import QUANTUM
+from forward_grid_mapper.core.evidence.indexing import reading_state_table
 from forward_grid_mapper.core.evidence.updates import _zone, find_observing, flip
 from forward_grid_mapper.core.runtime import threads
 from forward_grid_mapper.core.search.flips import gain_of

@@ -99,7 +99,7 @@ def test_want_of_memory_leaves_everything_as_it_was(
     assert failed > 8
 
 
-@pytest.mark.parametrize('kernel', ['_index', 'evaluate_all'])
+@pytest.mark.parametrize('kernel', ['insert_readings', 'evaluate_all'])
 @pytest.mark.parametrize('name', ['first', 'more', 'grow'])
 def test_cancelled_in_the_middle_everything_is_as_it_was(
     monkeypatch: pytest.MonkeyPatch, name: str, kernel: str
@@ -120,7 +120,7 @@ def test_cancelled_in_the_middle_everything_is_as_it_was(
     def halfway(s: Any, *rest: Any) -> Any:
         if s.stop is not stop:
             return real(s, *rest)
-        if kernel == '_index':
+        if kernel == 'insert_readings':
             (begin, end, words), totals = rest
             done = real(s, (begin, (begin + end) // 2, words), totals)
         else:

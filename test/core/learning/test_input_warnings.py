@@ -89,6 +89,12 @@ def standing(part: float) -> Messages:
     return circling()._replace(odometry=[m if m.stamp < stop.stamp else m._replace(pose=stop.pose) for m in odometry])
 
 
+def moved_by(factor: float) -> Messages:
+    """Odometry in another unit than metres."""
+    odometry = [m._replace(pose=m.pose._replace(x=m.pose.x * factor, y=m.pose.y * factor)) for m in circling().odometry]
+    return circling()._replace(odometry=odometry)
+
+
 def stuck(frame: int, value: float) -> Messages:
     name = list(circling().extrinsics)[frame]
     return circling().with_ranges(lambda m: m._replace(range=value) if m.frame_id == name else m)
@@ -118,6 +124,7 @@ SCENARIOS: dict[str, tuple[Callable[[], Messages], str]] = {
     'one frame, one after the other': (lambda: one_frame(8_000_000), r'frame sonar take turns.*one frame_id'),
     'odometry never moves': (lambda: standing(0.0), r'odometry stands still.*while the ranges.*encoders'),
     'odometry stops in the middle': (lambda: standing(0.5), r'odometry stands still for \d+ s'),
+    'poses in centimetres': (lambda: moved_by(100), r'poses move at \d+ m/s: are they in millimetres or centimetres'),
     'a sensor at 1.2 m': (lambda: stuck(2, 1.2345), r'gives one and the same range.*Repair it'),
     'a sensor at 0.2 m': (lambda: stuck(5, 0.2), r'sensor \S+ \(0\.200 m\) gives one and the same range'),
     'field of view of 1 degree': (

@@ -1,0 +1,96 @@
+"""One row of the table of parameters: its type, bounds and words, and the check of a value."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from .errors import ParameterError
+
+
+def param(
+    default: Any,
+    help: str,
+    unit: str = '',
+    low: float = -math.inf,
+    high: float = math.inf,
+    choices: tuple[str, ...] = (),
+    read_only: bool = False,
+) -> Any:
+    """Return the field of a dataclass that is a row of the table."""
+    return dataclasses.field(
+        default=default,
+        metadata={
+            'help': help,
+            'unit': unit,
+            'low': low,
+            'high': high,
+            'choices': choices,
+            'read_only': read_only,
+        },
+    )
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One row of the table; `low` and `high` are infinite where there is no bound.
+
+    `type` is float, int, bool, str or tuple (of str); `read_only` rows cannot change while the node runs.
+    """
+
+    name: str
+    group: str
+    type: type
+    default: Any
+    unit: str
+    low: float
+    high: float
+    choices: tuple[str, ...]
+    help: str
+    read_only: bool
+
+    @property
+    def range(self) -> str:
+        """The admitted values, for people."""
+        if self.choices:
+            return ' | '.join(self.choices)
+        if self.type is bool:
+            return 'true | false'
+        if self.type is str:
+            return 'text'
+        if self.type is tuple:
+            return 'list of text'
+        return f'{self.low:g} … {self.high:g}'
+
+    def check(self, value: Any) -> Any:
+        """Return `value` as this parameter's type.
+
+        Raises
+        ------
+        ParameterError
+            If it has the wrong type or is out of range.
+        """
+        wanted = {
+            float: 'a number',
+            int: 'a whole number',
+            bool: 'true or false',
+            str: 'text',
+            tuple: 'a list of text, none of it empty',
+        }[self.type]
+        if isinstance(value, np.generic):
+            value = value.item()
+        if self.type is tuple and isinstance(value, list) and all(isinstance(v, str) and v for v in value):
+            value = tuple(value)
+        if self.type is float and isinstance(value, int) and not isinstance(value, bool):
+            value = float(value)
+        if type(value) is not self.type:
+            raise ParameterError(f'{self.name}: {value!r} is not {wanted}; admitted: {self.range} {self.unit}'.rstrip())
+        if self.choices and value not in self.choices:
+            raise ParameterError(f'{self.name}: {value!r} is not one of {", ".join(self.choices)}')
+        if isinstance(value, (int, float)) and not self.low <= value <= self.high:
+            raise ParameterError(f'{self.name}: {value!r} is out of range; admitted: {self.range} {self.unit}'.rstrip())
+        return value

@@ -1,0 +1,87 @@
+"""How readings enter: what no map changes of each, the words that its pairs take, and its place in the tiles."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..common.parameters import ModelParameters
+from ..common.readings import Readings
+from ..runtime.jit import kernel
+from ..sensor.cone import rows_of, runs_of
+from ..sensor.cone_table import Floats, cone_of
+from ..sensor.density import causes_of
+from .pairs import WORDS_PER_BAND_PAIR, WORDS_PER_RUN
+from .state import READING_STATE, State
+from .tile_index import SHIFT, insert
+
+FREE, BAND, LARGEST, WORDS, UNSTORED, UNUSED = range(6)
+"""Of the totals: pairs in free zones and in bands, cells of the largest cone, words given to readings, readings not
+stored, and those of the words that no reading uses any more."""
+
+
+@kernel
+def insert_readings(s: State, limits: tuple[int, int, int], totals: Any) -> int:
+    """Count the pairs of readings, and insert these into the tiles; return the reading at which chunks ran out.
+
+    Parameters
+    ----------
+    limits
+        The first reading, the last one plus one, and the words that stored pairs may take.
+    totals : int64, shape (6,)
+        Added to.
+    """
+    begin, end, words = limits
+    cones, lattice, tiles, seen, before = s.cones, s.lattice, s.tiles, s.maps.seen, s.normals.before
+    for t in range(begin, end):
+        reading, times = cones[t], s.reading_states[t].multiplicity
+        cone = cone_of(reading)
+        bottom, end_row = rows_of(cone, lattice.height)
+        across = min(2 * int(cone.reach) + 3, lattice.width)
+        most = (((end_row - bottom) >> SHIFT) + 2) * ((across >> SHIFT) + 2)
+        if s.stop[0] or tiles.used[0] + most > len(tiles.chunks):
+            return t
+        count, free, band = 0, 0, 0
+        for row in range(bottom, end_row):
+            runs = runs_of(cone, row, lattice.width)
+            for left, right in ((runs.first, runs.last), (runs.first2, runs.last2)):
+                if left > right:
+                    continue
+                insert(tiles, row, left, right, t)
+                inner, outer = max(left, runs.inner), min(right, runs.outer)
+                inside = max(outer - inner + 1, 0)
+                count += inside > 0
+                if s.normals.cos2_limit > 0.0 and inside > 0:
+                    # a cell that is left out may cut a run in two
+                    count += before[row, outer + 1] - before[row, inner]
+                for c in range(np.uint64(row * lattice.width + left), np.uint64(row * lattice.width + right + 1)):
+                    seen[c] += times
+                free += inside
+                band += right - left + 1 - inside
+        reading_state = s.reading_states[t]
+        size = WORDS_PER_RUN * count + WORDS_PER_BAND_PAIR * band
+        reading_state.at = totals[WORDS]
+        reading_state.room = size
+        reading_state.stored = totals[WORDS] + size <= words
+        if reading_state.stored:
+            totals[WORDS] += size
+        else:
+            totals[UNSTORED] += 1
+        totals[FREE] += free
+        totals[BAND] += band
+        totals[LARGEST] = max(totals[LARGEST], free + band)
+    return end
+
+
+def reading_state_table(
+    readings: Readings, sigma: Floats, model: ModelParameters, resolution: float
+) -> NDArray[np.void]:
+    """Return records of `READING_STATE`, shape (N,), with what no map changes; arguments are those of `causes_of`."""
+    reading_states = np.zeros(len(readings), READING_STATE)
+    causes = causes_of(readings, sigma, model, resolution)
+    reading_states['floor'] = causes.random + causes.lost
+    reading_states['max_range'] = causes.max_range
+    reading_states['multiplicity'] = 1
+    return reading_states
