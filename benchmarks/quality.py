@@ -73,6 +73,7 @@ ABLATIONS: dict[str, dict[str, Any]] = {
     'surface normals': {'max_incidence_angle': 1.5708},
     'prior for walls': NO_WALLS,
     'unknown': {'least_passed': 0.0},
+    'walls that look any way (unknown)': {'least_noticed': 0.0},
     'lost echoes': {'p_lost': 0.0},
     'neighbours (uncertainty)': {'neighbour_weight': 0.0, 'alpha': 0.8, 'uncertainty_prior': 0.3},
     'all of these but lost echoes': {**PLAIN, 'neighbour_weight': 0.0, 'alpha': 0.8, 'uncertainty_prior': 0.3},
@@ -188,15 +189,15 @@ def print_ablations(groups: dict[str, list[Case]], base: dict[str, Any], whole: 
     def mean(r: Results, which: Sequence[str], name: str) -> float:
         return float(np.mean([getattr(r.figures[n], name) for n in which])) if which else math.nan
 
-    print('\nthe default without                 door n=…        corridor 15°                 own worlds', end='')
+    print('\nthe default without                   door n=…        corridor 15°                 own worlds', end='')
     print(''.join(f'{n:>13s}' for n in recordings), '   simulated')
-    print(f'{"":32s}{"F1":>7s}{"open":>6s}{"F1":>8s}{"dots":>6s}{"cover":>7s}{"smooth":>8s}', end='')
+    print(f'{"":34s}{"F1":>7s}{"open":>6s}{"F1":>8s}{"dots":>6s}{"cover":>7s}{"smooth":>8s}', end='')
     print(f'{"F1":>7s}{"nav":>7s}{"cover":>7s}' + f'{"F1":>7s}{"nav":>6s}' * len(recordings) + f'{"loss":>9s}')
     for title, changes in {'nothing': None, **ABLATIONS}.items():
         r = whole if changes is None else results(groups, Parameters.from_flat({**base, **changes}), tool)
         least = min(r.figures[n].door for n in doors)
         row = (
-            f'{title:32s}{mean(r, doors, "f1"):7.3f}{least:6.1f}{mean(r, hall, "f1"):8.3f}{mean(r, hall, "dots"):6.0f}'
+            f'{title:34s}{mean(r, doors, "f1"):7.3f}{least:6.1f}{mean(r, hall, "f1"):8.3f}{mean(r, hall, "dots"):6.0f}'
         )
         row += f'{mean(r, hall, "coverage"):7.3f}{mean(r, hall, "smooth"):8.2f}'
         row += ''.join(f'{mean(r, own, key):7.3f}' for key in ('f1', 'nav_iou', 'coverage'))

@@ -8,7 +8,7 @@ import math
 
 import numpy as np
 
-from forward_grid_mapper.core.common.constants import MOST_AGAINST_EXTENSION, STRAIGHT_RUN
+from forward_grid_mapper.core.common.constants import LED_ON, MOST_AGAINST_EXTENSION, STRAIGHT_RUN
 from forward_grid_mapper.core.common.grid import Grid
 from forward_grid_mapper.core.common.parameters import ModelParameters
 from forward_grid_mapper.core.common.readings import Readings
@@ -354,8 +354,11 @@ def normals(readings: Readings, grid: Grid, model: ModelParameters) -> tuple[np.
 def passed(
     readings: Readings, grid: Grid, occupied: np.ndarray, model: ModelParameters, weight: np.ndarray | None = None
 ) -> np.ndarray:
-    """How many readings are expected to have passed each cell, shape (cells,): the formula of `finishing`."""
-    out, model = np.zeros(grid.size), of_cells(model, grid)
+    """How many readings are expected to have passed each cell in each direction: that of `post_processing`.
+
+    Shape (4, cells): of beams along 0°, 45°, 90° and 135°, whichever is nearest.
+    """
+    out, model = np.zeros((4, grid.size)), of_cells(model, grid)
     mixture_weight = 1 - model.p_rand - model.p_lost
     for t in range(len(readings)):
         z, z_max, sigma = readings.z[t], readings.z_max[t], sigma_of(readings, t, grid, model)
@@ -377,8 +380,25 @@ def passed(
                 blocking = [at for at, _ in met if at <= free_end]
                 behind = bool(blocking) and d > min(blocking)
                 p += chance / total * ((1 - model.p_hit) ** len(blocking) if behind else 1.0)
-            out[c] += p * strength(readings, t, grid, c) * (1 if weight is None else weight[t])
+            row, column = divmod(c, grid.width)
+            x, y = (grid.column + column + 0.5) * grid.resolution, (grid.row + row + 0.5) * grid.resolution
+            bearing = math.atan2(y - readings.y[t], x - readings.x[t])
+            way = round(bearing / (math.pi / 4)) % 4
+            out[way, c] += p * strength(readings, t, grid, c) * (1 if weight is None else weight[t])
     return out
+
+
+def noticing(passes: np.ndarray, p_hit: float, max_incidence_angle: float) -> np.ndarray:
+    """As many readings that any surface would have noticed: of passes, shape (4, cells), by trying all bearings."""
+    bearings = (np.arange(18000) + 0.5) * math.pi / 18000
+    nearest = np.round(bearings / (math.pi / 4)).astype(int) % 4
+    out = np.zeros(passes.shape[1])
+    for normal in np.arange(4) * math.pi / 4:
+        off = np.abs((bearings - normal + math.pi / 2) % math.pi - math.pi / 2)
+        share = [np.mean(off[nearest == way] < max_incidence_angle) for way in range(4)]
+        out += (1 - p_hit) ** (np.array(share) @ passes) / 4
+    with np.errstate(divide='ignore'):
+        return np.log(out) / math.log(1 - p_hit)
 
 
 def evidence(
@@ -428,20 +448,27 @@ def handed_out(
     normals: SurfaceNormals | None,
     traversed: np.ndarray,
     steps: int,
-    least_passed: float,
+    least: tuple[float, float],
 ) -> np.ndarray:
-    """The map that is handed out, made of the one that the search found."""
+    """The map that is handed out, made of the one that the search found; `least`: passed, and noticed.
+
+    Cells are of 0.1 m.
+    """
     seen = np.zeros(grid.size, int)
     for t in range(len(readings)):
         seen[list(cells_of(readings, t, grid, model))] += 1
     seen = seen.reshape(grid.shape)
     ml = np.where(seen > 0, occupied.reshape(grid.shape).astype(int), -1)
     ml[traversed & (ml < 0)] = 0
-    through = passed(readings, grid, occupied, model).reshape(grid.shape) >= least_passed
-    known = (ml == 0) & (traversed | through)
+    passes = passed(readings, grid, occupied, model)
+    through = (ml == 0) & (traversed | (passes.sum(axis=0).reshape(grid.shape) >= least[0]))
+    noticed = noticing(passes, model.p_hit, model.max_incidence_angle).reshape(grid.shape) >= least[1]
+    known = (ml == 0) & (traversed | (noticed & through))
+    for _ in range(round(LED_ON / 0.1)):
+        known = through & (box_sum(known.astype(int)) > 0)
     told = evidence(readings, grid, occupied, model, normals).reshape(grid.shape)
     told = np.where(occupied.reshape(grid.shape) == 1, -told, told)
-    ahead = drawn_out(occupied.reshape(grid.shape), told, seen, steps, known)
+    ahead = drawn_out(occupied.reshape(grid.shape), told, seen, steps, through)
     ml[ahead == 1] = 1
     ml[(ml == 0) & (box_sum(known.astype(int)) == 0)] = -1
     return ml

@@ -190,7 +190,7 @@ def _what_decides(maps: MapArchive, found: CellEvidence, state: int) -> str:
     if state < 0:
         return (
             f'too little is known: fewer than {maps.parameters.search.least_passed:g} readings are expected to have '
-            f'passed through it, and nothing makes it occupied'
+            f'passed through it, or none that would have noticed a wall there, and nothing makes it occupied'
         )
     if (total > 0) != (state == 1):
         return (

@@ -156,7 +156,7 @@ class Mapper:
     def _post_process(self, given: _Given, evidence: Evidence) -> NDArray[np.int8]:
         search = self._parameters.search
         extension = EXTENSION if has_walls(search) else 0.0
-        return post_process(evidence, extension, search.least_passed, given.traversed)
+        return post_process(evidence, extension, search.least_passed, search.least_noticed, given.traversed)
 
     @_stage('uncertainty')
     def _judge(

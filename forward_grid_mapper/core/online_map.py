@@ -289,7 +289,7 @@ class OnlineMap:
         evidence, search = self._evidence, self._parameters.search
         window = evidence.grid.window(self.grid)
         extension = EXTENSION if has_walls(search) else 0.0
-        ml = post_process(evidence, extension, search.least_passed, self._traversed)
+        ml = post_process(evidence, extension, search.least_passed, search.least_noticed, self._traversed)
         neighbours = odds_given_neighbours(self._prior, ml == 1)
         uncertainty = uncertainty_map(evidence.of_occupancy(), neighbours, ml, search)
         return self.grid, ml[window], uncertainty[window]

@@ -129,9 +129,8 @@ def test_no_single_flip_gains_where_the_search_ended(seed: int) -> None:
 def test_the_map_that_is_handed_out(seed: int) -> None:
     c = case(seed)
     search, model = c.maps.parameters.search, c.maps.parameters.model
-    expected = naive.handed_out(
-        *c.told, model, c.maps.normals, c.traversed, round(EXTENSION / 0.1), search.least_passed
-    )
+    least = search.least_passed, search.least_noticed
+    expected = naive.handed_out(*c.told, model, c.maps.normals, c.traversed, round(EXTENSION / 0.1), least)
     assert np.array_equal(c.maps.ml, expected)
     assert set(np.unique(expected)) == {-1, 0, 1}
 

@@ -79,6 +79,11 @@ FREE_MARGIN = 0.1
 """Metres around a cell known to be free within which others are free, if nothing occupies them. Without it a fringe of
 unknown cells stands before every wall."""
 
+LED_ON = 0.3
+"""Metres by which free space goes on, through cells that some readings passed, from those that no surface could be in
+without readings having noticed it. With less, doors that one sweep looked through are shut, with more, more of what
+lies behind holes in walls is free. With `FREE_MARGIN` it is less than the margin of tiles, half of `LONGEST_GAP`."""
+
 LEAST_EVIDENCE = 0.1
 """Nats, either way, from which on a cell counts as observed though the maximum likelihood map does not know it."""
 

@@ -178,6 +178,14 @@ class SearchParameters:
         0.0,
         100.0,
     )
+    least_noticed: float = param(
+        1.5,
+        'Readings that must speak as much for free space around there as if they would have noticed a surface whatever '
+        'way it faces (max_incidence_angle); 0 takes readings that see at a slant alone for enough.',
+        'readings',
+        0.0,
+        100.0,
+    )
     max_iterations: int = param(
         200, 'Bound on the iterations of the search; the report says when it was reached.', 'iterations', 1, 100_000
     )

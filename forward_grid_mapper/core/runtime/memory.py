@@ -18,8 +18,8 @@ BYTES_A_CELL = 104
 """What a run on one thread takes for a cell at its peak, when the maps are collected: three maps, the evidence, the
 prior, and the sums that surface normals or passed readings are counted in."""
 
-BYTES_A_CELL_AND_THREAD = 24
-"""What another thread takes for a cell at its peak: the three sums of surface normals."""
+BYTES_A_CELL_AND_THREAD = 32
+"""What another thread takes for a cell at its peak: the four sums of readings that passed."""
 
 THREAD_MEMORY = 64_000_000
 """Bytes that all threads but the first may take together. Where an array for each of them would be more, on maps of

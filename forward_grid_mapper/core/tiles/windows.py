@@ -165,7 +165,7 @@ def finished(given: Given, parameters: Parameters) -> Finished:
     evidence = _evidence(given, p)
     searched, of_occupancy = evidence.observed(), evidence.of_occupancy()
     extension = EXTENSION if has_walls(p.search) else 0.0
-    ml = post_process(evidence, extension, p.search.least_passed, given.traversed)
+    ml = post_process(evidence, extension, p.search.least_passed, p.search.least_noticed, given.traversed)
     prior = wall_prior(p.search, given.traversed.ravel(), given.box.resolution)
     odds = odds_given_neighbours(prior, ml == 1)
     return Finished(

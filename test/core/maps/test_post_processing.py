@@ -9,14 +9,21 @@ import numpy as np
 import pytest
 
 import naive
-from forward_grid_mapper.core.common.constants import FREE_MARGIN, MOST_AGAINST_EXTENSION
+from forward_grid_mapper.core.common.constants import FREE_MARGIN, LED_ON, LONGEST_GAP, MOST_AGAINST_EXTENSION
 from forward_grid_mapper.core.common.grid import Grid
 from forward_grid_mapper.core.common.parameters import ModelParameters
 from forward_grid_mapper.core.common.readings import Readings
 from forward_grid_mapper.core.evidence.evidence import Evidence
 from forward_grid_mapper.core.evidence.fixed_point import QUANTUM
-from forward_grid_mapper.core.maps.free_space import expected_passes
-from forward_grid_mapper.core.maps.post_processing import post_process
+from forward_grid_mapper.core.maps.free_space import (
+    UNIT,
+    count,
+    direction_of,
+    expected_passes,
+    noticed_by,
+    passes_by_direction,
+)
+from forward_grid_mapper.core.maps.post_processing import led_on, post_process
 from forward_grid_mapper.core.maps.wall_extension import extend
 from forward_grid_mapper.core.runtime import threads
 from samples import plain_model, random_readings
@@ -57,11 +64,71 @@ def test_readings_that_passed_are_those_of_the_twin(seed: int, filled: float) ->
     evidence = made(readings, model, occupied)
     told = expected_passes(evidence, occupied)
     expected = naive.passed(readings, GRID, occupied, model)
-    assert np.abs(told - expected).max() < 2e-6 * len(readings)
-    assert (told <= evidence.state.maps.seen + 1e-9).all()
+    assert np.abs(passes_by_direction(evidence, occupied) * UNIT - expected).max() < 2e-6 * len(readings)
+    assert np.abs(told.all - expected.sum(axis=0)).max() < 8e-6 * len(readings)
+    assert (told.all <= evidence.state.maps.seen + 1e-9).all()
+    assert np.abs(told.noticing - told.all).max() < 1e-9, 'without a limit of the incidence, any surface notices all'
     again = Evidence(GRID, model, memory=0.0, start=occupied.reshape(GRID.shape))
     again.extend(readings)
     assert np.array_equal(expected_passes(again, occupied), told)
+
+
+@pytest.mark.parametrize('seed', range(8))
+@pytest.mark.parametrize('angle', [0.1, 0.3, 0.7, 1.2, 1.5])
+def test_what_any_surface_would_have_noticed_is_that_of_the_twin(seed: int, angle: float) -> None:
+    rng = np.random.default_rng(seed)
+    passes = np.where(rng.random((4, 50)) < 0.3, 0.0, rng.gamma(0.7, 3.0, (4, 50)))
+    passes[:, :2] *= 1000.0
+    passed, whole, out = np.round(passes / UNIT).astype(np.int64), np.empty(50), np.empty(50)
+    p_hit = rng.choice([0.05, 0.65, 0.98])
+    count(passed, noticed_by(angle), p_hit, whole, out)
+    assert np.array_equal(whole, passed.sum(axis=0) * UNIT)
+    expected = naive.noticing(passed * UNIT, p_hit, angle)
+    finite = np.isfinite(expected)
+    assert finite[2:].all()
+    assert out[finite] == pytest.approx(expected[finite], rel=5e-3, abs=2e-3)
+    assert (out >= -1e-12).all() and (out <= passes.sum(axis=0) + 1e-9).all()
+
+
+@pytest.mark.parametrize('turn', [1j, -1, 1 + 0j])
+def test_directions_of_looking_turn_and_mirror_with_the_lattice(turn: complex) -> None:
+    rng = np.random.default_rng(3)
+    for u, v in rng.normal(size=(200, 2)):
+        bearing = math.atan2(v, u)
+        assert direction_of(u, v) == round(bearing / (math.pi / 4)) % 4
+        turned = complex(u, v) * turn
+        assert direction_of(turned.real, turned.imag) == (direction_of(u, v) + (2 if turn == 1j else 0)) % 4
+        assert direction_of(-u, v) == (-direction_of(u, v)) % 4
+
+
+def test_readings_of_one_direction_do_not_say_that_a_cell_is_free() -> None:
+    beams = {'z': np.full(50, 1.3), 'z_max': 1.3, 'half_angle': 0.02}
+    model = plain_model(sigma=0.05, max_incidence_angle=0.7)
+    free = np.zeros(GRID.shape, np.uint8)
+    along = Readings.from_columns(x=0.05, y=0.55, yaw=0.0, **beams)
+    # along the row, the column and both diagonals of one cell
+    x, y, yaw = np.array([(0.05, 0.55, 0.0), (1.05, 0.05, 2.0), (0.65, 0.15, 1.0), (1.35, 0.25, 3.0)]).T
+    star = {name: np.repeat(column, 50) for name, column in (('x', x), ('y', y), ('yaw', yaw * math.pi / 4))}
+    around = Readings.from_columns(**star, z=np.full(200, 1.3), z_max=1.3, half_angle=0.02)
+    told = post_process(made(along, model, free), 0.0, 0.9, 1.5, NOWHERE)
+    assert (told == -1).all(), 'a wall at a slant would have let all of them pass'
+    assert (post_process(made(along, model, free), 0.0, 0.9, 0.0, NOWHERE) == 0).any()
+    told = post_process(made(around, model, free), 0.0, 0.9, 1.5, NOWHERE)
+    assert told[5, 10] == 0
+    far = np.flatnonzero(told[5] == 0)
+    assert far[0] == 10 - round(LED_ON / 0.1) - round(FREE_MARGIN / 0.1), 'as far as it leads on, and a cell beside'
+
+
+def test_free_space_leads_on_through_what_readings_passed_alone() -> None:
+    known, passed = np.zeros((3, 12), bool), np.ones((3, 12), bool)
+    known[1, 2], passed[:, 7] = True, False
+    assert np.array_equal(led_on(known, passed, 3).any(axis=0), np.arange(12) <= 5)
+    assert np.array_equal(led_on(known, passed, 9).any(axis=0), np.arange(12) <= 6)
+    assert np.array_equal(led_on(known, passed, 0), known)
+
+
+def test_tiles_hold_all_that_decides_about_a_cell() -> None:
+    assert LED_ON + FREE_MARGIN <= LONGEST_GAP / 2
 
 
 def test_the_map_asked_about_may_be_another_and_weights_count() -> None:
@@ -72,7 +139,7 @@ def test_the_map_asked_about_may_be_another_and_weights_count() -> None:
     evidence.add_multiplicity(np.repeat(np.arange(len(readings)), weight - 1))
     told = expected_passes(evidence, occupied)
     expected = naive.passed(readings, GRID, occupied, model, weight)
-    assert np.abs(told - expected).max() < 2e-6 * weight.sum()
+    assert np.abs(told.all - expected.sum(axis=0)).max() < 8e-6 * weight.sum()
 
 
 def test_neither_threads_nor_what_is_grazed_change_who_passed(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -84,7 +151,7 @@ def test_neither_threads_nor_what_is_grazed_change_who_passed(monkeypatch: pytes
     assert np.array_equal(expected_passes(made(readings, whole, occupied, threads=3), occupied), one)
     two = made(readings, slanted, occupied)
     assert two.state.normals.known.any()
-    assert np.array_equal(expected_passes(two, occupied), one)
+    assert np.array_equal(expected_passes(two, occupied).all, one.all)
 
 
 @pytest.mark.parametrize('seed', range(30))
@@ -122,11 +189,11 @@ def seen_by_all(occupied: np.ndarray) -> Evidence:
 
 def test_finish_draws_walls_out_by_so_many_cells_and_no_farther_than_something_speaks_against_it() -> None:
     evidence = seen_by_all(wall_at(5, 4, 8))
-    assert np.array_equal(post_process(evidence, 0.0, 0.0, NOWHERE) == 1, wall_at(5, 4, 8) == 1)
-    assert np.array_equal(post_process(evidence, 0.2, 0.0, NOWHERE) == 1, wall_at(5, 2, 10) == 1)
+    assert np.array_equal(post_process(evidence, 0.0, 0.0, 0.0, NOWHERE) == 1, wall_at(5, 4, 8) == 1)
+    assert np.array_equal(post_process(evidence, 0.2, 0.0, 0.0, NOWHERE) == 1, wall_at(5, 2, 10) == 1)
     evidence.state.maps.evidence.reshape(GRID.shape)[5, 10] = round(-1.1 * MOST_AGAINST / QUANTUM)
     evidence.state.maps.evidence.reshape(GRID.shape)[5, 2] = round(-0.9 * MOST_AGAINST / QUANTUM)
-    assert np.array_equal(post_process(evidence, 0.3, 0.0, NOWHERE) == 1, wall_at(5, 1, 9) == 1)
+    assert np.array_equal(post_process(evidence, 0.3, 0.0, 0.0, NOWHERE) == 1, wall_at(5, 1, 9) == 1)
     assert np.array_equal(evidence.observed() == 1, wall_at(5, 4, 8) == 1), 'the search goes on from its own map'
 
 
@@ -134,19 +201,21 @@ def test_no_wall_is_drawn_out_over_where_the_robot_was_or_readings_passed() -> N
     traversed = NOWHERE.copy()
     traversed[5, 10] = True
     evidence = seen_by_all(wall_at(5, 4, 8))
-    assert np.array_equal(post_process(evidence, 0.3, 0.0, traversed) == 1, wall_at(5, 1, 9) == 1)
+    assert np.array_equal(post_process(evidence, 0.3, 0.0, 0.0, traversed) == 1, wall_at(5, 1, 9) == 1)
     # ten readings that went through a gap
     readings = Readings.from_columns(x=1.15, y=0.05, yaw=math.pi / 2, z=np.full(10, 1.0), z_max=1.3, half_angle=0.02)
     evidence = made(readings, plain_model(sigma=0.05), wall_at(5, 4, 8))
     evidence.state.maps.seen[:], evidence.state.maps.evidence[:] = 1, 1
-    assert np.array_equal(post_process(evidence, 0.6, 0.0, NOWHERE)[5] == 1, np.arange(14) <= 13)
-    told = post_process(evidence, 0.6, 1.0, NOWHERE)
+    assert np.array_equal(post_process(evidence, 0.6, 0.0, 0.0, NOWHERE)[5] == 1, np.arange(14) <= 13)
+    told = post_process(evidence, 0.6, 1.0, 0.0, NOWHERE)
     assert told[5, 11] == 0
     assert (told[5, 9:11] == 1).all(), 'up to what is known'
 
 
 def test_three_cells_are_no_straight_wall() -> None:
-    assert np.array_equal(post_process(seen_by_all(wall_at(5, 4, 6)), 0.3, 0.0, NOWHERE) == 1, wall_at(5, 4, 6) == 1)
+    assert np.array_equal(
+        post_process(seen_by_all(wall_at(5, 4, 6)), 0.3, 0.0, 0.0, NOWHERE) == 1, wall_at(5, 4, 6) == 1
+    )
 
 
 @pytest.mark.parametrize('seed', range(6))
@@ -157,22 +226,22 @@ def test_cells_through_which_nobody_passed_are_unknown(seed: int) -> None:
     traversed = np.random.default_rng(seed).random(GRID.shape) < 0.01
     plain = evidence.observed()
     plain[traversed & (plain < 0)] = 0
-    passed = expected_passes(evidence, occupied).reshape(GRID.shape)
-    assert np.array_equal(post_process(evidence, 0.0, 0.0, traversed), plain)
+    passed = expected_passes(evidence, occupied).all.reshape(GRID.shape)
+    assert np.array_equal(post_process(evidence, 0.0, 0.0, 0.0, traversed), plain)
     for least in (0.5, 1.5):
-        told = post_process(evidence, 0.0, least, traversed)
+        told = post_process(evidence, 0.0, least, 0.0, traversed)
         known = ((passed >= least) | traversed) & (plain == 0)
         beside = naive.box_sum(known.astype(int)) > 0
         expected = np.where((plain == 0) & ~beside, -1, plain)
         assert np.array_equal(told, expected)
-    assert (post_process(evidence, 0.0, 100.0, NOWHERE) != 0).all()
+    assert (post_process(evidence, 0.0, 100.0, 0.0, NOWHERE) != 0).all()
 
 
 def test_behind_a_wall_nothing_is_free() -> None:
     # fifty echoes of a wall 0.6 m ahead, and one that went through a gap
     readings = Readings.from_columns(x=0.05, y=0.55, yaw=0.0, z=np.full(50, 0.6), z_max=1.3, half_angle=0.02)
     evidence = made(readings, dataclasses.replace(plain_model(), sigma=0.05), wall_at(5, 6, 6))
-    told = post_process(evidence, 0.0, 0.9, NOWHERE)
+    told = post_process(evidence, 0.0, 0.9, 0.0, NOWHERE)
     assert told[5, :7].tolist() == [0] * 6 + [1]
     assert (told[5, 9:] == -1).all()
     assert math.isfinite(evidence.log_likelihood)
@@ -190,7 +259,7 @@ def test_margins_and_extensions_are_lengths_in_metres(parts: int) -> None:
     )
     evidence.extend(readings)
     evidence.state.maps.seen[:], evidence.state.maps.evidence[:] = 1, 1
-    told = post_process(evidence, 0.3, 1.0, np.zeros(grid.shape, bool))
+    told = post_process(evidence, 0.3, 1.0, 0.0, np.zeros(grid.shape, bool))
     columns = np.flatnonzero(told[5 * parts] == 1)
     assert (columns[0], columns[-1]) == (1 * parts, 12 * parts - 1)
     free = np.flatnonzero(told[:, 7 * parts] == 0)

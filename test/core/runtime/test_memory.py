@@ -39,7 +39,7 @@ def test_what_a_run_takes_is_what_it_is_said_to_take(
 
 def test_another_thread_takes_no_more_on_a_large_map() -> None:
     assert least_memory(10**7, 0, 64) == least_memory(10**7, 0, 2) <= 10**7 * BYTES_A_CELL + THREAD_MEMORY
-    assert least_memory(1000, 0, 3) - least_memory(1000, 0, 1) == 2 * 1000 * 24
+    assert least_memory(1000, 0, 3) - least_memory(1000, 0, 1) == 2 * 1000 * 32
 
 
 def test_what_is_free_is_known_and_bounded_by_the_group(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
