@@ -35,11 +35,6 @@ STEP = math.radians(90.0 / STATES)
 DOUBT = 0.3
 """Weight of a vote that says nothing: boxes and people have directions too."""
 
-SHARPER = 2.0
-"""Power of the votes that is their likelihood: echoes of one wall vote for all directions within their cones, so votes
-are wider than they are wrong. In simulated and recorded buildings true directions are likelier with 2 than with 1,
-except where walls stand at any angle; with 3, a drift may be likelier than the odometry where that is exact."""
-
 SLIPS = 0.03
 """Part of the motions whose noise is three times larger."""
 
@@ -143,9 +138,7 @@ class _Chain:
         self.grid = np.arange(self.states) * STEP
         # a wall along an axis has the direction −(yaw + δ) in the frame of the node
         seen = np.degrees(-(yaw[:, None] + self.grid)) % DIRECTIONS
-        sharp = votes**SHARPER
-        sharp /= sharp.mean(1, keepdims=True)
-        ends = np.column_stack([sharp, sharp[:, :1]])
+        ends = np.column_stack([votes, votes[:, :1]])
         places = np.arange(DIRECTIONS + 1)
         rows = np.stack([np.interp(place, places, row) for place, row in zip(seen, ends, strict=True)])
         self.likelihood: Floats = (DOUBT + (1.0 - DOUBT) * rows) ** temper

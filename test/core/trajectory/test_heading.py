@@ -24,7 +24,7 @@ from forward_grid_mapper.core.trajectory.walls import (
 )
 from forward_grid_mapper.core.trajectory.windows import Odometry, Windows, corrected, cut
 from forward_grid_mapper.simulation.drift import LEVELS, with_drift
-from forward_grid_mapper.simulation.drive import Recording, corridor_drive, drive
+from forward_grid_mapper.simulation.drive import Recording, drive
 from forward_grid_mapper.simulation.sonar import NOISY, front_array
 from forward_grid_mapper.simulation.world import building_tour, building_world
 
@@ -142,25 +142,7 @@ def test_the_heading_is_found_where_odometry_drifts(bent, true) -> None:
     assert found.over_odometry > 20
 
 
-def test_sharper_votes_follow_wheels_that_stray(monkeypatch) -> None:
-    exact = corridor_drive(seed=1)
-    odometry = odometry_of(with_drift(exact, LEVELS['wheels'], 1))
-    windows = cut(with_drift(exact, LEVELS['wheels'], 1).readings, odometry)
-    at, votes = wall_votes(windows, np.zeros(len(windows), bool))
-    errors, over = [], []
-    for power in (module.SHARPER, 1.0):
-        monkeypatch.setattr(module, 'SHARPER', power)
-        found = heading(windows, at, votes)
-        assert found is not None
-        off = wrapped(windows.node[at, 2] + found.correction - odometry_of(exact).at(windows.node_stamp)[at, 2])
-        errors.append(np.degrees(np.sqrt(np.mean(wrapped(off - np.median(off)) ** 2))))
-        over.append(found.over_odometry)
-    assert errors[0] < 0.85 * errors[1]
-    assert errors[0] < 4.5
-    assert over[0] > 2 * over[1]
-
-
-def test_a_vote_counts_by_its_power_over_its_mean(bent) -> None:
+def test_a_vote_is_a_likelihood(bent) -> None:
     _, _, windows = bent
     at, votes = wall_votes(windows, np.zeros(len(windows), bool))
     chain = module._Chain(windows, at[:3], votes[:3])
@@ -168,9 +150,9 @@ def test_a_vote_counts_by_its_power_over_its_mean(bent) -> None:
         for state in (0, 17, 100):
             place = np.degrees(-(windows.node[at[k], 2] + state * module.STEP)) % DIRECTIONS
             left = int(place)
-            sharp = [v**module.SHARPER for v in votes[k]]
-            here = sharp[left] + (place - left) * (sharp[(left + 1) % DIRECTIONS] - sharp[left])
-            wanted = module.DOUBT + (1 - module.DOUBT) * here / (sum(sharp) / DIRECTIONS)
+            row = votes[k]
+            here = row[left] + (place - left) * (row[(left + 1) % DIRECTIONS] - row[left])
+            wanted = module.DOUBT + (1 - module.DOUBT) * here
             assert chain.likelihood[k, state] == pytest.approx(wanted)
 
 
