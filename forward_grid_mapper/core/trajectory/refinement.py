@@ -169,6 +169,8 @@ class Refiner:
         if better.sigmas < least:
             reason = f'{said}: not enough to tell that odometry is off'
             return Refinement(False, reason, readings, odometry, named, gain=better.mean)
+        if better.sigmas < LEAST_SIGMAS:
+            said = f'that walls stand at right angles is likelier by {witness:.0f} nats than with odometry; {said}'
         solution, loops = solver.with_matches(along)
         nodes = self._choose(scans, simple, along.nodes, solution.nodes)
         if nodes is solution.nodes:

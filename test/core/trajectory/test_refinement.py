@@ -61,6 +61,13 @@ def test_drift_is_taken_out(tour, bent, outcome) -> None:
     assert outcome.trajectory.pose[0] == pytest.approx(odometry.pose[0], abs=1e-6)
 
 
+def test_what_speaks_for_it_is_named(bent, monkeypatch, outcome) -> None:
+    assert outcome.reason.startswith(('readings are foreseen', 'that walls stand at right angles'))
+    # no readings are foreseen so much better, so the walls have the word
+    monkeypatch.setattr(refinement, 'LEAST_SIGMAS', 1e9)
+    assert 'that walls stand at right angles is likelier by' in Refiner(Parameters()).run(*bent).reason
+
+
 def test_readings_go_along(bent, outcome) -> None:
     readings, odometry = bent
     placed = outcome.readings
