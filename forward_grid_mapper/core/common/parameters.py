@@ -179,9 +179,9 @@ class SearchParameters:
         100.0,
     )
     least_noticed: float = param(
-        1.5,
-        'Readings that must speak as much for free space around there as if they would have noticed a surface whatever '
-        'way it faces (max_incidence_angle); 0 takes readings that see at a slant alone for enough.',
+        1.0,
+        'What readings from different directions must say for floor to be known as free, counted in readings that would '
+        'notice a wall whatever way it faces; 0 takes it as free from wherever it was seen.',
         'readings',
         0.0,
         100.0,
