@@ -150,3 +150,25 @@ def test_the_uncertainty_map(seed: int) -> None:
         logit = search.alpha * told[cell] + search.neighbour_weight * neighbours + base
         # where the robot was, a cell cannot be occupied
         assert q == pytest.approx(1 / (1 + math.exp(-max(logit, -500.0))), abs=1e-4)
+
+
+def in_room(x: float, y: float, bearing: float, half: float) -> float:
+    """Return the distance to the nearest wall in a cone, in a room of 6 by 5 metres."""
+    angles = bearing + np.linspace(-half, half, 31)
+    c, s = np.cos(angles), np.sin(angles)
+    across = np.where(c > 0, 6.0 - x, x) / np.maximum(np.abs(c), 1e-9)
+    along = np.where(s > 0, 5.0 - y, y) / np.maximum(np.abs(s), 1e-9)
+    return float(np.minimum(across, along).min())
+
+
+@pytest.mark.parametrize('sonars', [1, 3, 8])
+def test_a_robot_that_turns_on_the_spot_knows_the_room_around_it(sonars: int) -> None:
+    # every place is seen from one direction alone
+    x, y, half = 2.5, 2.2, 0.13
+    bearings = np.arange(144)[:, None] * (2 * np.pi / 72) + np.arange(sonars) * (2 * np.pi / 8)
+    z = [min(in_room(x, y, bearing, half), 4.0) for bearing in bearings.ravel()]
+    readings = Readings.from_columns(x=x, y=y, yaw=bearings.ravel(), z=z, z_max=4.0, half_angle=half)
+    maps = Mapper(Parameters()).run(readings)
+    xs, ys = np.meshgrid(np.arange(0.35, 5.7, 0.1), np.arange(0.35, 4.7, 0.1))
+    rows, columns = maps.grid.cells_of(xs.ravel(), ys.ravel())
+    assert (maps.ml[rows, columns] == 0).mean() > 0.9

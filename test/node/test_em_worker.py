@@ -112,7 +112,14 @@ def test_a_run_that_cannot_fit_does_not_begin(monkeypatch: pytest.MonkeyPatch, c
 def test_what_is_wrong_with_the_readings_comes_with_the_maps(caller: Caller) -> None:
     steps = np.repeat(np.arange(50), 2)
     twice = Readings.from_columns(
-        names=('sonar',), x=0.02 * steps, y=0.0, yaw=0.0, z=3.0 - 0.02 * steps, z_max=4.0, half_angle=0.2, stamp=steps * 10**8
+        names=('sonar',),
+        x=0.02 * steps,
+        y=0.0,
+        yaw=0.0,
+        z=3.0 - 0.02 * steps,
+        z_max=4.0,
+        half_angle=0.2,
+        stamp=steps * 10**8,
     )
     outcome = caller.outcome_of(twice)
     assert outcome.maps is not None

@@ -180,8 +180,8 @@ class SearchParameters:
     )
     least_noticed: float = param(
         1.0,
-        'What readings from different directions must say for floor to be known as free, counted in readings that would '
-        'notice a wall whatever way it faces; 0 takes it as free from wherever it was seen.',
+        'What readings from different directions must say for floor to be known as free, counted in readings that '
+        'would notice a wall whatever way it faces; 0 takes it as free from wherever it was seen.',
         'readings',
         0.0,
         100.0,
