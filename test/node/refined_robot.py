@@ -2,16 +2,34 @@
 
 from __future__ import annotations
 
+import threading
 from typing import Any
 
 import numpy as np
+import pytest
 from drift_samples import bend, replaced_by
 from inside import Inside
 
 from forward_grid_mapper.core.common.parameters import Parameters
+from forward_grid_mapper.core.mapping import Mapper
 from forward_grid_mapper.core.maps.log_odds_map import LogOddsMap
 from forward_grid_mapper.core.trajectory.poses import compose, relative
 from forward_grid_mapper.core.trajectory.windows import Odometry
+
+
+class HeldRun:
+    """EM that has begun, and waits until it may go on."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.begun, self.go_on = threading.Event(), threading.Event()
+        run = Mapper.run
+
+        def waits(*arguments: Any) -> Any:
+            self.begun.set()
+            assert self.go_on.wait(60.0)
+            return run(*arguments)
+
+        monkeypatch.setattr(Mapper, 'run', waits)
 
 
 def odometry_of(robot: Inside) -> Odometry:

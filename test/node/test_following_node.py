@@ -14,9 +14,8 @@ pytest.importorskip('rclpy', reason='the tests of the node need rclpy')
 
 from drift_samples import bent_drive, exact_drive, in_turn
 from inside import Inside
-from refined_robot import odometry_of
+from refined_robot import HeldRun, odometry_of
 
-from forward_grid_mapper.core.mapping import Mapper
 from forward_grid_mapper.core.trajectory.following import Follower
 from forward_grid_mapper.core.trajectory.refinement import Refinement, replaced
 from forward_grid_mapper.core.trajectory.windows import Odometry
@@ -130,21 +129,13 @@ def test_what_is_driven_while_a_run_goes_on_is_followed_when_it_ends(
 ) -> None:
     robot = driving()
     before = robot.node.trajectory.following.follower
-    begun, go_on = threading.Event(), threading.Event()
-    run = Mapper.run
-
-    def waits(*arguments: Any) -> Any:
-        begun.set()
-        assert go_on.wait(60.0)
-        return run(*arguments)
-
-    monkeypatch.setattr(Mapper, 'run', waits)
+    held = HeldRun(monkeypatch)
     answer = robot.begin(robot.node.em.run_em)
-    robot.until(begun.is_set)
+    robot.until(held.begun.is_set)
     robot.hand(told.parts[1])
     follow(robot, 10)
     assert robot.node.trajectory.following.follower is before, 'the one before goes on meanwhile'
-    go_on.set()
+    held.go_on.set()
     robot.until(lambda: answer.sent)
     assert answer.sent[0][0]
     after = robot.node.trajectory.following.follower

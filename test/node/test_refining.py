@@ -14,10 +14,9 @@ pytest.importorskip('rclpy', reason='the tests of the node need rclpy')
 
 from drift_samples import QuickRefiner
 from inside import Inside
-from refined_robot import assert_live, live_of, odometry_of, refined
+from refined_robot import HeldRun, assert_live, live_of, odometry_of, refined
 
 from forward_grid_mapper.core.common.errors import Cancelled
-from forward_grid_mapper.core.mapping import Mapper
 from forward_grid_mapper.core.trajectory.windows import Odometry
 from forward_grid_mapper.node import refining
 
@@ -42,20 +41,12 @@ def test_readings_that_come_while_it_runs_are_not_lost(
 ) -> None:
     robot = inside(refine_poses=True).start()
     robot.drive(0, 100)
-    bent, begun, go_on = odometry_of(robot), threading.Event(), threading.Event()
-    run = Mapper.run
-
-    def waits(*arguments: Any) -> Any:
-        begun.set()
-        assert go_on.wait(60.0)
-        return run(*arguments)
-
-    monkeypatch.setattr(Mapper, 'run', waits)
+    bent, held = odometry_of(robot), HeldRun(monkeypatch)
     answer = robot.begin(robot.node.em.run_em)
-    robot.until(begun.is_set)
+    robot.until(held.begun.is_set)
     robot.drive(100, 80)
     assert_live(robot, None)
-    go_on.set()
+    held.go_on.set()
     robot.until(lambda: answer.sent)
     assert answer.sent[0][0]
     assert_live(robot, bent)
