@@ -242,9 +242,12 @@ def test_a_fault_ends_it_until_the_next_run(
     status = robot.status('trajectory')
     assert status['level'] == WARN
     assert 'ended: there is not enough memory' in status['followed since the latest run']
+    # where it fails in a run, the one before may have failed during it too
+    said = list(warned)
+    assert len(said) == 1 or (when == 'in a run' and said == [said[0]] * 2)
     robot.hand(told.parts[2][:100])
     robot.spin(0.2)
-    assert len(warned) == 1
+    assert warned == said
     assert robot.call(node.em.run_em)[0]
     assert not node.trajectory.following.obstacle
     assert robot.status('trajectory')['level'] == OK
