@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import queue
+import sys
 import threading
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -10,7 +12,7 @@ from typing import Any
 import pytest
 
 from forward_grid_mapper.core.common.errors import InputError, MapperError
-from forward_grid_mapper.node.background import AT_ONCE, Inbox, Worker
+from forward_grid_mapper.node.background import AT_ONCE, NICE, Inbox, Worker
 
 logged: list[str] = []
 
@@ -119,6 +121,17 @@ def test_closing_waits_for_what_was_begun_and_leaves_the_rest(worker: Worker) ->
     assert done == ['first']
     worker.put(lambda: done.append('third'))
     assert done == ['first']
+
+
+@pytest.mark.skipif(sys.platform != 'linux', reason='elsewhere a thread has no priority of its own')
+@pytest.mark.parametrize('nice', [NICE, 0])
+def test_a_worker_gives_way_unless_it_is_told_not_to(nice: int) -> None:
+    worker = Worker('digger', logged.append, nice=nice)
+    own = os.getpriority(os.PRIO_PROCESS, 0)
+    found = worker.ask(lambda: os.getpriority(os.PRIO_PROCESS, threading.get_native_id()))
+    assert found == (nice or own)
+    assert os.getpriority(os.PRIO_PROCESS, 0) == own, 'nobody else does'
+    worker.close(10.0)
 
 
 class Guard:

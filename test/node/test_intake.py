@@ -188,6 +188,15 @@ def test_forgetting_begins_the_account_anew() -> None:
     assert robot.intake.loss_note() == []
 
 
+def test_as_many_lost_of_one_kind_as_of_the_other() -> None:
+    robot = Taking()
+    for number in (1, 3):
+        robot.range(100.0 + number, number=number)
+        robot.odometry(100.0 + number, number=number)
+    assert (robot.intake.lost, robot.intake.odometry_lost) == (1, 1)
+    assert '1 Range and 1 odometry' in robot.intake.loss_note()[0]
+
+
 def test_topics_are_subscribed_to_once_each_and_left() -> None:
     robot = Taking(range_topics=('a', 'b', 'a'), odom_topic='wheels', odom_reliability='reliable')
     intake, node = robot.intake, robot.node

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import threading
 from collections.abc import Callable, Iterator
 from types import SimpleNamespace
@@ -112,8 +113,9 @@ def test_before_the_first_map_there_is_an_empty_one(maps: MapPublishers) -> None
     for name in MAPS:
         (message,) = answers(maps, name)
         assert (message.info.width, message.info.height, len(message.data)) == (0, 0, 0)
+        assert (message.info.origin.position.x, message.info.origin.position.y) == (0.0, 0.0)
     grid, cells = maps.ml_map
-    assert grid.shape == cells.shape == (1, 1) and cells[0, 0] == -1
+    assert grid == Grid(0.1, 0, 0, 1, 1) and cells.shape == (1, 1) and cells[0, 0] == -1
 
 
 def test_a_map_goes_out_and_is_kept(node: Publishing, maps: MapPublishers) -> None:
@@ -123,7 +125,8 @@ def test_a_map_goes_out_and_is_kept(node: Publishing, maps: MapPublishers) -> No
     # tf2 refuses a leading slash
     assert message.header.frame_id == 'odom' and message.header.stamp.sec == 7
     assert maps.ml_map == (GRID, CELLS)
-    maps.publish('uncertainty_map', 0, GRID, np.zeros(GRID.shape, np.float32))
+    for name in ('uncertainty_map', 'live_map'):
+        maps.publish(name, 0, Grid(0.1, 0, 0, 3, 1), np.zeros((1, 3), np.float32))
     assert answers(maps, 'uncertainty_map')[0].info.width == 3
     assert maps.ml_map == (GRID, CELLS), 'only the ML map is'
 
@@ -188,6 +191,12 @@ def test_a_map_that_cannot_be_sent_keeps_no_other_and_no_answer(
     assert node.warned == ['maps: there is not enough memory']
     maps.publish('ml_map', 0, GRID, CELLS)
     assert answers(maps, 'ml_map')[0].info.width == 3
+
+
+def test_who_sends_does_not_give_way(maps: MapPublishers) -> None:
+    """It would take the executor along, since it holds the GIL."""
+    found = maps.worker.ask(lambda: os.getpriority(os.PRIO_PROCESS, threading.get_native_id()))
+    assert found == os.getpriority(os.PRIO_PROCESS, 0)
 
 
 def test_updates_are_of_the_live_map_alone(node: Publishing, monkeypatch: pytest.MonkeyPatch) -> None:
