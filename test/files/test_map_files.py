@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import math
 import errno
 import importlib.util
 import json
+import math
 from pathlib import Path
 from types import ModuleType
 from typing import Any

@@ -24,7 +24,7 @@ Message = RangeMessage | OdometryMessage
 
 def exact_drive() -> Recording:
     """25 m through a building."""
-    return drive(building_world(), building_tour()[:10], 0.15, sonar_ring(8), NOISY, seed=3)
+    return drive(building_world(), building_tour()[:10], 0.15, sonar_ring(16), NOISY, seed=3)
 
 
 def bent_drive() -> Recording:
