@@ -105,7 +105,8 @@ def test_poses_of_sensors(value: Any) -> None:
 
 
 @pytest.mark.parametrize(
-    'value', ['abc', [1.0, 2.0], [1.0, 2.0, math.nan], [1.0, math.inf, 0.0], ['a', 'b', 'c'], 3, []]
+    'value',
+    ['abc', [1.0, 2.0], [1.0, 2.0, 3.0, 4.0], [1.0, 2.0, math.nan], [1.0, math.inf, 0.0], ['a', 'b', 'c'], 3, []],
 )
 def test_poses_that_are_none(value: Any) -> None:
     node = Declaring()
