@@ -144,7 +144,7 @@ def launch_arguments() -> frozenset[str]:
 
 def is_value(name: str) -> bool:
     """Whether `name` is a number, or a parameter's default or one of its choices."""
-    texts = {text for row in PARAMETERS.values() for text in row.choices}
+    texts = {text for row in table.TABLE for text in row.choices}
     for row in PARAMETERS.values():
         default = row.default
         texts |= set(default) | {f'[{", ".join(default)}]'} if isinstance(default, tuple) else {str(default)}
@@ -237,11 +237,11 @@ def is_option(name: str) -> bool:
 
 
 def is_setting(name: str) -> bool:
-    """Whether `name` is a parameter, with or without a value."""
+    """Whether `name` is a parameter or a constant, with or without a value."""
     first = re.split(r'[ =:<>≤≥]', name)[0]
     if ':=' in name and first in launch_arguments():
         return True
-    return first in SETTABLE or re.fullmatch(r'sensors\.\S+\.pose(: .*)?', name) is not None
+    return first in PARAMETERS or re.fullmatch(r'sensors\.\S+\.pose(: .*)?', name) is not None
 
 
 def is_spoken(name: str) -> bool:

@@ -57,7 +57,7 @@ def _constants_markdown() -> list[str]:
     lines = [
         '## Constants of the model',
         '',
-        'These are no parameters. `plain` is the value with `plain_model`, that of the paper; lengths of gaps, walls '
+        'These are no parameters. *Plain* is the value with `plain_model`, that of the paper; lengths of gaps, walls '
         'and margins are in `core/common/constants.py`.',
         '',
         '| constant | default | plain | unit | meaning |',
