@@ -46,7 +46,7 @@ from quality_scores import (
 )
 from quality_worlds import Case, drawn_cases, on_grid, recorded_cases, scoring_tool, simulated_cases
 
-from forward_grid_mapper.core.common.parameters import Parameters
+from forward_grid_mapper.core.common.parameters import CONSTANTS, Parameters
 from forward_grid_mapper.core.evidence.evidence import Evidence
 from forward_grid_mapper.core.evidence.fixed_point import QUANTUM
 from forward_grid_mapper.core.mapping import Mapper
@@ -285,6 +285,13 @@ def print_cost(base: dict[str, Any], paper: dict[str, Any], runs: int) -> None:
         print(f'  {name:32s}{middle:7.2f} s   the default takes {ours / middle:.2f} times as long')
 
 
+def setting(text: str) -> tuple[str, Any]:
+    """Return the name and the value of `name=value`, of a parameter or of a constant of the model."""
+    name, _, value = (part.strip() for part in text.partition('='))
+    constants = {row.name: row for row in CONSTANTS}
+    return (name, type(constants[name].default)(value)) if name in constants else parse_setting(text)
+
+
 def main() -> None:
     """Run the benchmark."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -294,7 +301,7 @@ def main() -> None:
     parser.add_argument('--runs', type=int, default=5, help='runs of the timing')
     parser.add_argument('--pictures', type=Path, metavar='DIR', help='draw maps into this folder')
     options = parser.parse_args()
-    base = dict(parse_setting(text) for text in options.set)
+    base = dict(setting(text) for text in options.set)
     paper = dict(load_parameters(PAPER).values)
     print(f'{platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}, ', end='')
     print(f'numpy {np.__version__}, numba {numba.__version__}' + (f'; changed: {base}' if base else ''))

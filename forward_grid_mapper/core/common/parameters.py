@@ -351,11 +351,7 @@ class Parameters:
             if name not in DEPRECATED:
                 row = find(name)
                 given[row.name] = row.check(value)
-        base = base or cls()
-        if given.get('plain_model', base.model.plain_model) != base.model.plain_model:
-            plain = given['plain_model']
-            given = {row.name: row.plain if plain else row.default for row in CONSTANTS} | given
-        return base.varied(given)
+        return (base or cls()).varied(given)
 
     @classmethod
     def restored(cls, values: Mapping[str, Any]) -> Parameters:
@@ -377,12 +373,16 @@ class Parameters:
     def varied(self, values: Mapping[str, Any]) -> Parameters:
         """Return these with the named values changed, constants among them; nothing is checked but how they fit.
 
+        Another `plain_model` changes all constants that are not named.
+
         Raises
         ------
         ParameterError
             If values do not fit together, or no parameter and no constant has this name.
         """
-        changes: dict[str, dict[str, Any]] = {}
+        plain, changes = values.get('plain_model', self.model.plain_model), dict[str, dict[str, Any]]()
+        if plain != self.model.plain_model:
+            values = {row.name: row.plain if plain else row.default for row in CONSTANTS} | dict(values)
         for name, value in values.items():
             group = _CONSTANTS[name].group if name in _CONSTANTS else find(name).group
             changes.setdefault(group, {})[name] = value
