@@ -85,10 +85,10 @@ without readings having noticed it. With less, doors that one sweep looked throu
 lies behind holes in walls is free. With `FREE_MARGIN` it is less than the margin of tiles, half of `LONGEST_GAP`."""
 
 LEAST_EVIDENCE = 0.1
-"""Nats for an obstacle from which on a cell counts as observed though the maximum likelihood map does not know it."""
+"""Nats, either way, from which on a cell counts as observed though the maximum likelihood map does not know it."""
 
 LEAST_LOOK = 0.1
-"""Readings that passed a cell, and that any surface there would have noticed, from which on it does so as well."""
+"""Readings that it takes as well, of those that any surface there would have noticed, where they speak against one."""
 
 # The standard map
 

@@ -18,9 +18,9 @@ other is likelier a wall than a cell in the open, though readings passed both.
 
 The weights are those of a logistic regression on simulated worlds.
 
-Of a cell that the map does not know, of which echoes say little, and that hardly any reading passed that a surface of
-any direction would have noticed (`free_space`), nothing is said at all: the prior alone is no observation, and it would
-pass for rather free.
+Of a cell that the map does not know nothing is said at all where the readings say less than a tenth of a nat: the prior
+alone is no observation, and it would pass for rather free. Nor is it where they speak against an obstacle, but hardly
+any of them would have noticed a surface whatever way it faces (`free_space`).
 """
 
 from __future__ import annotations
@@ -146,11 +146,12 @@ def uncertainty_map(
     parameters : SearchParameters
     """
     told = evidence.reshape(ml.shape)
+    silent = np.abs(told) < LEAST_EVIDENCE
     if passes is None:
-        probability, silent = marginals(told, parameters), np.abs(told) < LEAST_EVIDENCE
+        probability = marginals(told, parameters)
     else:
         probability = calibrated(told, passes.all.reshape(ml.shape), ml, parameters)
-        silent = (told < LEAST_EVIDENCE) & (passes.noticing.reshape(ml.shape) < LEAST_LOOK)
+        silent |= (told < 0) & (passes.noticing.reshape(ml.shape) < LEAST_LOOK)
         probability[traversed] = 0.0
     probability[(ml < 0) & silent] = np.nan
     return probability.astype(np.float32)

@@ -77,14 +77,14 @@ def test_what_speaks_for_an_obstacle_makes_it_likelier(seed: int, more: float) -
 
 def test_nothing_is_said_where_no_reading_would_have_noticed_anything() -> None:
     ml = np.array([[1, 0, -1, -1, -1], [1, 0, -1, -1, -1]], np.int8)
-    evidence = np.array([0.0, 0.0, -5.0, 0.9, 2.0, 0.0, 0.0, -5.0, 0.9, -2.0]) * LEAST_EVIDENCE
-    noticing = np.array([0.0, 0.0, 0.9, 0.9, 0.0, 0.0, 0.0, 1.1, 1.1, 0.0]) * LEAST_LOOK
+    evidence = np.array([0.0, 0.0, -5.0, 0.9, 2.0, 0.0, 0.0, -5.0, -0.9, -2.0]) * LEAST_EVIDENCE
+    noticing = np.array([0.0, 0.0, 0.9, 5.0, 0.0, 0.0, 0.0, 1.1, 5.0, 0.0]) * LEAST_LOOK
     passes = Passes(np.full(10, 3.0), noticing)
     traversed = np.zeros(ml.shape, bool)
     traversed[0, 1] = True
     told = uncertainty_map(evidence, passes, ml, traversed, SearchParameters())
     assert told.dtype == np.float32
-    assert np.isnan(told).tolist() == [[False, False, True, True, False], [False, False, False, False, True]]
+    assert np.isnan(told).tolist() == [[False, False, True, True, False], [False, False, False, True, True]]
     assert told[0, 1] == 0.0
     known = ~np.isnan(told) & ~traversed
     expected = calibrated(evidence.reshape(ml.shape), np.full(ml.shape, 3.0), ml, SearchParameters())
