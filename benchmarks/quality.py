@@ -75,8 +75,7 @@ ABLATIONS: dict[str, dict[str, Any]] = {
     'unknown': {'least_passed': 0.0},
     'walls that look any way (unknown)': {'least_noticed': 0.0},
     'lost echoes': {'p_lost': 0.0},
-    'neighbours (uncertainty)': {'neighbour_weight': 0.0, 'alpha': 0.8, 'uncertainty_prior': 0.3},
-    'all of these but lost echoes': {**PLAIN, 'neighbour_weight': 0.0, 'alpha': 0.8, 'uncertainty_prior': 0.3},
+    'all of these but lost echoes': {**PLAIN, 'alpha': 0.8},
 }
 """What the default is without each of its parts."""
 

@@ -389,7 +389,7 @@ def test_the_mixed_marginal_is_that_of_eq_42_to_45_with_the_prior_counted_once()
     result = search(readings, prior=0.3).run()
     occupied = result.occupied.reshape(LINE.shape)
     alpha, prior = 0.6, 0.2
-    q = marginals(result.evidence, np.zeros(LINE.size), plain_search(alpha=alpha, uncertainty_prior=prior))
+    q = marginals(result.evidence, plain_search(alpha=alpha, prior=prior))
     for c in range(LINE.size):
         both = [occupied.copy(), occupied.copy()]
         both[0][0, c], both[1][0, c] = 0, 1
@@ -403,7 +403,7 @@ def test_without_evidence_the_marginal_is_the_prior_at_any_alpha() -> None:
     prior = 0.2
     h = math.log(prior / (1 - prior))
     for alpha in (0.0, 0.3, 1.0):
-        q = float(marginals(np.zeros(1), np.zeros(1), plain_search(alpha=alpha, uncertainty_prior=prior))[0])
+        q = float(marginals(np.zeros(1), plain_search(alpha=alpha, prior=prior))[0])
         assert q == pytest.approx(prior)
         # Table 2's last line mixes in the prior as if the likelihood ratio contained it already
         printed = 1 / (1 + math.exp(-(1 - alpha) * h))
@@ -430,7 +430,7 @@ def test_eq_26_alone_says_nothing_of_the_free_space_before_an_obstacle() -> None
     assert alone == pytest.approx(0.0)
     summed = search(readings, start=occupied).run().evidence[2]
     assert summed == pytest.approx(5 * math.log(1 - PAPER.p_hit), abs=0.2)
-    q = marginals(np.array([alone, summed]), np.zeros(2), plain_search(alpha=1.0, uncertainty_prior=0.5))
+    q = marginals(np.array([alone, summed]), plain_search(alpha=1.0, prior=0.5))
     assert q[0] == pytest.approx(0.5)
     assert q[1] < 0.02
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 _CONSTANT = 'a constant of the model, which has the value of the paper with plain_model'
 
+_CALIBRATED = 'no longer a parameter: the uncertainty map is calibrated, or that of the paper with end_cost 0'
+
 DEPRECATED = {
     'bridges': 'no longer a parameter: gaps of up to 1 m are closed where end_cost is above 0',
     'cell_distance': 'no longer a parameter: distances are to the centers of cells; see surface_offset',
@@ -19,10 +21,10 @@ DEPRECATED = {
     'live_directions': _CONSTANT,
     'live_echo_width': _CONSTANT,
     'live_p_free_no_echo': _CONSTANT,
-    'neighbour_weight': _CONSTANT,
+    'neighbour_weight': _CALIBRATED,
     'shift_moves': 'no longer a parameter: occupied cells are always tried to be moved to a neighbor',
     'surface_offset': _CONSTANT,
-    'uncertainty_prior': _CONSTANT,
+    'uncertainty_prior': _CALIBRATED,
 }
 """Parameters of the version before: what became of each. They are accepted with a warning and have no effect."""
 

@@ -158,8 +158,9 @@ class SearchParameters:
 
     prior: float = param(
         0.4,
-        'Prior probability of an occupied cell in the first part of the search, which takes cells as independent; 0.5 '
-        "is the paper's plain ML, less removes dots and thins walls.",
+        'Prior probability of an occupied cell in the first part of the search, which takes cells as independent, and '
+        "of the uncertainty map if that is the only one; 0.5 is the paper's plain ML, less removes dots and thins "
+        'walls.',
         'probability',
         1e-6,
         0.5,
@@ -197,27 +198,7 @@ class SearchParameters:
         0,
         1_000_000,
     )
-    alpha: float = param(
-        1.0,
-        'Weight of the evidence in the uncertainty map, (45) of the paper. With neighbour_weight and uncertainty_prior '
-        'it makes a logistic calibration, fitted to simulated worlds.',
-        '',
-        0.0,
-        1.0,
-    )
-    neighbour_weight: float = constant(
-        0.6,
-        0.0,
-        'Weight of what the neighbours of a cell say in the uncertainty map, by the prior of walls: the second '
-        'coefficient of the calibration.',
-    )
-    uncertainty_prior: float = constant(
-        0.38,
-        0.5,
-        'Occupancy that the uncertainty map states without evidence and without neighbours: the offset of the '
-        'calibration.',
-        'probability',
-    )
+    alpha: float = param(1.0, 'Weight of the evidence in the uncertainty map, (45) of the paper.', '', 0.0, 1.0)
 
 
 @dataclass(frozen=True)
