@@ -34,12 +34,14 @@ def occupancy_values(values: NDArray[Any]) -> NDArray[np.int8]:
     -------
     int8, of the same shape
     """
+    made: NDArray[np.int8]
     if np.issubdtype(values.dtype, np.integer):
         # sums of bytes: choosing numbers of eight bytes takes ten times as long, and holds up the executor of the node
-        made: NDArray[np.int8] = (values > 0).view(np.int8) * np.int8(100) - (values < 0).view(np.int8)
-        return made
-    # the larger one of a number and NaN is the number
-    return np.fmax(np.clip(np.rint(values * 100.0), 0, 100), -1).astype(np.int8)
+        made = (values > 0).view(np.int8) * np.int8(100) - (values < 0).view(np.int8)
+    else:
+        # the larger one of a number and NaN is the number
+        made = np.fmax(np.clip(np.rint(values * 100.0), 0, 100), -1).astype(np.int8)
+    return made
 
 
 def write_trinary(path_stem: Path | str, grid: Grid, cells: NDArray[np.int8]) -> Path:

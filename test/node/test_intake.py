@@ -9,58 +9,12 @@ import pytest
 
 pytest.importorskip('rclpy', reason='the intake takes messages of ROS')
 
-from nav_msgs.msg import Odometry
 from rclpy.qos import ReliabilityPolicy
-from sensor_msgs.msg import Range
-from stand_ins import PlainNode
+from stand_ins import Taking
 
-from forward_grid_mapper.core.common.parameters import Parameters
-from forward_grid_mapper.core.messages.message_types import Pose2
-from forward_grid_mapper.core.messages.pose_association import PoseAssociator
 from forward_grid_mapper.node import intake as module
-from forward_grid_mapper.node.frames import MapFrame, Transforms
-from forward_grid_mapper.node.intake import AT_ONCE, QUEUE, Intake
+from forward_grid_mapper.node.intake import AT_ONCE, QUEUE
 from forward_grid_mapper.node.losses import LASTING
-
-SONAR = Pose2(0.1, 0.0, 0.0)
-
-
-class Taking:
-    """An intake with its associator, and a robot that publishes to it."""
-
-    def __init__(self, at_once: int = AT_ONCE, **parameters: Any) -> None:
-        self.node = PlainNode()
-        own = Parameters.from_flat(parameters)
-        self.associator = PoseAssociator(lambda base, frame, stamp: SONAR, own, at_once=at_once)
-        self.published: list[int] = []
-        map_frame = MapFrame('', Transforms(), 1.0)
-        self.intake = Intake(self.node, own, self.associator, map_frame, self.published.append)
-        self.sent = 0
-
-    def odometry(self, seconds: float, x: float = 0.0, number: int | None = None) -> None:
-        made = Odometry(child_frame_id='base_link')
-        made.header.frame_id = 'odom'
-        made.pose.pose.position.x, made.pose.pose.orientation.w = x, 1.0
-        made.header.stamp.sec, made.header.stamp.nanosec = divmod(round(seconds * 1e9), 10**9)
-        info: dict[str, Any] = {'source_timestamp': round(seconds * 1e9)}
-        if number is not None:
-            info['publication_sequence_number'] = number
-        self.intake.on_odometry(made, info)
-
-    def range(self, seconds: float, frame: str = 'sonar', number: int | None = None, topic: int = 0) -> None:
-        made = Range(min_range=0.1, max_range=5.0, field_of_view=0.3, range=2.0)
-        made.header.frame_id = frame
-        made.header.stamp.sec, made.header.stamp.nanosec = divmod(round(seconds * 1e9), 10**9)
-        self.sent += 1
-        info = {'source_timestamp': round(seconds * 1e9), 'publication_sequence_number': number or self.sent}
-        self.intake.on_range(self.intake.range_losses[topic], made, info)
-
-    def account(self) -> tuple[int, int, int, int]:
-        """Received, accepted, waiting and rejected readings; the first is the sum of the others."""
-        rejected = sum(self.associator.rejected.values())
-        found = self.intake.received, len(self.associator.buffer), self.intake.waiting, rejected
-        assert found[0] == found[1] + found[2] + found[3]
-        return found
 
 
 def test_what_comes_before_it_begins_is_held_back_and_then_taken_in_order() -> None:
