@@ -42,6 +42,7 @@ MODULES = {
     'bags/choice': ('bags/test_topic_choice',),
     'bags/static_transforms': ('bags/test_static_transforms',),
     'node/background': ('node/test_background',),
+    'node/deferred': ('node/test_deferred',),
     'node/em': ('node/test_em_worker',),
     'node/frames': ('node/test_frames',),
     'node/grid_message': ('node/test_map_publishers',),

@@ -211,7 +211,7 @@ def test_what_is_left_for_a_node_that_was_destroyed_is_dropped() -> None:
     def fail() -> None:
         raise RuntimeError('the guard condition was destroyed')
 
-    executor.guard.trigger = fail  # type: ignore[method-assign]
+    executor.guard.trigger = fail
     done: list[int] = []
     inbox.put(lambda: done.append(1))
     inbox.work()
