@@ -349,11 +349,12 @@ def test_a_frame_that_is_missing_is_asked_for_now_and_then(
     now = 100.0
     monkeypatch.setattr(frames.time, 'monotonic', lambda: now)
     for _ in range(5):
-        assert transforms.lookup('base', 'sonar', 5) is LATER
-    assert buffer.asked == 1
+        for name in ('sonar', 'another'):
+            assert transforms.lookup('base', name, 5) is LATER
+    assert buffer.asked == 2
     now += frames.PATIENCE
     assert transforms.lookup('base', 'sonar', 5) is LATER
-    assert buffer.asked == 2
+    assert buffer.asked == 3
     buffer.known['base', 'sonar'] = transform(0.1, 0.0)
     now += frames.PATIENCE
     for _ in range(3):
