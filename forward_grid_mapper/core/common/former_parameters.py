@@ -11,7 +11,9 @@ DEPRECATED = {
     'isolated_cost': 'no longer a parameter: a single cell costs two ends of a wall, twice end_cost',
     'line_bonus': 'replaced by wall_cost: what a metre of wall costs, not what a cell of it gains',
     'live_depth': 'no longer a parameter: an echo marks an arc of 0.05 m, or half a cell, before and behind its range',
+    'neighbour_weight': 'no longer a parameter: neighbours count in the uncertainty map where end_cost is above 0',
     'shift_moves': 'no longer a parameter: occupied cells are always tried to be moved to a neighbor',
+    'uncertainty_prior': 'no longer a parameter: it is prior where end_cost is 0, and of no use otherwise',
 }
 """Parameters of the version before: what became of each. They are accepted with a warning and have no effect."""
 
