@@ -30,7 +30,7 @@ AREA = Grid(0.1, -13, 4, 30, 20)
 
 
 def run(readings: Readings, **values: object) -> MapSet:
-    return Mapper(Parameters.from_flat(values)).run(readings)
+    return Mapper(Parameters().varied(values)).run(readings)
 
 
 def some(seed: int = 0, count: int = 400) -> Readings:
@@ -228,7 +228,7 @@ def test_beside_a_larger_live_map_the_likelihood_stays_the_same() -> None:
 
 
 def test_the_map_so_far_is_known_while_the_search_runs() -> None:
-    mapper, seen = Mapper(Parameters.from_flat(PLAIN)), []
+    mapper, seen = Mapper(Parameters().varied(PLAIN)), []
     assert mapper.so_far() is None
     maps = mapper.run(some(), lambda stage, progress: seen.append(mapper.so_far()) if progress else None)
     assert len(seen) == maps.statistics['iterations']

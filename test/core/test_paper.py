@@ -113,7 +113,7 @@ def terms(readings: Readings, t: int, grid: Grid, occupied: np.ndarray, model: M
 
 def test_one_reading_gives_back_its_inverse_model_and_not_eq_4_as_printed() -> None:
     values = {'resolution': 0.1, 'live_p_occupied': 0.8, 'live_p_free': 0.25}
-    live = LogOddsMap(Parameters.from_flat({**values}))
+    live = LogOddsMap(Parameters().varied({**values}))
     live.add(along(0.55))
     p, log_odds = live.probability(LINE)[0], live.log_odds(LINE)[0]
     assert p[2] == pytest.approx(0.25, abs=1e-5)
@@ -124,7 +124,7 @@ def test_one_reading_gives_back_its_inverse_model_and_not_eq_4_as_printed() -> N
 
 def test_readings_that_say_nothing_leave_the_standard_map_at_its_prior() -> None:
     silent = {'live_p_occupied': 0.5, 'live_p_free': 0.5, 'live_p_free_no_echo': 0.5}
-    live = LogOddsMap(Parameters.from_flat({'resolution': 0.1, **silent}))
+    live = LogOddsMap(Parameters().varied({'resolution': 0.1, **silent}))
     live.add(random_readings(np.random.default_rng(0), AREA, 50))
     p = live.probability()
     assert np.isfinite(p).sum() > 50
@@ -140,7 +140,7 @@ def closed_form(each: np.ndarray, prior: float) -> np.ndarray:
 
 
 def test_the_standard_map_is_the_closed_form_of_eq_16_with_logarithms() -> None:
-    parameters = Parameters.from_flat({'resolution': 0.1, **ONE_SUM})
+    parameters = Parameters().varied({'resolution': 0.1, **ONE_SUM})
     readings = random_readings(np.random.default_rng(1), AREA, 40)
     live = LogOddsMap(parameters)
     live.add(readings)
@@ -441,7 +441,7 @@ def test_eq_26_alone_says_nothing_of_the_free_space_before_an_obstacle() -> None
 def test_readings_without_echo_hold_the_free_space() -> None:
     # two ranges by chance in the open, where ten others heard nothing
     readings = along(0.55, 0.55, *[1.1] * 10)
-    parameters = replace(Parameters.from_flat({**PLAIN, 'resolution': 0.1, 'prior': 0.3}), model=PAPER)
+    parameters = replace(Parameters().varied({**PLAIN, 'resolution': 0.1, 'prior': 0.3}), model=PAPER)
     whole, echoes = (Mapper(parameters).run(part) for part in (readings, readings.select(readings.echo)))
     assert (whole.ml[-whole.grid.row, :11] == 0).all()
     assert echoes.ml[-echoes.grid.row, 5] == 1, 'a dot'
