@@ -17,6 +17,7 @@ from ..core.messages.message_batch import MessageBatch
 from ..core.messages.message_types import NANOSECONDS, Pose2
 from ..core.messages.pose_association import PoseAssociator
 from ..core.messages.robot_path import RobotPath
+from ..core.trajectory.jumps import FASTEST, LONGEST_STEP
 from ..files.quality_warning import thinned
 
 
@@ -162,9 +163,13 @@ def path_of(associator: PoseAssociator) -> NDArray[np.float64]:
     return np.array(points, np.float64).reshape(-1, 2)
 
 
-def length_of(path: NDArray[np.float64]) -> float:
-    """Return the metres of a path, shape (P, 2)."""
-    return float(np.hypot(*np.diff(path, axis=0).T).sum())
+def length_of(associator: PoseAssociator) -> float:
+    """Return the metres that the robot drove; where odometry jumps faster than a robot drives it did not."""
+    whole = np.hypot(*np.diff(path_of(associator), axis=0).T).sum()
+    stamp, pose = associator.record.snapshot()
+    steps = np.hypot(*np.diff(pose[:, :2], axis=0).T)
+    jumped = steps > LONGEST_STEP + FASTEST * np.diff(stamp) / NANOSECONDS
+    return max(float(whole - steps[jumped].sum()), 0.0)
 
 
 def thinning_note(associator: PoseAssociator) -> list[str]:
