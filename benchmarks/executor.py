@@ -2,6 +2,7 @@
 """How long the node's executor is ever busy, or kept waiting, with one thing.
 
 usage: executor.py [--readings 500000] [--rate 500] [--seconds 30] [--cold] [--max-readings 500000]
+       executor.py --messages
 
 Starts a node in a process of its own, with the online map on and a journal of so many readings of the simulated
 corridor to restart from, publishes Range and odometry to it all the while, and calls every service: EM runs, maps are
@@ -9,7 +10,7 @@ fetched and saved, parameters change, and at last everything is forgotten. A tim
 measures how late it is called: `late` is the longest delay, of which the executor's own thread computed for `own` ms.
 `most own` is the longest that it computed between two calls. The rest of a delay is other threads that held the GIL,
 and the machine: `machine` is how late a process that does nothing else was woken at the worst. With --cold, the kernels
-are compiled first. Needs rclpy.
+are compiled first. With --messages, only what a map of a million cells costs as a message is measured. Needs rclpy.
 """
 
 from __future__ import annotations
@@ -281,6 +282,45 @@ def measure(options: argparse.Namespace, folder: Path) -> None:
     print(''.join(line for line in account.lines if 'WARN' in line or 'ERROR' in line), end='')
 
 
+def measure_messages(side: int = 1000, times: int = 20) -> None:
+    """Print what the thread that sends maps computes for one of a million cells; it holds the GIL for most of it."""
+    import rclpy
+    from builtin_interfaces.msg import Time
+    from nav_msgs.msg import OccupancyGrid
+
+    from forward_grid_mapper.core.common.grid import Grid
+    from forward_grid_mapper.node.grid_message import grid_message
+    from forward_grid_mapper.node.map_publishers import LATCHED
+
+    rng, grid = np.random.default_rng(0), Grid(0.1, 0, 0, side, side)
+    cells = rng.integers(-1, 2, grid.shape).astype(np.int8)
+    chances = np.where(cells < 0, np.nan, rng.random(grid.shape)).astype(np.float32)
+    rclpy.init()
+    node = rclpy.create_node('messages')
+    out = node.create_publisher(OccupancyGrid, 'map', LATCHED)
+    listener = node.create_subscription(OccupancyGrid, 'map', lambda message: None, LATCHED)
+    while not out.get_subscription_count():
+        time.sleep(0.01)
+    message = grid_message(grid, cells, 'map', Time())
+
+    def cost(work: Callable[[], object]) -> float:
+        taken = []
+        for _ in range(times):
+            begin = time.thread_time()
+            work()
+            taken.append(time.thread_time() - begin)
+        return 1e3 * float(np.median(taken))
+
+    for name, work in (
+        ('a maximum likelihood map becomes a message', lambda: grid_message(grid, cells, 'map', Time())),
+        ('a live map or an uncertainty map does', lambda: grid_message(grid, chances, 'map', Time())),
+        ('it is published, one subscription', lambda: out.publish(message)),
+    ):
+        print(f'{name:46s}{cost(work):8.2f} ms of a thread, {side}x{side} cells')
+    node.destroy_subscription(listener)
+    rclpy.shutdown()
+
+
 def main() -> None:
     """Run the benchmark."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -289,7 +329,11 @@ def main() -> None:
     parser.add_argument('--rate', type=float, default=500.0, help='Range messages a second')
     parser.add_argument('--seconds', type=float, default=30.0, help='of the phases in which nothing is called')
     parser.add_argument('--cold', action='store_true', help='without a cache of kernels')
+    parser.add_argument('--messages', action='store_true', help='only what a map costs as a message')
     options = parser.parse_args()
+    if options.messages:
+        measure_messages()
+        return
     with tempfile.TemporaryDirectory() as folder:
         measure(options, Path(folder))
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -274,13 +275,16 @@ def measure(
     return np.asarray(z)
 
 
-def seen_by_laser(segments: Floats, poses: Floats) -> tuple[Floats, tuple[float, float]]:
-    """Return the truth (1 occupied, 0 free, NaN unknown) that a laser makes on the way, and its lower left corner."""
+def seen_by_laser(segments: Floats, poses: Floats, mostly: bool) -> tuple[Floats, tuple[float, float]]:
+    """Return the truth (1 occupied, 0 free, NaN unknown) that a laser makes on the way, and its lower left corner.
+
+    A cell is occupied where a ray ended, or, with `mostly`, where three did and most of those that came there.
+    """
     angles = np.linspace(-math.pi, math.pi, 720, endpoint=False)
     low = np.floor((np.minimum(segments[:, :2], segments[:, 2:]).min(0) - 0.5) / CELL) * CELL
     high = np.maximum(segments[:, :2], segments[:, 2:]).max(0) + 0.5
     shape = tuple(np.ceil((high - low) / CELL).astype(int)[::-1])
-    free, hits = np.zeros(shape, bool), np.zeros(shape, np.int64)
+    free, hits, passed = np.zeros(shape, bool), np.zeros(shape, np.int64), np.zeros(shape, np.int64)
     for pose in poses[::3]:
         distance, hit = cast(pose[None, :2], angles[None, :], segments, LASER)
         met = hit[0] != NOTHING
@@ -295,14 +299,44 @@ def seen_by_laser(segments: Floats, poses: Floats) -> tuple[Floats, tuple[float,
             ok = (rows >= 0) & (rows < shape[0]) & (columns >= 0) & (columns < shape[1])
             free[rows[ok], columns[ok]] = True
         x, y = pose[0] + np.cos(angles[met]) * far[met], pose[1] + np.sin(angles[met]) * far[met]
-        np.add.at(hits, (((y - low[1]) / CELL).astype(int), ((x - low[0]) / CELL).astype(int)), 1)
-    truth = np.where(free, 0.0, np.nan)
-    truth[hits > 0] = 1.0
+        end = ((y - low[1]) / CELL).astype(int), ((x - low[0]) / CELL).astype(int)
+        np.add.at(hits, end, 1)
+        if mostly:
+            _count_passes(pose, angles, far, np.where(met, far, np.inf), low, passed)
+    truth = np.where(free | (hits > 0), 0.0, np.nan)
+    truth[(hits > np.maximum(passed, 2)) if mostly else hits > 0] = 1.0
     return truth, (float(low[0]), float(low[1]))
 
 
-def building_case(seed: int, sensors: int | None = None) -> Case:
-    """Return the drive of a seed; `sensors` chooses from `SENSORS`, by default by the seed."""
+def _count_passes(pose: Floats, angles: Floats, far: Floats, end: Floats, low: Floats, passed: Any) -> None:
+    """Add to each cell the rays of a scan that passed it: that were in it, and did not end in it."""
+    along = np.arange(0.0, LASER, CELL / 2)
+
+    def cell_at(length: Floats) -> NDArray[np.int64]:
+        x, y = pose[0] + np.cos(angles)[:, None] * length, pose[1] + np.sin(angles)[:, None] * length
+        rows, columns = ((y - low[1]) / CELL).astype(np.int64), ((x - low[0]) / CELL).astype(np.int64)
+        inside = (rows >= 0) & (rows < passed.shape[0]) & (columns >= 0) & (columns < passed.shape[1])
+        return np.where(inside, rows * passed.shape[1] + columns, -1)
+
+    cells = cell_at(along[None, :])
+    last = cell_at(np.where(np.isfinite(end), end, 0.0)[:, None])
+    on = (along < far[:, None]) & (cells >= 0) & ((cells != last) | np.isinf(end)[:, None])
+    # once a ray
+    on[:, 1:] &= ~(on[:, :-1] & (cells[:, 1:] == cells[:, :-1]))
+    passed += np.bincount(cells[on], minlength=passed.size).reshape(passed.shape)
+
+
+def building_case(seed: int, sensors: int | None = None, mostly: bool = False) -> Case:
+    """Return the drive of a seed.
+
+    Parameters
+    ----------
+    seed : int
+    sensors : int, optional
+        Which of `SENSORS`; by default, the seed chooses.
+    mostly : bool
+        What the truth calls a wall, as in `seen_by_laser`.
+    """
     rng = np.random.default_rng([seed, 77])
     sonars, spacing = SENSORS[(seed if sensors is None else sensors) % len(SENSORS)]
     plan = Plan(rng)
@@ -326,6 +360,6 @@ def building_case(seed: int, sensors: int | None = None) -> Case:
         stamp=np.repeat(np.arange(len(poses)) * int(spacing * 2e9), count),
         sensor=np.tile(np.arange(count), len(poses)),
     )
-    truth, origin = seen_by_laser(segments, poses)
+    truth, origin = seen_by_laser(segments, poses, mostly)
     nobody = np.zeros((0, 0), np.int64)
     return Case(f'materials {seed}', readings, poses[:, :2], truth, origin, CELL, None, nobody)

@@ -1,12 +1,14 @@
 #!/usr/bin/env python3
 """Changes modules in small ways, one change at a time, and counts how many of the changes the tests notice.
 
-usage: mutation.py [--only NAME ...] [--survivors]
+usage: mutation.py [--only NAME ...] [--most 100] [--seed 0] [--survivors]
 
 The changes are made by cosmic-ray 8 (`pip install cosmic-ray`, in an environment of its own if that is on the path), in
 a copy of the checkout: operators, comparisons, numbers and constants are replaced, loops and exceptions left out, and
-so on. The tests of a module are run after each change, without compiling kernels. The score is the part of the changes
-with which a test fails; changes that mean the same as before count against it. `--survivors` prints the others.
+so on. The tests of a module are run after each change, without compiling kernels where none of the node's parts starts.
+The score is the part of the changes with which a test fails, or does not end; changes that mean the same as before
+count against it. `--survivors` prints the others. Of more than `--most` changes of a module, so many are
+tried, drawn with `--seed`.
 
 Left out are changes of `|`, nearly all of which are in annotations that are never evaluated, and those of an operator
 into one of bits, modulo or powers, which any test notices.
@@ -15,10 +17,13 @@ into one of bits, modulo or powers, which any test notices.
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import os
+import random
 import shlex
 import shutil
+import sqlite3
 import subprocess
 import sys
 import tempfile
@@ -36,9 +41,19 @@ MODULES = {
     'core/messages/robot_path': ('core/messages/test_robot_path',),
     'bags/choice': ('bags/test_topic_choice',),
     'bags/static_transforms': ('bags/test_static_transforms',),
+    'node/background': ('node/test_background',),
+    'node/deferred': ('node/test_deferred',),
+    'node/em': ('node/test_em_worker',),
+    'node/frames': ('node/test_frames',),
+    'node/grid_message': ('node/test_map_publishers',),
+    'node/heard': ('node/test_heard', '-k', 'not diagnostics'),
+    'node/intake': ('node/test_intake',),
     'node/losses': ('node/test_losses',),
+    'node/map_publishers': ('node/test_map_publishers',),
+    'node/map_updates': ('node/test_map_updates', '-k', 'not node_sends'),
+    'node/ros_parameters': ('node/test_ros_parameters',),
 }
-"""Modules, and the tests that must notice their changes; each takes seconds."""
+"""Modules, and the tests that must notice their changes, with what else pytest is told; each takes seconds."""
 
 LEFT_OUT = [
     'core/ReplaceBinaryOperator_BitOr_.*',
@@ -51,7 +66,7 @@ LEFT_OUT = [
 CONFIGURATION = """
 [cosmic-ray]
 module-path = "forward_grid_mapper/{module}.py"
-timeout = 60.0
+timeout = {timeout:.1f}
 excluded-modules = []
 test-command = "{command}"
 
@@ -71,8 +86,21 @@ def copy_of_checkout(folder: Path) -> None:
         shutil.copy(ROOT / name, folder / name)
 
 
-def changes_of(module: str, folder: Path) -> list[tuple[bool, str]]:
-    """Return for each change of a module whether a test noticed it, and what it was."""
+def draw(session: Path, most: int, seed: int) -> int:
+    """Leave so many of the changes that are to be made; return how many there were."""
+    with contextlib.closing(sqlite3.connect(session)) as database, database:
+        found = database.execute(
+            'select job_id from mutation_specs where job_id not in (select job_id from work_results) '
+            'order by operator_name, occurrence, operator_args'
+        ).fetchall()
+        left_out = random.Random(seed).sample(found, max(len(found) - most, 0))
+        for table in ('mutation_specs', 'work_items'):
+            database.executemany(f'delete from {table} where job_id = ?', left_out)
+    return len(found)
+
+
+def changes_of(module: str, folder: Path, most: int, seed: int) -> tuple[int, list[tuple[bool, str]]]:
+    """Return how many changes of a module there are, and of each that was made whether a test noticed it, and what."""
     configuration = folder / 'cosmic_ray.toml'
     session = folder / f'{module.replace("/", "_")}.sqlite'
     # sources change within a second and without changing in size, which compiled files would hide
@@ -80,7 +108,9 @@ def changes_of(module: str, folder: Path) -> list[tuple[bool, str]]:
         **os.environ,
         'PYTHONPATH': str(folder),
         'PYTHONDONTWRITEBYTECODE': '1',
-        'NUMBA_DISABLE_JIT': '1',
+        # a node compiles its kernels when it starts; no change is to one of them
+        'NUMBA_DISABLE_JIT': str(int(not module.startswith('node/'))),
+        'NUMBA_CACHE_DIR': str(folder / 'kernels'),
         'PYTEST_DISABLE_PLUGIN_AUTOLOAD': '1',
     }
 
@@ -93,45 +123,51 @@ def changes_of(module: str, folder: Path) -> list[tuple[bool, str]]:
         return done.stdout
 
     test = [sys.executable, '-m', 'pytest', '-x', '-q', '-p', 'no:cacheprovider']
-    test += [f'test/{name}.py' for name in MODULES[module]]
+    test += [f'test/{word}.py' if '/' in word else word for word in MODULES[module]]
     run(*test)
-    text = CONFIGURATION.format(module=module, command=shlex.join(test), left_out=json.dumps(LEFT_OUT))
+    begin = time.monotonic()
+    run(*test)
+    timeout = max(10.0, 4 * (time.monotonic() - begin))
+    text = CONFIGURATION.format(module=module, command=shlex.join(test), left_out=json.dumps(LEFT_OUT), timeout=timeout)
     configuration.write_text(text, encoding='utf-8')
     run('cosmic-ray', 'init', configuration, session)
     run('cr-filter-operators', session, configuration)
+    count = draw(session, most, seed)
     run('cosmic-ray', 'exec', configuration, session)
     found = []
     for line in run('cosmic-ray', 'dump', session).splitlines():
         item, result = json.loads(line)
         if result is not None and result['worker_outcome'] == 'normal':
             found.append((result['test_outcome'] == 'killed', result['diff'] or str(item)))
-    return found
+    return count, found
 
 
 def main() -> None:
     """Print a row for each module."""
     parser = argparse.ArgumentParser(description=__doc__.partition('\n')[0])
     parser.add_argument('--only', nargs='+', choices=sorted(MODULES), default=list(MODULES), metavar='NAME')
+    parser.add_argument('--most', type=int, default=sys.maxsize, help='changes of a module that are tried')
+    parser.add_argument('--seed', type=int, default=0, help='they are drawn with')
     parser.add_argument('--survivors', action='store_true', help='print the changes that no test noticed')
     options = parser.parse_args()
     if shutil.which('cosmic-ray') is None:
         raise SystemExit('cosmic-ray is not on the path: pip install cosmic-ray')
-    print(f'{"module":34s}{"changes":>9s}{"noticed":>9s}{"score":>8s}{"seconds":>9s}')
-    total = noticed = 0
+    print(f'{"module":34s}{"changes":>9s}{"tried":>9s}{"noticed":>9s}{"score":>8s}{"seconds":>9s}')
+    total = tried = noticed = 0
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name) / 'checkout'
         folder.mkdir()
         copy_of_checkout(folder)
         for module in options.only:
             begin = time.monotonic()
-            found = changes_of(module, folder)
+            count, found = changes_of(module, folder, options.most, options.seed)
             killed = sum(was_noticed for was_noticed, _ in found)
-            total, noticed = total + len(found), noticed + killed
-            seconds = time.monotonic() - begin
-            print(f'{module:34s}{len(found):9d}{killed:9d}{killed / max(len(found), 1):8.0%}{seconds:9.0f}', flush=True)
+            total, tried, noticed = total + count, tried + len(found), noticed + killed
+            score, seconds = killed / max(len(found), 1), time.monotonic() - begin
+            print(f'{module:34s}{count:9d}{len(found):9d}{killed:9d}{score:8.0%}{seconds:9.0f}', flush=True)
             if options.survivors:
                 print(*(change for was_noticed, change in found if not was_noticed), sep='\n', flush=True)
-    print(f'{"all":34s}{total:9d}{noticed:9d}{noticed / max(total, 1):8.0%}')
+    print(f'{"all":34s}{total:9d}{tried:9d}{noticed:9d}{noticed / max(tried, 1):8.0%}')
 
 
 if __name__ == '__main__':

@@ -25,6 +25,9 @@ COMPILES = '(compiling kernels, which takes half a minute once)'
 PATIENCE = 1.0
 """Seconds of work before progress is shown."""
 
+ON_SCREEN, IN_LOG = 0.2, 1.0
+"""Seconds between two looks at what is to be shown, on a terminal and elsewhere."""
+
 
 def run(
     parser: argparse.ArgumentParser, body: Callable[[argparse.Namespace], int], arguments: Sequence[str] | None
@@ -131,7 +134,7 @@ class Ticker:
 
     def _watch(self) -> None:
         on_screen = self._stream.isatty()
-        while not self._done.wait(0.2 if on_screen else 1.0):
+        while not self._done.wait(ON_SCREEN if on_screen else IN_LOG):
             seconds = time.monotonic() - self._begin
             if self._quiet:
                 self._tell_of_compiling(seconds)

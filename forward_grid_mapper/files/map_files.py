@@ -34,10 +34,14 @@ def occupancy_values(values: NDArray[Any]) -> NDArray[np.int8]:
     -------
     int8, of the same shape
     """
+    made: NDArray[np.int8]
     if np.issubdtype(values.dtype, np.integer):
-        return np.where(values < 0, -1, np.where(values > 0, 100, 0)).astype(np.int8)
-    percent = np.clip(np.rint(values * 100.0), 0, 100)
-    return np.where(np.isnan(percent), -1, percent).astype(np.int8)
+        # sums of bytes: choosing numbers of eight bytes takes ten times as long, and holds up the executor of the node
+        made = (values > 0).view(np.int8) * np.int8(100) - (values < 0).view(np.int8)
+    else:
+        # the larger one of a number and NaN is the number
+        made = np.fmax(np.clip(np.rint(values * 100.0), 0, 100), -1).astype(np.int8)
+    return made
 
 
 def write_trinary(path_stem: Path | str, grid: Grid, cells: NDArray[np.int8]) -> Path:

@@ -49,8 +49,10 @@ class Worker:
         What failed last; empty once something succeeded after it, unless failures are `lasting`: then until `forgive`.
     """
 
-    def __init__(self, name: str, log: Callable[[str], object], lasting: bool = False) -> None:
+    def __init__(self, name: str, log: Callable[[str], object], lasting: bool = False, nice: int = NICE) -> None:
+        """Prepare; `nice` is by what the thread gives way to the executor."""
         self.name, self.trouble = name, ''
+        self._nice = nice
         self._log, self._lasting = log, lasting
         self._tasks: deque[_Task] = deque()
         self._wake = threading.Condition()
@@ -134,9 +136,9 @@ class Worker:
 
     def _run(self) -> None:
         # Linux has a priority for each thread, which the threads that it starts inherit
-        if sys.platform == 'linux':
+        if self._nice and sys.platform == 'linux':
             with suppress(OSError):
-                os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), NICE)
+                os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), self._nice)
         while True:
             with self._wake:
                 while not self._tasks and not self._closed:

@@ -84,6 +84,8 @@ class Health:
         received, rejected = intake.received, sum(associator.rejected.values())
         new, new_rejected = received - self._received, rejected - self._rejected
         self._received, self._rejected = received, rejected
+        # looked at each time: a reset begins to count anew
+        by_reason, self._by_reason = associator.rejected - self._by_reason, associator.rejected.copy()
         refused = sum(associator.odometry_rejected.values())
         silent_odometry = self._silence('odometry', associator.odometry_received - refused)
         refused_now, self._refused = refused - self._refused, refused
@@ -105,7 +107,7 @@ class Health:
             return DiagnosticStatus.WARN, f'no pose on the robot for {listed(associator.unknown_frames)}'
         if new and new_rejected > 0.2 * new:
             return DiagnosticStatus.WARN, (
-                f'{new_rejected} of {new} readings were rejected in the last second{self._main_reason(associator)}'
+                f'{new_rejected} of {new} readings were rejected in the last second{_main_reason(by_reason)}'
             )
         bound = associator.parameters.max_readings
         if bound and NEARLY * bound < len(associator.buffer) <= bound:
@@ -113,13 +115,6 @@ class Health:
                 f'{len(associator.buffer)} readings, and max_readings is {bound}: the oldest go where there are many'
             )
         return DiagnosticStatus.OK, 'mapping'
-
-    def _main_reason(self, associator: PoseAssociator) -> str:
-        """Return what most readings were rejected for since the last look."""
-        new = associator.rejected - self._by_reason
-        self._by_reason = associator.rejected.copy()
-        reason = max(new, key=lambda key: new[key], default='')
-        return f', most of them as {reason}: {REASONS[reason]}' if reason else ''
 
     def _silence(self, stream: str, count: int) -> float:
         now = time.monotonic()
@@ -136,6 +131,12 @@ def add_faults(made: DiagnosticStatus, faults: list[str]) -> None:
         well = made.level == DiagnosticStatus.OK
         made.level = max(made.level, DiagnosticStatus.WARN)
         made.message = '; '.join(faults if well else [made.message, *faults])
+
+
+def _main_reason(counts: Counter[str]) -> str:
+    """Say what most readings were rejected for."""
+    reason = max(counts, key=lambda key: counts[key], default='')
+    return f', most of them as {reason}: {REASONS[reason]}' if reason else ''
 
 
 def _and_no_pose(associator: PoseAssociator) -> str:

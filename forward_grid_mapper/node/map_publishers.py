@@ -60,7 +60,8 @@ class MapPublishers:
         MapperError
             If two maps were given the same topic.
         """
-        self.worker = Worker('maps', node.get_logger().error)
+        # rclpy keeps the GIL while it sends: a thread that gave way with it would have the executor give way as well
+        self.worker = Worker('maps', node.get_logger().error, nice=0)
         self.generation = 0
         self._node, self._resolution, self._frame, self._before = node, resolution, frame, before
         self._out = {name: node.create_publisher(OccupancyGrid, f'~/{name}', LATCHED) for name in MAPS}

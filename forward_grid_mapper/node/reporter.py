@@ -50,7 +50,7 @@ class Reporter:
         self._reported: set[str] = set()
         self._lost: set[str] = set()
         self._quiet: set[str] = set()
-        self._no_map_frame = False
+        self._no_map_frame = self._no_name = False
         self._out = node.create_publisher(DiagnosticArray, '/diagnostics', 10)
 
     def report(self) -> None:
@@ -70,7 +70,7 @@ class Reporter:
             extra,
             self._map_frame_fault(),
         )
-        faults = [*self._intake.faults(), *self._surroundings.faults()]
+        faults = [*self._intake.faults(), *self._surroundings.faults(), *self._nameless()]
         diagnostics.add_faults(statuses[0], [*faults, *self._associator.limits.warnings(), *self._em.wrong_input])
         statuses += [*self._journal.statuses(name), *self._trajectory.statuses(name)]
         counts = self._associator.buffer.counts()
@@ -114,6 +114,18 @@ class Reporter:
             self._no_map_frame = False
             self._node.get_logger().info('the transform to map_frame is there')
         return fault
+
+    def _nameless(self) -> list[str]:
+        """Warn of odometry whose frame has no name, which maps then lack as well; the log is told once."""
+        nameless = bool(len(self._associator.record)) and not self._associator.map_frame
+        text = (
+            'odometry has no frame_id in its header: RViz and Nav2 can show no map in that frame, and TF does not lead '
+            'there; have its driver set one, such as odom'
+        )
+        if nameless and not self._no_name:
+            self._node.get_logger().warning(text)
+        self._no_name = nameless
+        return [text] * nameless
 
     def _name_frames(self) -> None:
         """Name sensors without a pose in the log, each once, and those that have one after all."""

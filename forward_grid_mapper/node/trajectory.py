@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
+from numpy.typing import NDArray
 
 from ..core.common.parameters import Parameters
 from ..core.common.readings import Readings
@@ -145,6 +146,7 @@ class Trajectory:
         self._at, self._jump, newest = None, None, self._associator.record.newest
         # the path begins with the drive
         self._since = -1 if newest is None else newest[0]
+        self._jumps = self._associator.time_jumps
         self._switch(self._parameters.node.refine_poses)
         if self._out is not None:
             self._out.forget()
@@ -238,11 +240,19 @@ class Trajectory:
         if self._out is None or not self.on or self.obstacle or newest is None:
             return
         if associator.time_jumps != self._jumps:
-            self._jumps, self._at, self._jump = associator.time_jumps, None, None
+            self._jumps, self._since = associator.time_jumps, -1
+            self._at = self._jump = None
             self._out.forget()
-        correction = np.zeros(3) if self.correction is None else self.correction.last
-        self._out.send((self.frame, associator.map_frame, associator.base_frame), correction, newest)
+        frames = self.frame, associator.map_frame, associator.base_frame
+        self._out.send(frames, self._correction_at(newest[0]), newest)
         self._drive_on(*newest)
+
+    def _correction_at(self, stamp: int) -> NDArray[np.float64]:
+        """Return the pose of odometry's frame on the map, shape (3,), as readings of a stamp are moved."""
+        if self.correction is None:
+            return np.zeros(3)
+        # earlier than the end is what comes after the clock jumped back, as where a bag is played again and again
+        return (self.correction if stamp >= self.correction.end else self.correction.until(stamp)).last
 
     def _drive_on(self, stamp: int, pose: Pose2) -> None:
         """Count the way, and do what is due after it."""

@@ -218,7 +218,9 @@ def test_silent_under_a_second() -> None:
         assert stream.getvalue() == ''
 
 
-def test_shows_longer_work() -> None:
+def test_shows_longer_work(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ('PATIENCE', 'ON_SCREEN', 'IN_LOG'):
+        monkeypatch.setattr(console, name, 0.05)
     streams = {'log': io.StringIO(), 'screen': Screen(), 'quiet': Screen(), 'idle': Screen()}
     with (
         Ticker(stream=streams['log']) as log,
@@ -228,10 +230,12 @@ def test_shows_longer_work() -> None:
     ):
         for ticker in (log, screen, quiet):
             ticker.reading(1000, 12345)
-        time.sleep(1.4)
+        wait_until_shown(streams['log'], 'messages')
+        wait_until_shown(streams['screen'], 'messages')
         for ticker in (log, screen, quiet):
             ticker.mapping('search', Progress(3, 1234, 5, 678.9))
-        time.sleep(1.4)
+        wait_until_shown(streams['log'], 'gained')
+        wait_until_shown(streams['screen'], 'gained')
     shown = {name: stream.getvalue() for name, stream in streams.items()}
     assert shown['quiet'] == shown['idle'] == ''
     reading, searching = 'reading: 1,000 of 12,345 messages', 'search: iteration 3, 1,234 flips, 679 nats gained'
@@ -324,15 +328,18 @@ def test_shortened() -> None:
     assert [len(console.shortened('too long', width)) for width in range(-1, 9)] == [0, 0, 1, 2, 3, 4, 5, 6, 7, 8]
 
 
-def test_a_pipe_gets_a_line_a_second_at_most() -> None:
+def test_a_pipe_gets_a_line_a_second_at_most(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert console.IN_LOG == 1.0
+    monkeypatch.setattr(console, 'PATIENCE', 0.0)
+    monkeypatch.setattr(console, 'IN_LOG', 0.2)
     stream = io.StringIO()
     begin = time.monotonic()
     with Ticker(stream=stream) as ticker:
-        while time.monotonic() < begin + 3.3:
+        while not stream.getvalue() or time.monotonic() < begin + 0.7:
             ticker.say(f'step {time.monotonic()}')
             time.sleep(0.01)
         passed = time.monotonic() - begin
-    assert 1 <= len(stream.getvalue().splitlines()) <= passed
+    assert 1 <= len(stream.getvalue().splitlines()) <= passed / 0.2
 
 
 def test_ends_at_an_error(monkeypatch: pytest.MonkeyPatch) -> None:

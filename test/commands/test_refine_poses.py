@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
@@ -32,22 +32,43 @@ from forward_grid_mapper.simulation.world import building_tour, building_world
 REFINED = FILES | {'trajectory.tum', 'odometry.tum', 'odometry_calibration.yaml'}
 
 
+class Kept(NamedTuple):
+    """A drive that drifts, as a bag and as the journal of the node that was there; and what becomes of the bag."""
+
+    exact: Recording
+    bent: Recording
+    bag: Path
+    journal: Path
+    report: dict[str, Any]
+    maps: Path
+
+
+def drifting(points: int, seed: int, bent: int) -> tuple[Recording, Recording]:
+    """A drive through rooms with eight sonars, and the same with odometry that drifts."""
+    exact = drive(building_world(), building_tour()[:points], 0.15, sonar_ring(8), NOISY, seed=seed)
+    return exact, with_drift(exact, LEVELS['high'], bent)
+
+
 @pytest.fixture(scope='module')
-def exact() -> Recording:
-    return drive(building_world(), building_tour()[:20], 0.15, sonar_ring(16), NOISY, seed=3)
+def kept(tmp_path_factory: pytest.TempPathFactory) -> Kept:
+    folder = tmp_path_factory.mktemp('kept')
+    exact, bent = drifting(10, 3, 6)
+    journal = Journal(folder / 'journal', print)
+    assert not list(journal.restore())
+    journal.put(bent.readings, ('odom', 'base_link'), [m.pose[:2] for m in bent.odometry[::5]])
+    journal.close()
+    bag = write_recording(folder, bent)
+    report = mapped(bag, folder / 'maps', '--refine-poses', '-q')
+    return Kept(exact, bent, bag, folder / 'journal', report, folder / 'maps')
 
 
-def test_drift_is_taken_out_of_a_bag(tmp_path: Path, exact: Recording) -> None:
-    folder = tmp_path / 'drive'
-    folder.mkdir()
-    bag = write_recording(folder, with_drift(exact, LEVELS['high'], 6))
-    report = mapped(bag, tmp_path / 'maps', '--refine-poses')
-    assert {path.name for path in (tmp_path / 'maps').iterdir()} == REFINED
-    assert report['input']['trajectory']['refined']
-    assert report['input']['trajectory']['odometry_off_m'] > 0.5
-    true = np.array([m.pose for m in exact.odometry])
+def test_drift_is_taken_out_of_a_bag(kept: Kept) -> None:
+    assert {path.name for path in kept.maps.iterdir()} == REFINED
+    assert kept.report['input']['trajectory']['refined']
+    assert kept.report['input']['trajectory']['odometry_off_m'] > 0.5
+    true = np.array([m.pose for m in kept.exact.odometry])
     for name, low, high in (('odometry', 0.7, 9.0), ('trajectory', 0.0, 0.2)):
-        lines = np.loadtxt(tmp_path / 'maps' / f'{name}.tum')
+        lines = np.loadtxt(kept.maps / f'{name}.tum')
         assert len(lines) == len(true)
         assert low < rms_after_alignment(lines[:, 1:3], true) < high
 
@@ -101,8 +122,9 @@ def test_a_calibration_is_applied(tmp_path: Path, capsys: pytest.CaptureFixture[
 
 def drive_of(folder: Path, number: int, points: int, seed: int, bent: int | None) -> tuple[Path, np.ndarray]:
     """Write the bag of a drive on a day of its own; return it and the true poses."""
-    exact = drive(building_world(), building_tour()[:points], 0.15, sonar_ring(16), NOISY, seed=seed)
-    recording = exact if bent is None else with_drift(exact, LEVELS['high'], bent)
+    exact, recording = drifting(points, seed, bent or 0)
+    if bent is None:
+        recording = exact
     later = number * 86_400 * 10**9
     recording = replace(
         recording,
@@ -165,39 +187,21 @@ def test_drives_that_all_stay_make_the_same_maps(days: dict[str, Any], tmp_path:
 # ---- journals
 
 
-@pytest.fixture(scope='module')
-def kept(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, Recording]:
-    """A drive that drifts, as a bag and as the journal of the node that was there."""
-    folder = tmp_path_factory.mktemp('kept')
-    recording = with_drift(
-        drive(building_world(), building_tour()[:10], 0.15, sonar_ring(16), NOISY, seed=3), LEVELS['high'], 6
-    )
-    journal = Journal(folder / 'journal', print)
-    assert not list(journal.restore())
-    journal.put(recording.readings, ('odom', 'base_link'), [m.pose[:2] for m in recording.odometry[::5]])
-    journal.close()
-    return write_recording(folder, recording), folder / 'journal', recording
-
-
-def test_a_journal_is_refined_as_the_bag_is(tmp_path: Path, kept: tuple[Path, Path, Recording]) -> None:
-    bag, journal, recording = kept
-    sensors = [f'--sensor={frame}={x},{y},{yaw}' for frame, (x, y, yaw) in recording.extrinsics]
-    reports = [
-        mapped(path, tmp_path / name, '--refine-poses', '-q', *options)
-        for path, name, options in ((bag, 'bag', []), (journal, 'journal', sensors))
-    ]
-    told = [report['input']['trajectory'] for report in reports]
+def test_a_journal_is_refined_as_the_bag_is(tmp_path: Path, kept: Kept) -> None:
+    sensors = [f'--sensor={frame}={x},{y},{yaw}' for frame, (x, y, yaw) in kept.bent.extrinsics]
+    of_journal = mapped(kept.journal, tmp_path / 'journal', '--refine-poses', '-q', *sensors)
+    told = [report['input']['trajectory'] for report in (kept.report, of_journal)]
     assert all(found['refined'] for found in told)
     assert told[1]['odometry_off_m'] == pytest.approx(told[0]['odometry_off_m'], abs=0.05)
-    a, b = (np.loadtxt(tmp_path / name / 'trajectory.tum') for name in ('bag', 'journal'))
-    assert len(a) > len(b) == len(np.unique(recording.readings.stamp))
+    a, b = (np.loadtxt(folder / 'trajectory.tum') for folder in (kept.maps, tmp_path / 'journal'))
+    assert len(a) > len(b) == len(np.unique(kept.bent.readings.stamp))
     at = np.stack([np.interp(b[:, 0], a[:, 0], a[:, k]) for k in (1, 2)], 1)
     # about its begin a trajectory may swing a little
     assert rms_after_alignment(b[:, 1:3], at) < 0.1
-    assert any('they tell the odometry' in warning for warning in reports[1]['warnings'])
+    assert any('they tell the odometry' in warning for warning in of_journal['warnings'])
 
 
-def test_a_journal_without_poses_of_the_sensors_stays(tmp_path: Path, kept: tuple[Path, Path, Recording]) -> None:
-    found = mapped(kept[1], tmp_path / 'maps', '--refine-poses', '-q')['input']['trajectory']
+def test_a_journal_without_poses_of_the_sensors_stays(tmp_path: Path, kept: Kept) -> None:
+    found = mapped(kept.journal, tmp_path / 'maps', '--refine-poses', '-q')['input']['trajectory']
     assert not found['refined']
     assert 'give their poses with --sensor' in found['reason']

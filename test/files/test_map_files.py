@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import importlib.util
 import json
+import math
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -198,6 +199,28 @@ def test_occupancy_values() -> None:
     np.testing.assert_array_equal(occupancy_values(probability), [[0, 100, 12, -1]])
     np.testing.assert_array_equal(occupancy_values(CELLS), [[0, 0, 100], [-1, 0, -1]])
     assert occupancy_values(CELLS).dtype == occupancy_values(probability).dtype == np.int8
+
+
+@pytest.mark.parametrize('kind', [np.int8, np.int64, np.uint8, np.float16, np.float32, np.float64])
+def test_occupancy_values_are_those_of_the_twin(kind: type[np.generic]) -> None:
+    rng = np.random.default_rng(0)
+    whole = np.issubdtype(kind, np.integer)
+    values = (rng.integers(0 if kind is np.uint8 else -5, 6, 500) if whole else rng.normal(0.5, 0.6, 500)).astype(kind)
+    if not whole:
+        values[rng.random(500) < 0.3] = np.nan
+        values[:3] = np.inf, -np.inf, -0.0
+
+    def twin(value: float) -> int:
+        if math.isnan(value) or (whole and value < 0):
+            return -1
+        if whole or math.isinf(value):
+            return 100 if value > 0 else 0
+        return min(max(round(float(kind(value) * kind(100.0))), 0), 100)
+
+    found = occupancy_values(values)
+    assert found.dtype == np.int8
+    assert found.tolist() == [twin(value) for value in values.tolist()]
+    assert occupancy_values(values[:0].reshape(0, 4)).shape == (0, 4)
 
 
 def test_npz_round_trip(tmp_path: Path) -> None:

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import os
 import queue
+import sys
 import threading
+import time
 from collections.abc import Callable, Iterator
 from typing import Any
 
 import pytest
 
 from forward_grid_mapper.core.common.errors import InputError, MapperError
-from forward_grid_mapper.node.background import AT_ONCE, Inbox, Worker
+from forward_grid_mapper.node.background import AT_ONCE, NICE, Inbox, Worker
 
 logged: list[str] = []
 
@@ -121,6 +124,33 @@ def test_closing_waits_for_what_was_begun_and_leaves_the_rest(worker: Worker) ->
     assert done == ['first']
 
 
+def test_what_is_done_does_not_wait_any_more(worker: Worker) -> None:
+    assert worker.waiting == 0
+    worker.ask(lambda: None)
+    # the answer comes a moment before the thread looks for the next piece
+    end = time.monotonic() + 60.0
+    while worker.waiting:
+        assert time.monotonic() < end
+        time.sleep(0.001)
+
+
+def test_whoever_asks_a_worker_that_has_ended_is_told(worker: Worker) -> None:
+    worker.close(10.0)
+    with pytest.raises(MapperError, match='digger has ended'):
+        worker.ask(lambda: None)
+
+
+@pytest.mark.skipif(sys.platform != 'linux', reason='elsewhere a thread has no priority of its own')
+@pytest.mark.parametrize('nice', [NICE, 0])
+def test_a_worker_gives_way_unless_it_is_told_not_to(nice: int) -> None:
+    worker = Worker('digger', logged.append, nice=nice)
+    own = os.getpriority(os.PRIO_PROCESS, 0)
+    found = worker.ask(lambda: os.getpriority(os.PRIO_PROCESS, threading.get_native_id()))
+    assert found == (nice or own)
+    assert os.getpriority(os.PRIO_PROCESS, 0) == own, 'nobody else does'
+    worker.close(10.0)
+
+
 class Guard:
     def __init__(self, callback: Callable[[], None]) -> None:
         self.callback, self.triggered = callback, 0
@@ -172,3 +202,17 @@ def test_a_result_that_fails_does_not_hold_up_the_others() -> None:
         executor.run()
     executor.run()
     assert done == [1]
+
+
+def test_what_is_left_for_a_node_that_was_destroyed_is_dropped() -> None:
+    executor = Executor()
+    inbox = Inbox(executor)
+
+    def fail() -> None:
+        raise RuntimeError('the guard condition was destroyed')
+
+    executor.guard.trigger = fail
+    done: list[int] = []
+    inbox.put(lambda: done.append(1))
+    inbox.work()
+    assert done == []

@@ -315,3 +315,57 @@ def test_the_lookup_says_whether_a_frame_or_a_time_is_missing(buffer: Buffer, tr
     buffer.until = 4
     assert transforms.lookup('base', 'ghost', 5) is LATER
     assert transforms.lookup('base', 'servo', 5) is LATE
+
+
+@pytest.mark.parametrize('timeout', [0.25, 3.0])
+def test_the_timeout_is_that_of_the_parameter(transforms: Transforms, timeout: float) -> None:
+    frame = MapFrame('map', transforms, timeout)
+    for k in range(50):
+        frame.convert(OdometryMessage(k * NANOSECONDS // 10, 'odom', 'base', Pose2(0, 0, 0)))
+    # what is as old as that waits
+    assert len(frame._held) == 10 * timeout // 1 + 1
+    assert frame.dropped + len(frame._held) == 50
+
+
+@pytest.mark.parametrize('begin', [0, 1_700_000_000 * NANOSECONDS])
+def test_what_waits_is_dropped_by_a_jump_and_by_no_less(transforms: Transforms, begin: int) -> None:
+    for back, dropped in ((frames.JUMP, 0), (frames.JUMP + 1, 2)):
+        frame = MapFrame('map', transforms, 1000.0)
+        for stamp in (begin + 8 * NANOSECONDS, begin + 9 * NANOSECONDS, begin + 9 * NANOSECONDS - back):
+            assert frame.convert(OdometryMessage(stamp, 'odom', 'base', Pose2(0, 0, 0))) == []
+        assert frame.dropped == dropped
+
+
+@pytest.mark.parametrize('name', ['earth', 'zone', '/zone'])
+def test_odometry_of_any_other_frame_is_converted(buffer: Buffer, transforms: Transforms, name: str) -> None:
+    buffer.known[name.lstrip('/'), 'odom'] = transform(1.0, 2.0)
+    (made,) = MapFrame(name, transforms, 1.0).convert(OdometryMessage(5, 'odom', 'base', Pose2(0, 0, 0)))
+    assert (made.frame_id, made.pose) == (name, Pose2(1.0, 2.0, 0.0))
+
+
+def test_a_frame_that_is_missing_is_asked_for_now_and_then(
+    buffer: Buffer, transforms: Transforms, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now = 100.0
+    monkeypatch.setattr(frames.time, 'monotonic', lambda: now)
+    for _ in range(5):
+        assert transforms.lookup('base', 'sonar', 5) is LATER
+    assert buffer.asked == 1
+    now += frames.PATIENCE
+    assert transforms.lookup('base', 'sonar', 5) is LATER
+    assert buffer.asked == 2
+    buffer.known['base', 'sonar'] = transform(0.1, 0.0)
+    now += frames.PATIENCE
+    for _ in range(3):
+        assert transforms.lookup('base', 'sonar', 5) is buffer.known['base', 'sonar']
+
+
+def test_poses_of_so_many_sensors_are_remembered(
+    buffer: Buffer, transforms: Transforms, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(frames, 'MOST_MISSING', 2)
+    extrinsics = Extrinsics({}, transforms)
+    for k in range(4):
+        buffer.known['base', f'sonar {k}'] = transform(0.1 * k, 0.0)
+        assert extrinsics('base', f'sonar {k}', 5) == Pose2(0.1 * k, 0.0, 0.0)
+    assert set(extrinsics.fixed) == {'sonar 0', 'sonar 1'}

@@ -115,6 +115,49 @@ def test_the_transform_from_map_to_odom_is_sent(
     robot.until(lambda: numbers(tf2_ros.sent[-1]) == (0.0, 0.0, 0.0))
 
 
+def test_after_the_clock_jumped_back_the_transform_is_that_of_readings_of_its_stamp(
+    inside: Callable[..., Inside], quick: Any, tf2_ros: type[Broadcaster]
+) -> None:
+    """A bag that is played again and again, or a simulation that begins anew."""
+    robot = inside(refine_poses=True).start()
+    robot.drive(0, 200)
+    assert robot.call(robot.node.em.run_em)[0]
+    correction = robot.node.trajectory.correction
+    assert correction is not None
+    for seconds, of in ((50.0, 100.0), (103.0, 103.0), (120.0, 110.0)):
+        robot.odometry(seconds, 0.5)
+        robot.until(lambda seconds=seconds: seconds_of(tf2_ros.sent[-1]) == pytest.approx(seconds + 0.2))
+        odometry, path = (
+            each.at(np.array([round(of * 1e9)]))[0] for each in (correction.odometry, correction.trajectory)
+        )
+        x, y, yaw = numbers(tf2_ros.sent[-1])
+        # between two poses both are interpolated
+        assert compose(np.array([x, y, yaw]), odometry) == pytest.approx(path, abs=0.01)
+    assert robot.node.associator.time_jumps == 1
+
+
+def test_the_path_begins_with_the_drive_also_where_the_clock_jumps_back_after_it(
+    inside: Callable[..., Inside], quick: Any, tf2_ros: type[Broadcaster], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    robot = inside(refine_poses=True).start()
+    robot.drive(0, 50)
+    robot.call(robot.node.reset)
+    shown: list[Any] = []
+    monkeypatch.setattr(robot.node.trajectory._out, 'publish_path', lambda frame, path, stamp: shown.append(path))
+    for k in range(20):
+        robot.odometry(20.0 + 0.1 * k, 0.1 * k)
+        robot.node.trajectory._tick()
+    robot.until(lambda: shown and len(shown[-1].stamp))
+    assert shown[-1].stamp[0] == 20 * 10**9
+    # a reset, after which nothing jumps, begins another drive
+    robot.call(robot.node.reset)
+    for k in range(20, 40):
+        robot.odometry(20.0 + 0.1 * k, 0.1 * k)
+        robot.node.trajectory._tick()
+    robot.until(lambda: len(shown[-1].stamp) and shown[-1].stamp[0] > 21.9e9)
+    assert shown[-1].stamp[0] == 22 * 10**9
+
+
 def test_without_refine_poses_nothing_is_sent(inside: Callable[..., Inside], tf2_ros: type[Broadcaster]) -> None:
     tf2_ros.sent = []
     robot = inside().start()

@@ -187,7 +187,8 @@ def test_no_alarm_in_the_simulated_worlds(noise: object, sonars: Callable[[], So
             corridor_drive(seed, 1 + seed % 2, noise, noise is NOISY, sonars()),
             *([building_drive(seed, 1, noise, noise is NOISY, sonars())] if not seed else []),
         ):
-            assert told(Messages(dict(recording.extrinsics), recording.odometry, recording.ranges)) == []
+            # ten poses a second
+            assert told(Messages(dict(recording.extrinsics), recording.odometry[::5], recording.ranges)) == []
 
 
 @pytest.mark.parametrize('odometry', ['/odom', '/odom_corrected'])

@@ -1,0 +1,121 @@
+"""What parts of the node need of rclpy, without a middleware: the test says when what is called."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from nav_msgs.msg import Odometry
+from sensor_msgs.msg import Range
+
+from forward_grid_mapper.core.common.parameters import Parameters
+from forward_grid_mapper.core.messages.message_types import Pose2
+from forward_grid_mapper.core.messages.pose_association import PoseAssociator
+from forward_grid_mapper.node.frames import MapFrame, Transforms
+from forward_grid_mapper.node.intake import AT_ONCE, Intake
+
+
+class Guard:
+    """A guard condition: `turn` of the node calls what it guards."""
+
+    def __init__(self, callback: Callable[[], None]) -> None:
+        self.callback, self.triggered = callback, False
+
+    def trigger(self) -> None:
+        self.triggered = True
+
+
+class PlainNode:
+    """As much of a node as a part of ours asks for.
+
+    Attributes
+    ----------
+    warned : list of str
+        What the log was told.
+    publishers : int
+        How many publish any topic.
+    subscribed : dict of topic → (callback, QoSProfile)
+    """
+
+    def __init__(self) -> None:
+        self.warned: list[str] = []
+        self.publishers = 1
+        self.subscribed: dict[str, tuple[Callable[..., None], Any]] = {}
+        self._guards: list[Guard] = []
+
+    def get_logger(self) -> Any:
+        return self
+
+    def warning(self, text: str) -> None:
+        self.warned.append(text)
+
+    error = info = warning
+
+    def create_guard_condition(self, callback: Callable[[], None]) -> Guard:
+        made = Guard(callback)
+        self._guards.append(made)
+        return made
+
+    def turn(self) -> int:
+        """Call what was triggered, again and again; return how often."""
+        turns = 0
+        while triggered := [guard for guard in self._guards if guard.triggered]:
+            for guard in triggered:
+                guard.triggered = False
+                guard.callback()
+            turns += 1
+        return turns
+
+    def count_publishers(self, topic: str) -> int:
+        return self.publishers
+
+    def resolve_topic_name(self, name: str) -> str:
+        return name if name.startswith('/') else f'/{name}'
+
+    def create_subscription(self, kind: Any, topic: str, callback: Any, quality: Any, **options: Any) -> str:
+        self.subscribed[topic] = callback, quality
+        return topic
+
+    def destroy_subscription(self, topic: str) -> None:
+        del self.subscribed[topic]
+
+
+SONAR = Pose2(0.1, 0.0, 0.0)
+
+
+class Taking:
+    """An intake with its associator, and a robot that publishes to it."""
+
+    def __init__(self, at_once: int = AT_ONCE, **parameters: Any) -> None:
+        self.node = PlainNode()
+        own = Parameters.from_flat(parameters)
+        self.associator = PoseAssociator(lambda base, frame, stamp: SONAR, own, at_once=at_once)
+        self.published: list[int] = []
+        map_frame = MapFrame('', Transforms(), 1.0)
+        self.intake = Intake(self.node, own, self.associator, map_frame, self.published.append)
+        self.sent = 0
+
+    def odometry(self, seconds: float, x: float = 0.0, number: int | None = None, frame: str = 'odom') -> None:
+        made = Odometry(child_frame_id='base_link')
+        made.header.frame_id = frame
+        made.pose.pose.position.x, made.pose.pose.orientation.w = x, 1.0
+        made.header.stamp.sec, made.header.stamp.nanosec = divmod(round(seconds * 1e9), 10**9)
+        info: dict[str, Any] = {'source_timestamp': round(seconds * 1e9)}
+        if number is not None:
+            info['publication_sequence_number'] = number
+        self.intake.on_odometry(made, info)
+
+    def range(self, seconds: float, frame: str = 'sonar', number: int | None = None, topic: int = 0) -> None:
+        made = Range(min_range=0.1, max_range=5.0, field_of_view=0.3, range=2.0)
+        made.header.frame_id = frame
+        made.header.stamp.sec, made.header.stamp.nanosec = divmod(round(seconds * 1e9), 10**9)
+        self.sent += 1
+        info = {'source_timestamp': round(seconds * 1e9), 'publication_sequence_number': number or self.sent}
+        self.intake.on_range(self.intake.range_losses[topic], made, info)
+
+    def account(self) -> tuple[int, int, int, int]:
+        """Received, accepted, waiting and rejected readings; the first is the sum of the others."""
+        rejected = sum(self.associator.rejected.values())
+        found = self.intake.received, len(self.associator.buffer), self.intake.waiting, rejected
+        assert found[0] == found[1] + found[2] + found[3]
+        return found

@@ -1,0 +1,80 @@
+"""Answers that come later than the handler returns, or sooner: each caller gets one, by the header of his call."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+pytest.importorskip('rclpy', reason='services are those of rclpy')
+
+from rclpy.qos import ReliabilityPolicy
+from std_srvs.srv import SetBool, Trigger
+
+from forward_grid_mapper.node.deferred import CALLS, DeferredService, Reply
+
+
+class Serving:
+    """As much of a node as a service needs; `call` does what rclpy's executor does with a request."""
+
+    def __init__(self) -> None:
+        self.sent: list[tuple[Any, Any]] = []
+
+    def create_service(self, kind: Any, name: str, callback: Any, qos_profile: Any) -> Any:
+        assert qos_profile.depth >= 2000 and qos_profile.reliability == ReliabilityPolicy.RELIABLE
+        self.callback = callback
+        self.service = SimpleNamespace(send_response=lambda response, header: self.sent.append((response, header)))
+        return self.service
+
+    def call(self, header: str, request: Any = None) -> None:
+        self.service.send_response(self.callback(request, Trigger.Response()), header)
+
+
+def test_an_answer_goes_out_when_it_is_there_whoever_is_first() -> None:
+    node, replies = Serving(), list[Reply]()
+    DeferredService(node, Trigger, 'later', replies.append)
+    for header in ('first', 'second'):
+        node.call(header)
+    assert node.sent == []
+    replies[1].send(True, 'done')
+    replies[0].send(message='failed')
+    assert [(r.success, r.message, header) for r, header in node.sent] == [
+        (True, 'done', 'second'),
+        (False, 'failed', 'first'),
+    ]
+    at_once = Serving()
+    DeferredService(at_once, Trigger, 'now', lambda reply: reply.send(True, 'at once'))
+    at_once.call('third')
+    assert [(r.message, header) for r, header in at_once.sent] == [('at once', 'third')]
+
+
+def test_nobody_is_answered_twice() -> None:
+    node, replies = Serving(), list[Reply]()
+    DeferredService(node, Trigger, 'later', replies.append)
+    node.call('one')
+    replies[0].send(True, 'a')
+    replies[0].send(False, 'b')
+    assert [r.message for r, _ in node.sent] == ['a']
+
+    def twice(reply: Reply) -> None:
+        reply.send(True, 'a')
+        reply.send(False, 'b')
+
+    node = Serving()
+    DeferredService(node, Trigger, 'now', twice)
+    node.call('one')
+    assert [r.message for r, _ in node.sent] == ['a']
+
+
+def test_the_handler_has_the_request() -> None:
+    node, seen = Serving(), list[bool]()
+
+    def handle(reply: Reply) -> None:
+        seen.append(reply.request.data)
+        reply.send(success=True)
+
+    DeferredService(node, SetBool, 'pause', handle)
+    node.call('one', SetBool.Request(data=True))
+    assert seen == [True] and isinstance(node.sent[0][0], SetBool.Response) and node.sent[0][0].success
+    assert CALLS.depth > 10, 'what ROS keeps by itself'

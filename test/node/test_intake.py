@@ -1,0 +1,241 @@
+"""Messages on their way to the associator: what is held back, in which portions it is taken, and the account of it."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import pytest
+
+pytest.importorskip('rclpy', reason='the intake takes messages of ROS')
+
+from rclpy.qos import ReliabilityPolicy
+from stand_ins import Taking
+
+from forward_grid_mapper.node import intake as module
+from forward_grid_mapper.node.intake import AT_ONCE, QUEUE
+from forward_grid_mapper.node.losses import LASTING
+
+
+def test_what_comes_before_it_begins_is_held_back_and_then_taken_in_order() -> None:
+    robot = Taking()
+    for k in range(30):
+        robot.odometry(100.0 + 0.05 * k, 0.001 * k)
+        robot.range(100.0 + 0.05 * k)
+    assert (robot.intake.received, robot.intake.waiting, len(robot.associator.buffer)) == (30, 30, 0)
+    assert robot.intake.busy and robot.node.turn() == 0
+    robot.intake.work()
+    assert robot.intake.received == robot.intake.waiting == 30
+    robot.intake.begin()
+    robot.node.turn()
+    assert robot.account() == (30, 30, 0, 0)
+    assert robot.associator.readings.x == pytest.approx([0.1 + 0.001 * k for k in range(30)])
+    assert not robot.intake.busy
+    # from here on they are taken as they come
+    robot.odometry(102.0)
+    robot.range(102.0)
+    assert robot.account() == (31, 31, 0, 0)
+    assert len(robot.published) == 31
+
+
+def test_one_turn_takes_a_portion_of_the_messages() -> None:
+    robot = Taking()
+    for k in range(3 * AT_ONCE):
+        robot.odometry(100.0 + 0.01 * k)
+    robot.intake.begin()
+    left = []
+    while robot.intake.busy:
+        robot.intake.work()
+        left.append(3 * AT_ONCE - robot.associator.odometry_received)
+    assert left == [2 * AT_ONCE, AT_ONCE, 0]
+
+
+def test_one_turn_places_a_portion_of_the_readings() -> None:
+    robot = Taking(at_once=10)
+    robot.intake.begin()
+    robot.odometry(99.0)
+    for k in range(1000):
+        robot.range(99.5 + 0.001 * k)
+    robot.odometry(100.0)
+    robot.odometry(101.0)
+    # behind: what comes now waits until the others are placed
+    robot.range(101.0)
+    assert robot.intake.busy and robot.intake.waiting > 900
+    before = len(robot.associator.buffer)
+    robot.intake.work()
+    assert AT_ONCE <= len(robot.associator.buffer) - before <= AT_ONCE + 10
+    robot.node.turn()
+    assert robot.account() == (1001, 1001, 0, 0)
+
+
+def test_of_too_many_that_are_held_back_the_newest_go_and_are_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, 'MOST_WAITING', 5)
+    robot = Taking()
+    for k in range(8):
+        robot.odometry(100.0 + k)
+        robot.range(100.0 + k, 'front' if k < 6 else 'left')
+    assert (robot.intake.received, robot.intake.waiting) == (8, 5)
+    assert robot.intake.odometry_lost == 3
+    robot.intake.begin()
+    robot.node.turn()
+    assert robot.account()[0] == 8
+    assert robot.associator.rejected['too_many_waiting'] == 3
+    assert robot.associator.rejected_by_frame['left']['too_many_waiting'] == 3
+    assert robot.associator.odometry_received == 5
+
+
+def test_of_too_many_that_wait_behind_others_the_newest_go_as_well(monkeypatch: pytest.MonkeyPatch) -> None:
+    robot = Taking(at_once=1)
+    robot.intake.begin()
+    robot.odometry(99.4)
+    for k in range(20):
+        robot.range(99.5 + 0.001 * k)
+    robot.odometry(100.2)
+    assert robot.associator.behind
+    monkeypatch.setattr(module, 'MOST_WAITING', 4)
+    for k in range(6):
+        robot.range(100.0 + 0.01 * k)
+    assert robot.associator.rejected['too_many_waiting'] == 2
+    robot.node.turn()
+    assert robot.account() == (26, 24, 0, 2)
+
+
+def test_none_is_refused_where_none_were_too_many() -> None:
+    robot = Taking()
+    robot.intake.begin()
+    assert robot.account() == (0, 0, 0, 0) and robot.associator.rejected == {}
+
+
+def test_a_pause_counts_for_what_comes_during_it() -> None:
+    robot = Taking()
+    robot.odometry(99.9)
+    robot.range(100.0)
+    robot.intake.paused = True
+    robot.range(100.1)
+    robot.odometry(100.2)
+    robot.intake.paused = False
+    robot.range(100.2)
+    robot.intake.begin()
+    robot.node.turn()
+    robot.odometry(100.3)
+    # also where it was held back meanwhile
+    assert robot.account() == (3, 2, 0, 1)
+    assert robot.associator.rejected['paused'] == 1
+    robot.intake.paused = True
+    robot.range(100.3)
+    robot.odometry(100.4)
+    assert robot.associator.rejected['paused'] == 2
+    assert robot.associator.odometry_received == 4
+
+
+def test_forgetting_begins_the_account_anew() -> None:
+    robot = Taking()
+    robot.range(100.0, number=1)
+    robot.range(100.1, number=50)
+    robot.odometry(100.0, number=1)
+    robot.odometry(100.1, number=8)
+    assert (robot.intake.lost, robot.intake.odometry_lost) == (48, 6)
+    assert 'sonar' in robot.intake.heard and robot.intake.busy
+    robot.intake.forget()
+    assert (robot.intake.received, robot.intake.waiting, robot.intake.lost, robot.intake.odometry_lost) == (0, 0, 0, 0)
+    assert 'sonar' not in robot.intake.heard and not robot.intake.busy
+    assert robot.intake.loss_note() == []
+
+
+def test_as_many_lost_of_one_kind_as_of_the_other() -> None:
+    robot = Taking()
+    for number in (1, 3):
+        robot.range(100.0 + number, number=number)
+        robot.odometry(100.0 + number, number=number)
+    assert (robot.intake.lost, robot.intake.odometry_lost) == (1, 1)
+    assert '1 Range and 1 odometry' in robot.intake.loss_note()[0]
+
+
+def test_topics_are_subscribed_to_once_each_and_left() -> None:
+    robot = Taking(range_topics=('a', 'b', 'a'), odom_topic='wheels', odom_reliability='reliable')
+    intake, node = robot.intake, robot.node
+    assert not intake.listening
+    intake.subscribe()
+    assert intake.listening and set(node.subscribed) == {'a', 'b', 'wheels'}
+    assert set(intake.subscriptions) == {'/a', '/b', '/wheels'}
+    qualities = {topic: quality for topic, (_, quality) in node.subscribed.items()}
+    assert all(quality.depth == QUEUE for quality in qualities.values())
+    assert qualities['wheels'].reliability == ReliabilityPolicy.RELIABLE
+    assert qualities['a'].reliability == qualities['b'].reliability == ReliabilityPolicy.BEST_EFFORT
+    robot.range(100.0, number=7)
+    robot.range(100.0, number=90, topic=1)
+    intake.unsubscribe()
+    assert not intake.listening and node.subscribed == {} and intake.subscriptions == {}
+    assert 'sonar' not in intake.heard
+    intake.subscribe()
+    # what was published meanwhile was not lost
+    robot.range(101.0, number=500)
+    robot.range(101.0, number=500, topic=1)
+    assert intake.lost == 0
+
+
+@pytest.mark.parametrize(('reliability', 'remedy'), [('reliable', 'give it more time'), ('best_effort', 'network')])
+def test_losses_are_warned_of_while_they_are_fresh_and_in_the_log_now_and_then(
+    monkeypatch: pytest.MonkeyPatch, reliability: str, remedy: str
+) -> None:
+    now = 1000.0
+    monkeypatch.setattr(time, 'monotonic', lambda: now)
+    robot = Taking(range_reliability=reliability)
+    assert robot.intake.faults() == [] and robot.intake.loss_note() == []
+    robot.range(100.0, number=1)
+    robot.range(100.1, number=4)
+    robot.odometry(100.0, number=1)
+    robot.odometry(100.1, number=7)
+    (told,) = robot.intake.faults()
+    assert '2 Range and 5 odometry messages so far were lost' in told and remedy in told
+    assert robot.node.warned == [told]
+    assert '2 Range and 5 odometry messages were lost' in robot.intake.loss_note()[0]
+    # more of them soon are in the diagnostics, and in the log when it was silent for a while
+    now += LASTING / 2
+    robot.range(100.2, number=6)
+    assert '3 Range' in robot.intake.faults()[0] and len(robot.node.warned) == 1
+    now += LASTING / 2 + 0.1
+    assert '3 Range' in robot.intake.faults()[0] and len(robot.node.warned) == 2
+    now += LASTING
+    assert robot.intake.faults() == [] and robot.intake.loss_note()
+    assert len(robot.node.warned) == 2
+
+
+def test_a_clock_that_jumps_back_is_told_of() -> None:
+    robot = Taking()
+    robot.intake.begin()
+    robot.odometry(100.0)
+    robot.range(100.5)
+    robot.odometry(100.1)
+    assert robot.node.warned == []
+    robot.odometry(50.0)
+    assert len(robot.node.warned) == 1 and 'the clock jumped back' in robot.node.warned[0]
+    assert robot.account() == (1, 0, 0, 1)
+    robot.range(50.1)
+    robot.odometry(50.2)
+    assert robot.account() == (2, 1, 0, 1)
+
+
+def test_odometry_that_waited_for_a_transform_comes_in_order(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Before whatever else is held back."""
+    robot = Taking()
+    robot.intake.begin()
+    waited: list[Any] = []
+    taken: list[float] = []
+
+    def convert(message: Any) -> list[Any]:
+        waited.append(message)
+        return waited[:] if len(waited) == 4 else []
+
+    def convert_now(message: Any) -> list[Any]:
+        return [message]
+
+    monkeypatch.setattr(robot.intake._map_frame, 'convert', convert)
+    add = robot.associator.add_odometry
+    monkeypatch.setattr(robot.associator, 'add_odometry', lambda m, sent: (taken.append(m.stamp / 1e9), add(m, sent)))
+    for k in range(4):
+        robot.odometry(100.0 + k)
+    assert taken == [100.0]
+    monkeypatch.setattr(robot.intake._map_frame, 'convert', convert_now)
+    robot.odometry(104.0)
+    assert robot.node.turn() and taken == [100.0, 101.0, 102.0, 103.0, 104.0]

@@ -1,0 +1,75 @@
+"""What the node says of its input: causes in words, and nothing of what a reset has forgotten."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+pytest.importorskip('rclpy', reason='the tests of the node need rclpy')
+
+from stand_ins import Taking
+
+from forward_grid_mapper.core.common.grid import Grid
+from forward_grid_mapper.node.diagnostics import Health
+from forward_grid_mapper.node.reporter import Reporter
+
+OK, WARN = b'\x00', b'\x01'
+
+
+def judged(robot: Taking, health: Health) -> tuple[bytes, str]:
+    """Level and message of the readings, once a second of the test has passed."""
+    robot.intake.subscribe()
+    found = health.statuses('mapper', robot.intake, robot.associator, None, 'none yet', Grid(0.1, 0, 0, 1, 1), {})[0]
+    robot.intake.unsubscribe()
+    return found.level, found.message
+
+
+def drive(robot: Taking, first: int, good: int, bad: int, frame: str = '') -> None:
+    """Readings with and without a frame, and odometry with each."""
+    for k in range(first, first + good + bad):
+        robot.odometry(100.0 + 0.05 * k)
+        robot.range(100.0 + 0.05 * k, 'sonar' if k < first + good else frame)
+
+
+def test_the_reason_is_that_of_the_last_second_also_after_a_reset() -> None:
+    robot, health = Taking(), Health()
+    robot.intake.begin()
+    drive(robot, 0, 10, 90)
+    assert 'most of them as empty_frame_id' in judged(robot, health)[1]
+    drive(robot, 100, 40, 10, 'x' * 1000)
+    drive(robot, 150, 0, 5)
+    level, message = judged(robot, health)
+    assert level == WARN and '15 of 55' in message and 'most of them as long_frame_id' in message
+    drive(robot, 155, 50, 0)
+    assert judged(robot, health) == (OK, 'mapping')
+    robot.associator.clear()
+    robot.intake.forget()
+    judged(robot, health)
+    # fewer than before the reset
+    drive(robot, 205, 10, 40)
+    drive(robot, 255, 0, 15, 'x' * 1000)
+    level, message = judged(robot, health)
+    assert level == WARN and '55 of 65' in message and 'most of them as empty_frame_id' in message
+
+
+def reporter_of(robot: Taking) -> Any:
+    made = Reporter.__new__(Reporter)
+    made._node, made._associator, made._no_name = robot.node, robot.associator, False
+    return made
+
+
+def test_odometry_without_a_frame_is_told_of() -> None:
+    robot = Taking()
+    robot.intake.begin()
+    reporter = reporter_of(robot)
+    assert reporter._nameless() == [], 'nothing came yet'
+    robot.odometry(100.0, frame='')
+    for _ in range(2):
+        (text,) = reporter._nameless()
+        assert 'odometry has no frame_id in its header' in text
+    assert robot.node.warned == [text]
+    named = Taking()
+    named.intake.begin()
+    named.odometry(100.0)
+    assert reporter_of(named)._nameless() == [] and named.node.warned == []

@@ -1,0 +1,162 @@
+"""The table of parameters as ROS has it: what is declared, what is admitted, and what is said of the rest."""
+
+from __future__ import annotations
+
+import array
+import math
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+pytest.importorskip('rclpy', reason='parameters are those of rclpy')
+
+from rclpy.parameter import Parameter as RosParameter
+
+from forward_grid_mapper.core.common.errors import ParameterError
+from forward_grid_mapper.core.common.parameters import TABLE, Parameters
+from forward_grid_mapper.core.messages.message_types import Pose2
+from forward_grid_mapper.node.ros_parameters import declare, descriptor, validator, with_points
+
+ROWS = {row.name: row for row in TABLE}
+
+
+class Declaring:
+    """A node that was made with parameters, as far as declaring others goes."""
+
+    def __init__(self, **given: Any) -> None:
+        self.given = {name.replace('__', '.'): SimpleNamespace(value=value) for name, value in given.items()}
+        self.declared: dict[str, Any] = {}
+
+    def get_parameters_by_prefix(self, prefix: str) -> dict[str, Any]:
+        assert prefix == ''
+        return dict(self.given)
+
+    def undeclare_parameter(self, name: str) -> None:
+        del self.given[name]
+
+    def declare_parameter(self, name: str, value: Any, described: Any, ignore_override: bool) -> None:
+        assert ignore_override and described.name == name and name not in self.given
+        self.declared[name] = value
+
+
+def test_every_row_is_declared_with_its_value() -> None:
+    node = Declaring(p_hit=0.7, max_iterations=7, range_topics=['a', 'b'])
+    parameters, poses, warnings = declare(node)
+    assert set(node.declared) == set(ROWS)
+    assert (node.declared['p_hit'], node.declared['max_iterations'], node.declared['sigma']) == (
+        0.7,
+        7,
+        ROWS['sigma'].default,
+    )
+    assert node.declared['range_topics'] == ['a', 'b'] and parameters.node.range_topics == ('a', 'b')
+    assert parameters == Parameters.from_flat({'p_hit': 0.7, 'max_iterations': 7, 'range_topics': ('a', 'b')})
+    assert (poses, warnings) == ({}, [])
+
+
+def test_descriptors_have_words_and_bounds() -> None:
+    hit = descriptor(ROWS['p_hit'])
+    assert (hit.floating_point_range[0].from_value, hit.floating_point_range[0].to_value) == (
+        ROWS['p_hit'].low,
+        ROWS['p_hit'].high,
+    )
+    assert not hit.integer_range and hit.additional_constraints == '' and not hit.read_only
+    resolution = descriptor(ROWS['resolution'])
+    assert resolution.read_only and resolution.description == f'{ROWS["resolution"].help} [m]'
+    rounds = descriptor(ROWS['max_iterations'])
+    assert (rounds.integer_range[0].from_value, rounds.integer_range[0].step) == (1, 1)
+    assert rounds.integer_range[0].to_value == ROWS['max_iterations'].high and not rounds.floating_point_range
+    choice = descriptor(ROWS['over_range'])
+    assert 'no_echo' in choice.additional_constraints and not choice.floating_point_range
+    without_unit = next(row for row in TABLE if not row.unit)
+    assert descriptor(without_unit).description == without_unit.help
+    boundless = SimpleNamespace(**{**vars(ROWS['p_hit']), 'high': math.inf, 'range': ''})
+    assert not descriptor(boundless).floating_point_range
+    boundless = SimpleNamespace(**{**vars(ROWS['p_hit']), 'low': -math.inf, 'range': ''})
+    assert not descriptor(boundless).floating_point_range
+
+
+def test_a_former_name_counts_and_the_new_one_wins() -> None:
+    parameters, _, warnings = declare(Declaring(max_sweeps=5))
+    assert parameters.search.max_iterations == 5
+    assert len(warnings) == 1 and 'max_sweeps is called max_iterations now' in warnings[0]
+    node = Declaring(max_sweeps=5, max_iterations=6)
+    parameters, _, warnings = declare(node)
+    assert parameters.search.max_iterations == node.declared['max_iterations'] == 6
+    assert len(warnings) == 1
+
+
+def test_names_that_mean_nothing_are_told_of_and_those_of_ros_are_not() -> None:
+    given = {'p_hitt': 1, 'use_sim_time': True, 'qos_overrides./a.reliability': 'x', 'cut': 3.0, 'sensors.a.poze': 1}
+    node = Declaring()
+    node.given = {name: SimpleNamespace(value=value) for name, value in given.items()}
+    _, poses, warnings = declare(node)
+    assert poses == {}
+    assert sorted(warning.split()[1] for warning in warnings) == ['cut', 'p_hitt', 'sensors.a.poze']
+    assert any('did you mean p_hit?' in warning for warning in warnings)
+    assert any('cut is ignored: it is no longer a parameter' in warning for warning in warnings)
+
+
+@pytest.mark.parametrize('value', [[1, -2, 0.5], (1.0, -2.0, 0.5), array.array('d', [1.0, -2.0, 0.5])])
+def test_poses_of_sensors(value: Any) -> None:
+    node = Declaring()
+    node.given = {'sensors.front.left.pose': SimpleNamespace(value=value)}
+    assert declare(node)[1] == {'front.left': Pose2(1.0, -2.0, 0.5)}
+
+
+@pytest.mark.parametrize(
+    'value',
+    ['abc', [1.0, 2.0], [1.0, 2.0, 3.0, 4.0], [1.0, 2.0, math.nan], [1.0, math.inf, 0.0], ['a', 'b', 'c'], 3, []],
+)
+def test_poses_that_are_none(value: Any) -> None:
+    node = Declaring()
+    node.given = {'sensors.front.pose': SimpleNamespace(value=value)}
+    with pytest.raises(ParameterError, match=r'sensors\.front\.pose: .* is not \[x, y, yaw\]'):
+        declare(node)
+
+
+def test_a_value_out_of_range_at_start() -> None:
+    with pytest.raises(ParameterError, match=r'p_hit: 2\.0 is out of range'):
+        declare(Declaring(p_hit=2.0))
+
+
+def test_what_is_set_at_run_time_is_checked_as_a_whole() -> None:
+    now = Parameters()
+    accepted: list[Parameters] = []
+    check = validator(lambda: now, accepted.append)
+    result = check([RosParameter('p_hit', value=0.7), RosParameter('use_sim_time', value=True)])
+    assert result.successful and accepted == [Parameters.from_flat({'p_hit': 0.7})]
+    for changes, why in (
+        ([('p_hit', 0.5), ('p_rand', 7.0)], 'p_rand'),
+        ([('sigma', 0.1), ('sensors.front.pose', [0.0, 0.0, 0.0])], 'sensors.front.pose is read at start only'),
+    ):
+        result = check([RosParameter(name, value=value) for name, value in changes])
+        assert not result.successful and why in result.reason
+    assert len(accepted) == 1
+
+    def refuse(parameters: Parameters) -> None:
+        raise ParameterError('not now')
+
+    result = validator(lambda: now, refuse)([RosParameter('p_hit', value=0.7)])
+    assert (result.successful, result.reason) == (False, 'not now')
+
+
+def test_a_whole_number_is_taken_for_a_double_where_one_is_wanted() -> None:
+    changes = [
+        RosParameter('sigma', value=1),
+        RosParameter('sigma', value=0.5),
+        RosParameter('max_iterations', value=3),
+        RosParameter('stranger', value=3),
+        RosParameter('p_hit', value='often'),
+    ]
+    found = with_points(changes)
+    kinds = RosParameter.Type
+    assert [change.type_ for change in found] == [
+        kinds.DOUBLE,
+        kinds.DOUBLE,
+        kinds.INTEGER,
+        kinds.INTEGER,
+        kinds.STRING,
+    ]
+    assert [change.name for change in found] == [change.name for change in changes]
+    assert found[0].value == 1.0 and isinstance(found[0].value, float)
