@@ -23,7 +23,7 @@ from forward_grid_mapper.core.common.readings import Readings
 from forward_grid_mapper.core.trajectory.correction import Correction
 from forward_grid_mapper.core.trajectory.following import Follower
 from forward_grid_mapper.core.trajectory.poses import Floats, compose, inverse
-from forward_grid_mapper.core.trajectory.refinement import Refiner
+from forward_grid_mapper.core.trajectory.refinement import Refinement, Refiner
 from forward_grid_mapper.core.trajectory.windows import Odometry
 from forward_grid_mapper.core.warm_up import warm_up
 from forward_grid_mapper.simulation.drift import with_drift
@@ -55,11 +55,11 @@ def part_of(path: Odometry, end: int) -> Odometry:
 
 
 def followed(
-    base: Correction, calibration: dict[str, float], readings: Readings, odometry: Odometry, end: int
+    base: Correction, found: Refinement, readings: Readings, odometry: Odometry, end: int
 ) -> tuple[Floats, list[float]]:
     """Return where each pose of odometry after the end of `base` is said to be as it comes, and ms of each window."""
     first, said, spent = len(base.odometry.stamp), [], []
-    follower = Follower(base, calibration, Parameters())
+    follower = Follower(base, found.calibration, Parameters(), found.noise)
     follower.follow(readings.select(readings.stamp <= base.end), base.odometry)
     for k in range(first, end):
         if k % ASKED == 0:
@@ -74,7 +74,7 @@ def followed(
 
 def run(name: str, readings: Readings, odometry: Odometry, true: Odometry) -> tuple[list[Floats], list[float]]:
     """Print a row; return the distances without anything, kept and followed, and ms of windows."""
-    travel, at, base, calibration = odometry.travel, EVERY, None, {}
+    travel, at = odometry.travel, EVERY
     columns: list[list[Floats]] = [[], [], []]
     spent: list[float] = []
     while at < min(travel[-1], MOST):
@@ -82,12 +82,12 @@ def run(name: str, readings: Readings, odometry: Odometry, true: Odometry) -> tu
         end = int(np.searchsorted(travel, min(at + EVERY, MOST)))
         begun = part_of(odometry, first)
         found = Refiner(Parameters()).run(readings.select(readings.stamp <= begun.stamp[-1]), begun)
-        base, calibration = (Correction(begun, found.trajectory), found.calibration) if found.accepted else (None, {})
+        base = Correction(begun, found.trajectory) if found.accepted else None
         at += EVERY
         if base is None:
             continue
         motion, truth, raw = fitted(base.trajectory.pose, true.pose[:first]), true.pose[first:end], odometry.pose
-        said, more = followed(base, calibration, readings, odometry, end)
+        said, more = followed(base, found, readings, odometry, end)
         spent += more
         start = compose(true.pose[0], inverse(raw[0]))
         columns[0].append(off(start, raw[first:end], truth))

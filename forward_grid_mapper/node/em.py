@@ -47,7 +47,8 @@ class Run:
 
     `stage` and `progress` say where it stands; `ended` is set when its thread has done all that it does for it. `found`
     is called with the maps as soon as they are there, in the thread. `shown` says whether the map so far was published,
-    `asked` whether somebody asked for its end alone.
+    `asked` whether somebody asked for its end alone. `by_itself` says whether nobody has asked for it so far, `fresh`
+    whether it looks at all that there is by now. In `then` is who waits for the run after it.
     """
 
     mapper: Mapper | RefiningMapper
@@ -62,6 +63,9 @@ class Run:
     cancelled: bool = False
     shown: bool = False
     asked: bool = False
+    by_itself: bool = False
+    fresh: Callable[[], bool] = lambda: True
+    then: list[Callable[[Outcome], object]] = field(default_factory=list)
     ended: threading.Event = field(default_factory=threading.Event)
     waiting: list[Callable[[Outcome], object]] = field(default_factory=list)
 

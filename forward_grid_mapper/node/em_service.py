@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import queue
+import threading
 import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
@@ -29,6 +30,9 @@ from .refining import Drive, Found, RefiningMapper
 from .sensor_status import SensorWatch
 from .trajectory import Trajectory
 
+ITS_OWN = 2
+"""Those who wait for the end of a run on its own account, before all others."""
+
 TELLING = 10.0
 """Seconds between two lines in the log while a trajectory is looked for."""
 
@@ -43,6 +47,14 @@ def _waited_for(taken: queue.SimpleQueue[Taken], run: Run) -> Taken:
             raise Cancelled('cancelled before it began')
         with suppress(queue.Empty):
             return taken.get(timeout=0.1)
+
+
+def _tell_all(waiting: list[Callable[[Outcome], object]], why: str) -> None:
+    """Tell those who wait for a run that it does not begin."""
+    told = list(waiting)
+    waiting.clear()
+    for done in told:
+        done(Outcome(None, why))
 
 
 class EmService:
@@ -112,17 +124,42 @@ class EmService:
                 reply.send(True, '; '.join(said))
 
         run = self.current
-        if run is not None:
-            reply.send(False, f'EM runs already ({run}); call again when it has ended')
-        else:
+        if run is None:
             self._start(done)
+        elif run.by_itself and run.fresh() and not run.cancelled:
+            # from here on it is one that was asked for
+            run.by_itself = False
+            run.waiting.append(done)
+        elif run.by_itself:
+            self._give_way(run, done)
+        else:
+            reply.send(False, f'EM runs already ({run}); call again when it has ended')
 
     def run_by_itself(self) -> bool:
         """Begin a run that nobody asked for; return whether it began: not while one goes on, nor without readings."""
         if self.current is not None or not len(self._associator.buffer):
             return False
-        self._start(lambda outcome: None)
+        run = self._start(lambda outcome: self._go_on(run))
+        run.by_itself = True
         return True
+
+    def _give_way(self, run: Run, done: Callable[[Outcome], object]) -> None:
+        """End a run that nobody asked for, and have another one begin then."""
+        run.by_itself = False
+        if not run.cancelled:
+            # who waited for it, as save_maps does, waits for the other one
+            run.then += run.waiting[ITS_OWN:]
+            del run.waiting[ITS_OWN:]
+        run.then.append(done)
+        self.worker.cancel()
+
+    def _go_on(self, run: Run) -> None:
+        """Begin the run that one which has ended gave way to, if it did."""
+        if not run.then:
+            return
+        first, *others = run.then
+        run.then.clear()
+        self._start(first).waiting.extend(others)
 
     def cancel(self, reply: Reply) -> None:
         """Cancel the run that goes on, forget nothing, and answer when it has ended."""
@@ -139,6 +176,7 @@ class EmService:
 
         run.asked = True
         run.waiting.append(ended)
+        _tell_all(run.then, 'EM was cancelled by cancel_em')
         self.worker.cancel()
 
     def when_there_are_maps(self, done: Callable[[Outcome], object]) -> None:
@@ -148,6 +186,8 @@ class EmService:
             done(Outcome(self.maps, ''))
         elif run is not None and not run.cancelled:
             run.waiting.append(done)
+        elif run is not None and run.then:
+            run.then.append(done)
         elif run is not None:
             done(Outcome(None, 'EM is being cancelled; call again when it has ended'))
         else:
@@ -156,6 +196,8 @@ class EmService:
     def reset(self) -> None:
         """Forget the maps, and cancel the run that goes on."""
         self.worker.cancel()
+        if self.current is not None:
+            _tell_all(self.current.then, 'EM was cancelled by reset')
         self._generation = self._publishers.generation
         self.maps, self.found, self.wrong_input, self.last_run = None, None, [], 'none since the reset'
         self.sensors.clear()
@@ -164,11 +206,12 @@ class EmService:
         """Cancel the run that goes on, and wait so long for its end."""
         self.worker.close(seconds)
 
-    def _start(self, done: Callable[[Outcome], object]) -> None:
+    def _start(self, done: Callable[[Outcome], object]) -> Run:
+        """Begin a run; `done` is called with how it ended, before others who come to wait for it."""
         generation, bound = self._publishers.generation, self._associator.buffer.bound
         # what comes while kernels are compiled is mapped as well
         early = not self._kernels.has('EM')
-        taken = [self._take()]
+        taken, begun = [self._take()], threading.Event()
 
         def take_now() -> Taken:
             asked = queue.SimpleQueue[Taken]()
@@ -176,6 +219,7 @@ class EmService:
             return _waited_for(asked, run)
 
         def readings() -> Readings:
+            begun.set()
             if early:
                 taken[0] = take_now()
             return bounded(taken[0][1], bound)
@@ -193,12 +237,18 @@ class EmService:
                 outcome.maps, outcome.message = None, 'EM was cancelled by reset'
             elif outcome.maps is None and run.asked:
                 outcome.message = 'EM was cancelled by cancel_em'
+            elif outcome.maps is None and run.then:
+                outcome.message = 'the run that was begun after some way gave way to run_em'
             self._finish(outcome, taken[0][0])
             if outcome.maps is None and run.shown:
                 self._publishers.publish('ml_map', generation, *before)
 
         parameters = self._parameters()
         mounts = dict(self.mounts())
+
+        def fresh() -> bool:
+            waits = early and not begun.is_set()
+            return parameters is self._parameters() and (waits or taken[0][0] == len(self._associator.buffer))
 
         def drive() -> Drive:
             _, held, odometry = taken[0]
@@ -213,10 +263,11 @@ class EmService:
         start = self.online.so_far() if self.online and self._trajectory.correction is None else None
         # it comes back if the run ends without a map, since the map so far is shown meanwhile
         before = self._publishers.ml_map
-        run = Run(mapper, parameters, readings, found, start)
+        run = Run(mapper, parameters, readings, found, start, fresh=fresh)
         self._generation = generation
         self.worker.start(run, finish)
         run.waiting.append(done)
+        return run
 
     def _take(self) -> Taken:
         buffer = self._associator.buffer

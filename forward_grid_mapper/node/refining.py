@@ -19,6 +19,7 @@ from ..core.maps.log_odds_map import LogOddsMap
 from ..core.maps.map_set import MapSet
 from ..core.trajectory.correction import Correction
 from ..core.trajectory.following import Follower
+from ..core.trajectory.keeping import kept
 from ..core.trajectory.refinement import Refinement, Refiner
 from ..core.trajectory.windows import Odometry
 from ..files.trajectory_text import calibration_words
@@ -40,13 +41,15 @@ class Found(NamedTuple):
 
     `refinement` is None where none was to be found, `correction` where odometry stays. `live` is the live map of the
     drive's readings, None where the one that there is need not be replaced. `follower` goes on from where the drive is
-    by now; None where it is not to be followed.
+    by now; None where it is not to be followed. `kept` says why the run by itself leaves odometry as it is, where the
+    trajectory of an earlier one goes on; otherwise it is empty.
     """
 
     refinement: Refinement | None
     correction: Correction | None
     live: LogOddsMap | None
     follower: Follower | None = None
+    kept: str = ''
 
 
 class RefiningMapper:
@@ -63,7 +66,7 @@ class RefiningMapper:
         parameters: Parameters,
         drive: Callable[[], Drive],
         refine: bool,
-        bent: bool,
+        before: Found | None,
         now: Callable[[], Drive] | None = None,
     ) -> None:
         """Prepare a run.
@@ -75,8 +78,8 @@ class RefiningMapper:
             Called in the thread of the run, once the readings are there.
         refine : bool
             Whether to look for a trajectory; without, odometry stays.
-        bent : bool
-            Whether the live map so far is along another trajectory than odometry's.
+        before : Found or None
+            The trajectory in force, along which the live map is so far; None if it is odometry's.
         now : callable, optional
             Called in the thread of the run, returns the drive so far: what came since the begin is followed.
         """
@@ -84,13 +87,15 @@ class RefiningMapper:
         self._now = now
         self._follower: Follower | None = None
         self._parameters, self._drive = parameters, drive
-        self._to_refine, self._bent = refine, bent
+        self._to_refine, self._before = refine, before
+        self._stop, self._kept = np.zeros(1, np.uint8), ''
         self._mapper, self._refiner = Mapper(parameters), Refiner(parameters)
         self._cancelled = False
 
     def cancel(self) -> None:
         """Make `run` raise `Cancelled` soon; may be called from any thread."""
         self._cancelled = True
+        self._stop[0] = 1
         self._refiner.cancel()
         if self._follower is not None:
             self._follower.cancel()
@@ -120,7 +125,7 @@ class RefiningMapper:
             if refinement.accepted:
                 correction, start = Correction(drive.odometry, refinement.trajectory), None
         live = None
-        if correction is not None or self._bent:
+        if correction is not None or self._before is not None:
             watch('live map along the trajectory', None)
             live = self._live_map(drive.readings, correction)
         maps = self._mapper.run(readings, watch, start)
@@ -130,13 +135,13 @@ class RefiningMapper:
             refinement = replace(refinement, readings=maps.readings)
         if refinement is not None and correction is not None and self._now is not None:
             watch('following', None)
-            self._follow(correction, refinement.calibration, self._now)
-        self.found = Found(refinement, correction, live, self._follower)
+            self._follow(correction, refinement, self._now)
+        self.found = Found(refinement, correction, live, self._follower, self._kept)
         return maps
 
-    def _follow(self, correction: Correction, calibration: dict[str, float], now: Callable[[], Drive]) -> None:
+    def _follow(self, correction: Correction, found: Refinement, now: Callable[[], Drive]) -> None:
         """Follow what was driven while the drive before was looked at; without it the maps are as good."""
-        follower = self._follower = Follower(correction, calibration, self._parameters)
+        follower = self._follower = Follower(correction, found.calibration, self._parameters, found.noise)
         if self._cancelled:
             raise Cancelled('the work was cancelled')
         odometry, readings = now()
@@ -148,9 +153,18 @@ class RefiningMapper:
             follower.obstacle = reason(error)
 
     def _refine(self, readings: Readings, odometry: Odometry, watch: Watch) -> Refinement:
-        return self._refiner.run(
-            readings, odometry, lambda stage, part: watch(f'trajectory ({stage}, {part:.0%})', None)
-        )
+        def say(stage: str, part: float) -> None:
+            watch(f'trajectory ({stage}, {part:.0%})', None)
+
+        found, before = self._refiner.run(readings, odometry, say), self._before
+        if found.accepted or before is None or before.refinement is None or before.correction is None:
+            return found
+        say('that of the run before', 0.0)
+        outcome = kept(before.refinement, before.correction, found, self._parameters, self._stop)
+        if outcome.accepted:
+            self._kept = found.reason
+            return outcome
+        return replace(found, reason=f'{found.reason}; and it is no worse than what the run before found')
 
     def _live_map(self, readings: Readings, correction: Correction | None) -> LogOddsMap:
         live = LogOddsMap(self._parameters)
@@ -170,8 +184,12 @@ def outcome_words(found: Found) -> str:
     if correction is None:
         return f'trajectory as odometry gives it: {refinement.reason}'
     wheels = calibration_words(refinement.calibration)
+    said = 'trajectory refined'
+    if found.kept:
+        said = f'trajectory of the run before kept ({refinement.reason}; by itself this run says: {found.kept})'
     return (
-        f'trajectory refined: odometry was off by {refinement.moved:.2f} m (root mean square), '
+        f'{said}: odometry was off by {refinement.moved:.2f} m (root mean square), '
         f'{correction.moved:.2f} m at the end of the drive, {refinement.loops} places recognised'
         + (f'; {wheels}' if wheels else '')
+        + (f'; {refinement.jumps}' if refinement.jumps else '')
     )

@@ -85,6 +85,8 @@ class Saver:
         options: dict[str, Any] = {}
         if found is not None and found.refinement is not None:
             account.source['trajectory'] = trajectory_data(found.refinement)
+            if found.refinement.unplaced:
+                warnings.append(found.refinement.jumps)
         if found is not None and found.correction is not None:
             assert found.refinement is not None
             texts = trajectory_files(found.refinement, found.correction.odometry)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
@@ -21,6 +21,8 @@ from ..core.maps.log_odds_map import LogOddsMap
 from ..core.messages.message_types import Pose2
 from ..core.messages.pose_association import PoseAssociator
 from ..core.trajectory.correction import Correction
+from ..core.trajectory.jumps import jumps
+from ..core.trajectory.refinement import SHORTEST
 from ..core.trajectory.windows import Odometry
 from ..files.trajectory_text import calibration_words
 from .background import Worker
@@ -36,8 +38,9 @@ MAP = 'map'
 GROWS = 0.5
 """Metres of driving after which the path is published again."""
 
-LONGEST_STEP = 1.0
-"""Metres between two looks at odometry that are driving; more is a jump."""
+AFTER_JUMP = SHORTEST
+"""Metres after a jump of odometry from which on the node refines by itself, if it does at all: then there is something
+to tell by where the robot is."""
 
 LEAST_EVERY = 1.0
 """Metres between two runs that the node begins by itself, so that there is time for run_em between them."""
@@ -45,6 +48,20 @@ LEAST_EVERY = 1.0
 GROWN = 0.1
 """Part of the drive that must be new for the node to refine by itself: a run looks at all of it, so that runs after
 equal ways would cost more and more."""
+
+
+class _Jump(NamedTuple):
+    """A jump of odometry: the stamp after it, nanoseconds, by how far, and after which way of the drive, metres."""
+
+    stamp: int
+    far: float
+    driven: float
+
+    def __str__(self) -> str:
+        return (
+            f'odometry jumped by {self.far:.1f} m: where the robot is on the map is not known until run_em has found '
+            f'it, and what it reads goes to a wrong place; where it was carried away, call reset'
+        )
 
 
 class Trajectory:
@@ -84,7 +101,8 @@ class Trajectory:
         self.refine: Callable[[], bool] = lambda: False
         self.following: Following | None = None
         self.driven = self._refined_at = self._shown_at = 0.0
-        self._at: Pose2 | None = None
+        self._at: tuple[int, Pose2] | None = None
+        self._jump: _Jump | None = None
         self._since = -1
         self._showing = False
 
@@ -125,7 +143,7 @@ class Trajectory:
         if self.following is not None:
             self.following.begin(None)
         self.driven = self._refined_at = self._shown_at = 0.0
-        self._at, newest = None, self._associator.record.newest
+        self._at, self._jump, newest = None, None, self._associator.record.newest
         # the path begins with the drive
         self._since = -1 if newest is None else newest[0]
         self._jumps = self._associator.time_jumps
@@ -139,10 +157,12 @@ class Trajectory:
     ) -> RefiningMapper | Mapper:
         """Return what makes the maps of a run; `drive` returns what it was begun with, `now` what there is by then."""
         self._refined_at = self.driven
-        refine, bent = parameters.node.refine_poses and not self.obstacle, self.correction is not None
-        if not (refine or bent):
+        refine, before = parameters.node.refine_poses and not self.obstacle, None
+        if self.found is not None and self.correction is not None:
+            before = self.found._replace(correction=self.correction)
+        if not refine and before is None:
             return Mapper(parameters)
-        return RefiningMapper(parameters, drive, refine, bent, None if self.following is None else now)
+        return RefiningMapper(parameters, drive, refine, before, None if self.following is None else now)
 
     def adopt(self, found: Found | None, count: int) -> None:
         """Take what was found for the maps of the first `count` readings; None if they are as odometry has it."""
@@ -150,6 +170,10 @@ class Trajectory:
         self.correction = found.correction if found else None
         # the live map belongs to the one who shows it
         self.found = found._replace(live=None, follower=None) if found and found.refinement else None
+        refinement = found.refinement if found else None
+        looked_at = refinement.trajectory.stamp[-1:] if refinement else np.zeros(0, np.int64)
+        if self._jump is not None and (looked_at >= self._jump.stamp).any():
+            self._jump = None
         if self.following is not None:
             self.following.begin(found.follower if found else None)
             if self.following.follower is not None:
@@ -192,9 +216,16 @@ class Trajectory:
             }
         if self.following is not None:
             values |= self.following.values()
-        troubled = self.obstacle or (self.following is not None and self.following.obstacle)
-        level = DiagnosticStatus.WARN if troubled else DiagnosticStatus.OK
         message = self.outcome() or 'as odometry gives it until run_em is called'
+        if self._jump is not None:
+            message = f'{message}; {self._jump}'
+        troubled = (
+            self.obstacle
+            or (self.following is not None and self.following.obstacle)
+            or self._jump is not None
+            or (refinement is not None and refinement.unplaced)
+        )
+        level = DiagnosticStatus.WARN if troubled else DiagnosticStatus.OK
         return [status(f'{name}: trajectory', level, message, name, values)]
 
     def _switch(self, on: bool) -> None:
@@ -210,10 +241,11 @@ class Trajectory:
             return
         if associator.time_jumps != self._jumps:
             self._jumps, self._since = associator.time_jumps, -1
+            self._at = self._jump = None
             self._out.forget()
         frames = self.frame, associator.map_frame, associator.base_frame
         self._out.send(frames, self._correction_at(newest[0]), newest)
-        self._drive_on(newest[1])
+        self._drive_on(*newest)
 
     def _correction_at(self, stamp: int) -> NDArray[np.float64]:
         """Return the pose of odometry's frame on the map, shape (3,), as readings of a stamp are moved."""
@@ -222,20 +254,37 @@ class Trajectory:
         # earlier than the end is what comes after the clock jumped back, as where a bag is played again and again
         return (self.correction if stamp >= self.correction.end else self.correction.until(stamp)).last
 
-    def _drive_on(self, pose: Pose2) -> None:
+    def _drive_on(self, stamp: int, pose: Pose2) -> None:
         """Count the way, and do what is due after it."""
-        step = 0.0 if self._at is None else math.dist(self._at[:2], pose[:2])
+        before, self._at = self._at or (stamp, pose), (stamp, pose)
+        self._count(before, stamp, pose)
         if self.following is not None and self._parameters.node.refine_poses:
             self.following.offer(pose, self._associator.buffer.snapshot(), self._associator.record.snapshot())
-        self._at = pose
-        self.driven += step if step <= LONGEST_STEP else 0.0
         if self.driven - self._shown_at >= GROWS and not self._showing:
             self._show_path()
         every = self._parameters.node.refine_every
         if not every or not self._parameters.node.refine_poses:
             return
-        if self.driven - self._refined_at >= max(every, LEAST_EVERY, GROWN * self.driven) and self.refine():
+        due = max(every, LEAST_EVERY, GROWN * self.driven) <= self.driven - self._refined_at
+        if self._jump is not None and self._jump.driven >= self._refined_at:
+            due = due or self.driven - self._jump.driven >= AFTER_JUMP
+        if due and self.refine():
             self._refined_at = self.driven
+
+    def _count(self, before: tuple[int, Pose2], stamp: int, pose: Pose2) -> None:
+        """Add the way since the last look, which may be long ago where messages come fast, without jumps."""
+        passed = Odometry(*self._associator.record.since(before[0]))
+        at = jumps(passed)
+        if not len(at):
+            self.driven += math.dist(before[1][:2], pose[:2])
+            return
+        steps = np.hypot(*np.diff(passed.pose[:, :2], axis=0).T)
+        far, last = float(steps[at[-1] - 1]), int(at[-1])
+        steps[at - 1] = 0.0
+        begin, self.driven = self.driven + float(steps[:last].sum()), self.driven + float(steps.sum())
+        known, self._jump = self._jump is not None, _Jump(int(passed.stamp[last]), far, begin)
+        if self._parameters.node.refine_poses and not known:
+            self._node.get_logger().warning(str(self._jump))
 
     def _show_path(self) -> None:
         """Have the trajectory published, and behind its end the poses of odometry as they are on the map."""

@@ -16,6 +16,8 @@ from ..core.maps.map_set import MapSet
 from ..core.messages.message_batch import MessageBatch
 from ..core.messages.message_types import NANOSECONDS, Pose2
 from ..core.messages.pose_association import PoseAssociator
+from ..core.messages.robot_path import RobotPath
+from ..core.trajectory.jumps import FASTEST, LONGEST_STEP
 from ..files.quality_warning import thinned
 
 
@@ -146,7 +148,28 @@ class Drive:
     @property
     def path_xy(self) -> NDArray[np.float64]:
         """Where the robot drove, shape (P, 2), metres."""
-        return np.array(self.associator.path, np.float64).reshape(-1, 2)
+        return path_of(self.associator)
+
+
+def path_of(associator: PoseAssociator) -> NDArray[np.float64]:
+    """Return where the robot drove, shape (P, 2), metres: in order of stamps, where odometry came in another one."""
+    points, record = associator.path, associator.record
+    # a clock that jumped back has the record begin anew
+    if record.late and not associator.time_jumps:
+        path = RobotPath()
+        for x, y in record.snapshot()[1][:, :2].tolist():
+            path.extend((x, y))
+        points = path.points
+    return np.array(points, np.float64).reshape(-1, 2)
+
+
+def length_of(associator: PoseAssociator) -> float:
+    """Return the metres that the robot drove; where odometry jumps faster than a robot drives it did not."""
+    whole = np.hypot(*np.diff(path_of(associator), axis=0).T).sum()
+    stamp, pose = associator.record.snapshot()
+    steps = np.hypot(*np.diff(pose[:, :2], axis=0).T)
+    jumped = steps > LONGEST_STEP + FASTEST * np.diff(stamp) / NANOSECONDS
+    return max(float(whole - steps[jumped].sum()), 0.0)
 
 
 def thinning_note(associator: PoseAssociator) -> list[str]:

@@ -15,7 +15,7 @@ from ..core.messages.rep117 import REASONS
 from ..files.journal_format import Contents
 from ..files.journal_reader import read
 from ..files.output_folder import readable
-from .drive import WHOLE, Drive, LogOddsMapOfAll, Part, thinning_note
+from .drive import WHOLE, Drive, LogOddsMapOfAll, Part, length_of, thinning_note
 
 MOST_NAMED = 10
 """Parameters that a warning names."""
@@ -74,7 +74,7 @@ def read_journal(
         'mounts_from': 'the journal',
         'stamps': [int(first), int(last)],
         'duration_s': (last - first) / NANOSECONDS,
-        'path_m': sum(math.dist(a, b) for a, b in zip(associator.path, associator.path[1:], strict=False)),
+        'path_m': length_of(associator),
         'counts': {
             'received': associator.received,
             'accepted': len(associator.buffer),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
@@ -20,7 +19,7 @@ from ..core.messages.pose_association import PoseAssociator
 from ..core.messages.rep117 import ODOMETRY_REASONS, REASONS
 from ..files.journal import drive_file
 from ..files.output_folder import readable
-from .drive import WHOLE, Drive, LogOddsMapOfAll, Part, Spans, thinning_note
+from .drive import WHOLE, Drive, LogOddsMapOfAll, Part, Spans, length_of, thinning_note
 from .given_poses import GivenPoses
 from .journal_drive import read_journal
 
@@ -169,7 +168,7 @@ def read_drive(
         'extrinsics': lookup.poses,
         'stamps': [int(stamps.min()), int(stamps.max())],
         'duration_s': float(stamps.max() - stamps.min()) / NANOSECONDS,
-        'path_m': sum(math.dist(a, b) for a, b in zip(associator.path, associator.path[1:], strict=False)),
+        'path_m': length_of(associator),
         'counts': {
             'received': associator.received,
             'accepted': len(associator.buffer),

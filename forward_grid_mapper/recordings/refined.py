@@ -160,6 +160,9 @@ def refine_drives(
         source = drives.source['drives'][number - 1] if several else drive.source
         source['trajectory'] = trajectory_data(outcome, number if several else None, fits, known)
         source['trajectory']['calibrated'] = given.file if given and _moved(poses, outcome) else ''
+        if outcome.unplaced:
+            name = f'{readable(drive.source["bag"])}: ' if several else ''
+            drives.source['warnings'].append(f'{name}{outcome.jumps}')
     return RefinedDrives(drives, tuple(odometry), tuple(outcomes), tuple(told))
 
 
@@ -171,15 +174,20 @@ def _told(
     watch: Watch,
     given: Given | None,
 ) -> dict[str, Told]:
-    if not outcome.accepted:
+    if not outcome.accepted or not outcome.calibration:
         return {}
     watch('what the drive tells of its odometry', 0.0)
-    readings, stop = drive.associator.readings, np.zeros(1, np.uint8)
+    readings, trajectory, stop = drive.associator.readings, outcome.trajectory, np.zeros(1, np.uint8)
+    if outcome.stretch is not None:
+        # wheels say nothing of what lies beyond a jump
+        begin, end = outcome.stretch
+        readings = readings.select((readings.stamp >= begin) & (readings.stamp <= end))
+        odometry, trajectory = odometry.between(begin, end), trajectory.between(begin, end)
     if given is None:
-        return certain(readings, odometry, outcome.trajectory, outcome.calibration, parameters, stop)
+        return certain(readings, odometry, trajectory, outcome.calibration, parameters, stop)
     applied = _calibrated(odometry, given)
     readings = replaced(readings, odometry, applied)
-    told = certain(readings, applied, outcome.trajectory, outcome.calibration, parameters, stop)
+    told = certain(readings, applied, trajectory, outcome.calibration, parameters, stop)
     return after(given.calibration, told)
 
 

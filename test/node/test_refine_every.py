@@ -37,13 +37,33 @@ def test_it_refines_by_itself_after_some_way(
     assert 'trajectory refined' in node.em.last_run
     first = node.em.maps
     robot.drive(140, 20)
-    robot.until(lambda: node.trajectory._at.x > 0.158)
+    robot.until(lambda: node.trajectory._at[1].x > 0.158)
     assert node.em.maps is first and node.em.current is None
     robot.drive(160, 120)
     robot.until(lambda: node.em.maps is not first and node.em.current is None)
     # a service call begins the way anew
     assert robot.call(node.em.run_em)[0]
     assert node.trajectory.driven - node.trajectory._refined_at < 0.05
+
+
+def test_it_refines_soon_after_a_jump(
+    inside: Callable[..., Inside], quick: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(trajectory, 'AFTER_JUMP', 0.1)
+    robot = inside(refine_poses=True, refine_every=50.0).start()
+    node = robot.node
+    begin(robot)
+    robot.drive(1, 149)
+    robot.until(lambda: node.trajectory.driven > 0.14)
+    assert node.em.current is None and node.em.maps is None
+    # from 0.15 m to 5.15 m
+    for k in range(150, 300):
+        robot.odometry(100.0 + 0.05 * k, 5.0 + 0.001 * k)
+        robot.range(100.0 + 0.05 * k)
+    robot.until(lambda: node.em.maps is not None and node.em.current is None)
+    first = node.em.maps
+    robot.until(lambda: node.trajectory._at[1].x > 5.298)
+    assert node.em.maps is first and node.em.current is None, 'once is enough'
 
 
 def test_it_does_not_refine_at_every_step(inside: Callable[..., Inside], quick: Any) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,8 @@ from inside import Inside
 from refined_robot import HeldRun, assert_live, live_of, odometry_of, refined
 
 from forward_grid_mapper.core.common.errors import Cancelled
+from forward_grid_mapper.core.trajectory import keeping
+from forward_grid_mapper.core.trajectory.holding_out import Gain
 from forward_grid_mapper.core.trajectory.windows import Odometry
 from forward_grid_mapper.node import refining
 
@@ -68,13 +71,78 @@ def test_a_refusal_leaves_everything_as_odometry_has_it(inside: Callable[..., In
     assert 'rajectory' not in plain.node.em.last_run
 
 
-def test_a_refusal_after_a_trajectory_goes_back_to_odometry(inside: Callable[..., Inside], quick: Any) -> None:
+def test_a_refusal_after_a_trajectory_keeps_it(inside: Callable[..., Inside], quick: Any) -> None:
+    robot, bent = refined(inside(refine_poses=True).start())
+    quick.accepts = False
+    for first in (200, 220):
+        robot.drive(first, 20)
+        answer = robot.call(robot.node.em.run_em)
+        assert answer[0]
+        assert 'trajectory of the run before kept' in answer[1] and 'the test says so' in answer[1]
+        assert robot.node.trajectory.correction.end == odometry_of(robot).stamp[-1], 'it goes on to the end'
+        assert_live(robot, bent)
+    status = robot.status('trajectory')
+    assert 'kept' in status['message'] and 'the test says so' in status['message']
+    assert status['places recognised'] == '3', 'of the run that found it'
+    assert robot.call(robot.node.saver.save_maps)[0]
+    # what a run finds by itself takes its place
+    quick.accepts = True
+    assert robot.call(robot.node.em.run_em)[0]
+    assert 'kept' not in robot.node.em.last_run
+    assert_live(robot, odometry_of(robot))
+
+
+def test_it_goes_back_to_odometry_where_this_is_better(
+    inside: Callable[..., Inside], quick: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
     robot, _ = refined(inside(refine_poses=True).start())
     quick.accepts = False
+    monkeypatch.setattr(keeping, '_odometry_better', lambda *arguments: Gain(0.1, 0.04))
     robot.drive(200, 20)
-    assert robot.call(robot.node.em.run_em)[0]
+    answer = robot.call(robot.node.em.run_em)
     assert robot.node.trajectory.correction is None
     assert_live(robot, None)
+    assert 'as odometry gives it: the test says so; and it is no worse than what the run before found' in answer[1]
+
+
+def test_a_jump_of_odometry_is_warned_of_until_a_run_has_looked_at_it(
+    inside: Callable[..., Inside], quick: Any
+) -> None:
+    robot, _ = refined(inside(refine_poses=True).start())
+    node = robot.node
+    assert robot.status('trajectory')['level'] == OK
+    robot.odometry(111.0, 9.0)
+    robot.odometry(111.05, 9.0)
+    robot.until(lambda: robot.status('trajectory')['level'] == WARN)
+    message = robot.status('trajectory')['message']
+    assert 'trajectory refined' in message and 'odometry jumped by 8.8 m' in message
+    assert 'run_em' in message and 'reset' in message
+    assert node.trajectory.driven < 1.0, 'nobody drove that'
+    robot.range(111.02)
+    robot.until(lambda: not node.intake.busy)
+    assert robot.call(node.em.run_em)[0]
+    assert robot.status('trajectory')['level'] == OK
+    robot.odometry(112.0, 0.0)
+    robot.until(lambda: robot.status('trajectory')['level'] == WARN)
+    robot.call(node.reset)
+    assert robot.status('trajectory')['level'] == OK
+
+
+def test_what_a_run_could_not_place_is_warned_of(
+    inside: Callable[..., Inside], quick: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = quick.run
+
+    def unplaced(*arguments: Any) -> Any:
+        return replace(run(*arguments), jumps='odometry jumps, and it is not known', unplaced=True)
+
+    monkeypatch.setattr(quick, 'run', unplaced)
+    robot, _ = refined(inside(refine_poses=True).start())
+    status = robot.status('trajectory')
+    assert status['level'] == WARN and 'odometry jumps, and it is not known' in status['message']
+    assert 'odometry jumps, and it is not known' in robot.node.em.last_run
+    saved = Path(robot.call(robot.node.saver.save_maps)[1].split(', ')[0]).parent
+    assert 'odometry jumps, and it is not known' in (saved / 'report.txt').read_text().replace('\n', ' ')
 
 
 def test_it_can_be_switched_on_and_off_between_runs(inside: Callable[..., Inside], quick: Any) -> None:

@@ -39,6 +39,11 @@ class OdometryRecord:
     ----------
     most : int
         Poses that are kept at the most; 0 is no bound.
+
+    Attributes
+    ----------
+    late : int
+        Poses that came after one of a later stamp, or of the same.
     """
 
     def __init__(self, most: int = MOST_POSES) -> None:
@@ -64,6 +69,7 @@ class OdometryRecord:
     def clear(self) -> None:
         """Forget every pose."""
         self._size, self._next, self._anew = 0, 0, False
+        self.late = 0
         self._before = np.iinfo(np.int64).min
         self._late: dict[int, Pose2] = {}
         self._stamp = np.empty(1024, np.int64)
@@ -74,6 +80,7 @@ class OdometryRecord:
         size = self._size
         if size and stamp <= self._stamp[size - 1]:
             self._late[stamp] = pose
+            self.late += 1
             if len(self._late) >= MOST_LATE:
                 self._sort_in()
             return
@@ -126,6 +133,11 @@ class OdometryRecord:
             return stamp, pose
         begin = max(int(np.searchsorted(stamp, first, side='right')) - 1, 0)
         return stamp[begin:], pose[begin:]
+
+    def since(self, stamp: int) -> tuple[NDArray[np.int64], Floats]:
+        """Return stamps and poses from one stamp on, as `snapshot` does, without those that came late of late."""
+        begin = int(np.searchsorted(self._stamp[: self._size], stamp))
+        return self._stamp[begin : self._size], self._pose[begin : self._size]
 
     def _sort_in(self) -> None:
         """Sort in what came late; into copies, since the columns are those of snapshots."""

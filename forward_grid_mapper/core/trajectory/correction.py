@@ -15,7 +15,7 @@ import numpy as np
 
 from ..common.readings import Readings
 from .local_map import at_poses
-from .poses import Floats, compose, inverse
+from .poses import Floats, compose, inverse, relative
 from .refinement import replaced
 from .windows import Odometry
 
@@ -61,6 +61,15 @@ class Correction:
         return Correction(
             Odometry(before.stamp[:end], before.pose[:end]), Odometry(after.stamp[:end], after.pose[:end])
         )
+
+    def along(self, odometry: Odometry) -> Odometry:
+        """Return poses of odometry as they are on the map, at the same stamps, which need not be those known."""
+        pose, early = compose(self.last, odometry.pose), odometry.stamp <= self.end
+        stamp = odometry.stamp[early]
+        off = relative(self.odometry.at(stamp), odometry.pose[early])
+        pose[early] = compose(self.trajectory.at(stamp), off)
+        pose[:, 2] = np.unwrap(pose[:, 2])
+        return Odometry(odometry.stamp, pose)
 
     def apply(self, readings: Readings) -> Readings:
         """Return readings that odometry placed where they belong on the map."""

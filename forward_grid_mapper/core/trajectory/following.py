@@ -26,6 +26,7 @@ from ..runtime.cancelling import check
 from .correction import Correction
 from .heading import yaws_of_votes
 from .holding_out import gain
+from .jumps import jumps, since_jump
 from .likelihood import scores
 from .local_map import at_poses, for_matching, local_map
 from .matching import grid_around, measure
@@ -33,7 +34,7 @@ from .odometry_model import CALIBRATION, Noise, calibrated, covariances, motions
 from .passes import BEHIND, BLOCK
 from .pose_graph import Edges, Graph, Yaws, joined, no_edges, solve
 from .poses import Floats, axes_at, compose, interpolated, relative
-from .refinement import LEAST_SIGMAS, LONGEST_STEP, MOST_WORSE
+from .refinement import LEAST_SIGMAS, MOST_WORSE, SHORTEST
 from .scans import FEWEST_ON_MAP, Scans
 from .solving import LEAST_YAW, UNSEEN
 from .wall_distances import Distances
@@ -108,6 +109,9 @@ class Follower:
     calibration : mapping of str to float
         Of its odometry, by the names of `odometry_model`; those that are missing are 0.
     parameters : Parameters
+    noise : float
+        By how much the yaw of odometry strays, radians a √metre, as the whole drive says; 0 if it is not known. What
+        `odometry_noise` says goes before.
 
     Attributes
     ----------
@@ -123,13 +127,19 @@ class Follower:
         Why nothing is followed any more, in words; empty while it is.
     """
 
-    def __init__(self, correction: Correction, calibration: Mapping[str, float], parameters: Parameters) -> None:
+    def __init__(
+        self,
+        correction: Correction,
+        calibration: Mapping[str, float],
+        parameters: Parameters,
+        noise: float = 0.0,
+    ) -> None:
         self.correction = self._before = self._proven = self._now = correction
         self.kept, self.windows, self.places, self.obstacle = False, 0, 0, ''
         self._parameters, self._stop = for_matching(parameters), np.zeros(1, np.uint8)
         self._calibration = np.array([calibration.get(name, 0.0) for name in CALIBRATION])
-        told = parameters.association.odometry_noise
-        self._noise = Noise(yaw=max(LEAST_YAW, UNSEEN * told)) if told else Noise()
+        known = parameters.association.odometry_noise or noise
+        self._noise = Noise(yaw=max(LEAST_YAW, UNSEEN * known)) if known else Noise()
         self._tail: _Tail | None = None
         self._axes = np.zeros(3)
         self._past = Readings.from_columns(z=[], x=[], y=[], yaw=[], z_max=[], half_angle=[])
@@ -157,31 +167,44 @@ class Follower:
             If `cancel` was called.
         """
         was, newest = self.correction, readings.stamp.max(initial=0)
-        tail = self._tail = self._tail or self._begun(readings)
-        while not self.obstacle:
+        if self._tail is None and not self.obstacle:
+            self._tail = self._begun(readings)
+        tail = self._tail
+        while tail is not None and not self.obstacle:
             check(self._stop)
             whole = _continued(tail.odometry, odometry)
             u = _steps(whole)
             end = int(np.searchsorted(u, len(tail.nodes) + 1))
             if end == len(u) or whole.stamp[end] + LATE > newest:
                 break
-            longest = np.hypot(*np.diff(whole.pose[: end + 1, :2], axis=0).T).max()
-            if longest > LONGEST_STEP:
-                self.obstacle = f'odometry jumped by {longest:.1f} m'
+            part = Odometry(whole.stamp[: end + 1], whole.pose[: end + 1])
+            if len(at := jumps(part)):
+                far = math.dist(*part.pose[at[0] - 1 : at[0] + 1, :2].tolist())
+                self.obstacle = f'odometry jumped by {far:.1f} m'
                 break
-            tail = self._tail = self._step(tail, readings, Odometry(whole.stamp[: end + 1], whole.pose[: end + 1]))
+            tail = self._tail = self._step(tail, readings, part)
         return self.correction is not was
 
-    def _begun(self, readings: Readings) -> _Tail:
+    def _begun(self, readings: Readings) -> _Tail | None:
         """Return the tail where the whole drive ends, and remember what was mapped before it."""
-        path, odometry = self.correction.trajectory, self.correction.odometry
-        windows = cut(in_canonical_order(readings.select(readings.stamp <= self.correction.end)), odometry)
+        path, whole = self.correction.trajectory, self.correction.odometry
+        odometry = since_jump(whole)
+        if odometry is not whole and odometry.travel[-1] < SHORTEST:
+            self.obstacle = f'odometry jumped, and the robot drove no more than {odometry.travel[-1]:.1f} m after that'
+            return None
+        early = readings.stamp < odometry.stamp[0]
+        driven = (readings.stamp <= self.correction.end) & ~early
+        windows = cut(in_canonical_order(readings.select(driven)), odometry)
         nodes = path.at(windows.node_stamp)
         self._axes = np.array([0.0, 0.0, direction_of_walls(windows, nodes)])
         begin = max(len(windows) - SETTLED, 0)
         sensors = compose(path.at(windows.readings.stamp), windows.mount)
         past = at_poses(windows.readings, relative(self._axes, sensors))
         self._past = past.select(slice(0, windows.first[begin]))
+        if early.any():
+            before = self.correction.apply(in_canonical_order(readings.select(early)))
+            sensors = np.stack([before.x, before.y, before.yaw], axis=1)
+            self._past = _both(at_poses(before, relative(self._axes, sensors)), self._past)
         nodes = relative(self._axes, nodes[begin:])
         nodes[:, 2] = np.unwrap(nodes[:, 2])
         return _Tail(_from_step(odometry, begin), nodes, len(nodes), no_edges())

@@ -11,20 +11,24 @@ judgement       what was held out and where walls stand must speak for the traje
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..common.parameters import Parameters
 from ..common.readings import Readings
 from ..runtime.cancelling import check
 from .heading import NOISES, Heading, heading
 from .holding_out import Gain, blocks_of, foreseen, gain, held_out, held_out_blocks
+from .jumps import MOST_JUMPS, UNKNOWN, Begin, Part, begins_of, jumps, parts_at, words
 from .local_map import at_poses, for_matching
 from .odometry_model import CALIBRATION
 from .passes import BLOCK
 from .poses import Floats, compose, inverse, relative
+from .registration import moved_to
 from .scans import Scans
 from .solving import Solver
 from .walls import wall_votes
@@ -32,9 +36,6 @@ from .windows import Odometry, Windows, corrected, cut
 
 SHORTEST = 8.0
 """Metres of a drive below which nothing is refined: its drift is small, and there is little to judge it by."""
-
-LONGEST_STEP = 1.0
-"""Metres between two poses of odometry, beyond which it jumped."""
 
 FEWEST_READINGS = 200
 
@@ -100,6 +101,14 @@ class Refinement:
     lost : bool
         Whether odometry is off by so much that its heading could not be followed: then it stays, but nothing should be
         fitted to it.
+    jumps : str
+        What became of jumps of odometry, in words; empty where there are none.
+    unplaced : bool
+        Whether it is not known where the robot was after one of them.
+    stretch : tuple of int, optional
+        First and last stamp of what `calibration` and `noise` are of; None for the whole drive.
+    noise : float
+        By how much the yaw of odometry strays, radians a √metre, as walls say; 0 if they say nothing.
     """
 
     accepted: bool
@@ -112,6 +121,10 @@ class Refinement:
     loops: int = 0
     gain: float = 0.0
     lost: bool = False
+    noise: float = 0.0
+    jumps: str = ''
+    unplaced: bool = False
+    stretch: tuple[int, int] | None = None
 
 
 class Refiner:
@@ -144,6 +157,30 @@ class Refiner:
             If `cancel` was called.
         """
         self._watch = watch
+        jumped_to = jumps(odometry)
+        if not len(jumped_to):
+            return self._whole(readings, odometry)
+        reason = without_times(readings, odometry)
+        if not reason and len(jumped_to) > MOST_JUMPS:
+            reason = f'odometry jumps {len(jumped_to)} times: it is no wheel odometry, or messages are missing'
+        if reason:
+            return Refinement(False, reason, readings, odometry, {})
+        return self._in_parts(readings, odometry, jumped_to)
+
+    def _in_parts(self, readings: Readings, odometry: Odometry, jumped_to: NDArray[np.int64]) -> Refinement:
+        """Return the trajectory of a drive whose odometry jumps: of each part by itself, each on the map of others."""
+        watch, cuts, outcomes = self._watch, parts_at(readings, odometry, jumped_to), []
+        for k, (own, part) in enumerate(cuts, 1):
+            self._watch = partial(_named, watch, f'part {k} of {len(cuts)}, ')
+            outcomes.append(self._whole(own, part))
+        self._watch = watch
+        self._say('what follows jumps of odometry')
+        parts = [Part(o.readings, part, o.trajectory, o.lost) for (_, part), o in zip(cuts, outcomes, strict=True)]
+        begins = begins_of(parts, self._parameters, self._stop)
+        return joined_parts(readings, odometry, parts, outcomes, begins)
+
+    def _whole(self, readings: Readings, odometry: Odometry) -> Refinement:
+        """Return the trajectory of a drive whose odometry does not jump."""
         reason = unfit(readings, odometry)
         if reason:
             return Refinement(False, reason, readings, odometry, {})
@@ -180,8 +217,8 @@ class Refiner:
         if moved < LEAST_MOVED:
             reason = f'odometry is off by {moved:.2f} m, which is no more than sonar can tell'
             return Refinement(False, reason, readings, odometry, named, gain=better.mean)
-        placed = replaced(readings, odometry, trajectory)
-        return Refinement(True, said, placed, trajectory, named, moved, turned, len(loops), better.mean)
+        placed, noise = replaced(readings, odometry, trajectory), walls.drifts.noise
+        return Refinement(True, said, placed, trajectory, named, moved, turned, len(loops), better.mean, noise=noise)
 
     def _say(self, stage: str) -> Callable[[float], None]:
         def progress(part: float) -> None:
@@ -229,20 +266,24 @@ class Refiner:
         return best
 
 
-def unfit(readings: Readings, odometry: Odometry) -> str:
-    """Return why a drive cannot be refined; empty if it can."""
+def without_times(readings: Readings, odometry: Odometry) -> str:
+    """Return why odometry does not tell where each reading was taken; empty if it does."""
     if not len(odometry.stamp):
         return 'the poses of odometry are not at hand, as in a journal'
     early, late = readings.stamp.min(initial=odometry.stamp[0]), readings.stamp.max(initial=odometry.stamp[-1])
     if early < odometry.stamp[0] or late > odometry.stamp[-1]:
         return "there are readings of a time that has no odometry, as where odometry's clock jumped"
+    return ''
+
+
+def unfit(readings: Readings, odometry: Odometry) -> str:
+    """Return why a drive cannot be refined; empty if it can."""
+    if reason := without_times(readings, odometry):
+        return reason
     if len(odometry.stamp) < 2 or odometry.travel[-1] < SHORTEST:
         return (
             f'the drive is {odometry.travel[-1]:.1f} m long; from {SHORTEST:g} m on odometry drifts enough to be told'
         )
-    steps = np.hypot(*np.diff(odometry.pose[:, :2], axis=0).T)
-    if steps.max() > LONGEST_STEP:
-        return f'odometry jumps by {steps.max():.1f} m: it is no wheel odometry, or messages are missing'
     if len(readings) < FEWEST_READINGS:
         return f'there are {len(readings)} readings; it takes {FEWEST_READINGS}'
     if readings.echo.mean() < LEAST_ECHOES:
@@ -260,6 +301,51 @@ def refined(odometry: Odometry, windows: Windows, nodes: Floats) -> Odometry:
     pose = compose(home, pose)
     pose[:, 2] = np.unwrap(pose[:, 2])
     return Odometry(odometry.stamp, pose)
+
+
+def joined_parts(
+    readings: Readings,
+    odometry: Odometry,
+    parts: Sequence[Part],
+    outcomes: Sequence[Refinement],
+    begins: Sequence[Begin],
+) -> Refinement:
+    """Return what became of a drive whose parts were refined each by itself, and begin where `begins` says."""
+    said, unplaced = words(begins, parts), any(begin.how == UNKNOWN for begin in begins[1:])
+    taken = [k for k, outcome in enumerate(outcomes) if outcome.accepted]
+    best = max(taken, key=lambda k: float(parts[k].odometry.travel[-1]), default=0)
+    of, span = outcomes[best], parts[best].odometry.stamp
+    reason = f'{said}; {of.reason}' if of.reason else said
+    same = all(
+        np.allclose(begin.pose, part.odometry.pose[0], atol=1e-9) for begin, part in zip(begins, parts, strict=True)
+    )
+    if not taken and same:
+        lost = any(outcome.lost for outcome in outcomes)
+        return Refinement(False, reason, readings, odometry, {}, lost=lost, jumps=said, unplaced=unplaced)
+    pose = np.concatenate([moved_to(begin.pose, part.path.pose) for begin, part in zip(begins, parts, strict=True)])
+    pose[:, 2] = np.unwrap(pose[:, 2])
+    trajectory = Odometry(odometry.stamp, pose)
+    moved, turned = differences(odometry, trajectory)
+    loops = sum(outcome.loops for outcome in outcomes)
+    return Refinement(
+        True,
+        reason,
+        replaced(readings, odometry, trajectory),
+        trajectory,
+        of.calibration if taken else {},
+        moved,
+        turned,
+        loops,
+        of.gain,
+        noise=of.noise,
+        jumps=said,
+        unplaced=unplaced,
+        stretch=(int(span[0]), int(span[-1])),
+    )
+
+
+def _named(watch: Watch, name: str, stage: str, part: float) -> None:
+    watch(name + stage, part)
 
 
 def replaced(readings: Readings, odometry: Odometry, trajectory: Odometry) -> Readings:

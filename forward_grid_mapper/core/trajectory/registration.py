@@ -44,6 +44,9 @@ BLOCKS = 40
 FEWEST = 5
 """Readings of a piece that is compared."""
 
+SILENT = 1e-6
+"""Nats a reading of a block that says nothing, since all of it is new."""
+
 LEAST_SIGMAS = 2.3
 """Standard errors by which readings must be foreseen better, as for trajectories."""
 
@@ -85,21 +88,71 @@ def register(
     Cancelled
         If `stop` was set.
     """
-    parameters = for_matching(parameters)
-    model, resolution = parameters.model, parameters.grid.resolution
-    around = local_map(bounded(others, ON_MAP), parameters, stop)
-    readings = readings.select(np.argsort(readings.stamp, kind='stable'))
-    sensors = relative(begin, np.stack([readings.x, readings.y, readings.yaw], axis=1))
-    scan = make_scan(readings, sensors, model, resolution, UNKNOWN * hit_probability(model, resolution))
-    far = max(float(np.sqrt((sensors[:, :2] ** 2).sum(1).mean())), 1.0)
-    found, reach, steps = begin, SIGMAS * SIGMA, np.array([STEP, STEP, STEP / far])
-    information = np.diag(SIGMA**-2.0)
-    for asked in ASKED[:LEVELS]:
-        poses = grid_around(found, reach, (steps[0], steps[1], steps[2]))
-        found = _best(scan, around, poses, begin, information, asked)
-        reach, steps = steps, FINER * steps
-    better = gain(_foreseen(scan, around, begin), _foreseen(scan, around, found))
+    around = OnMap(readings, begin, others, parameters, stop)
+    found = around.search(begin, SIGMA)
+    better = gain(around.foreseen(begin, BLOCKS), around.foreseen(found, BLOCKS))
     return Registration(found if better.sigmas >= LEAST_SIGMAS else begin, better)
+
+
+class OnMap:
+    """A drive as one scan, to be put on the map of others.
+
+    The parameters are those of `register`; `begin` is where the drive begins as its readings are placed.
+    """
+
+    def __init__(
+        self, readings: Readings, begin: Floats, others: Readings, parameters: Parameters, stop: NDArray[np.uint8]
+    ) -> None:
+        parameters = for_matching(parameters)
+        model, resolution = parameters.model, parameters.grid.resolution
+        self._around = local_map(bounded(others, ON_MAP), parameters, stop)
+        readings = readings.select(np.argsort(readings.stamp, kind='stable'))
+        sensors = relative(begin, np.stack([readings.x, readings.y, readings.yaw], axis=1))
+        self._scan = make_scan(readings, sensors, model, resolution, UNKNOWN * hit_probability(model, resolution))
+        self._far = _far(sensors[:, :2])
+
+    def search(self, begin: Floats, sigma: Floats, blocks: int = 0) -> Floats:
+        """Return the best begin near one, shape (3,), with these σ a priori: metres, metres, radians.
+
+        With `blocks`, readings are asked only of those blocks that lie on the map.
+        """
+        scan, far = self._scan, self._far
+        if blocks:
+            parts = np.array_split(scan.readings, blocks)
+            told = [p for p, value in zip(parts, self.foreseen(begin, blocks), strict=True) if abs(value) > SILENT]
+            if not told:
+                return begin
+            scan = Scan(np.concatenate(told), scan.weight)
+            far = _far(np.stack([scan.readings['x'], scan.readings['y']], axis=1))
+        found, reach, steps = begin, SIGMAS * sigma, np.array([STEP, STEP, STEP / far])
+        information = np.diag(sigma**-2.0)
+        for asked in ASKED[:LEVELS]:
+            poses = grid_around(found, reach, (steps[0], steps[1], steps[2]))
+            found = _best(scan, self._around, poses, begin, information, asked)
+            reach, steps = steps, FINER * steps
+        return found
+
+    def of_each(self, begin: Floats, count: int) -> Floats:
+        """Return the log ratio of each of the first `count` readings, in order of time."""
+        readings, weight = self._scan.readings[:count], self._scan.weight
+        each = [scores(Scan(readings[k : k + 1], weight), self._around, begin[None])[0] for k in range(len(readings))]
+        return np.array(each)
+
+    def foreseen(self, begin: Floats, blocks: int) -> Floats:
+        """Return the mean log ratio of the readings of each of so many blocks, in order of time, shape (blocks,).
+
+        It is NaN where they are few.
+        """
+        out = np.full(blocks, np.nan)
+        for k, part in enumerate(np.array_split(self._scan.readings, blocks)):
+            if len(part) >= FEWEST:
+                out[k] = scores(Scan(part, self._scan.weight), self._around, begin[None])[0] / len(part)
+        return out
+
+
+def _far(xy: Floats) -> float:
+    """Return how far readings are from the begin of the drive, metres."""
+    return max(float(np.sqrt((xy**2).sum(1).mean())), 1.0)
 
 
 def _best(scan: Scan, around: LocalMap, poses: Floats, begin: Floats, information: Floats, asked: int) -> Floats:
@@ -122,12 +175,3 @@ def readings_moved(readings: Readings, before: Floats, begin: Floats) -> Reading
     """Return readings of a drive that began at `before`, shape (3,), as they are if it begins at `begin`."""
     sensors = np.stack([readings.x, readings.y, readings.yaw], axis=1)
     return at_poses(readings, compose(begin, relative(before, sensors)))
-
-
-def _foreseen(scan: Scan, around: LocalMap, pose: Floats) -> Floats:
-    """Return the mean log ratio of the readings of each piece of the drive, shape (BLOCKS,); NaN where few are."""
-    out = np.full(BLOCKS, np.nan)
-    for k, part in enumerate(np.array_split(scan.readings, BLOCKS)):
-        if len(part) >= FEWEST:
-            out[k] = scores(Scan(part, scan.weight), around, pose[None])[0] / len(part)
-    return out

@@ -66,6 +66,11 @@ class Odometry:
         """Return the poses at stamps, shape (N, 3)."""
         return interpolated(self.seconds(stamp), self.seconds(self.stamp), self.pose)
 
+    def between(self, first: int, last: int) -> Odometry:
+        """Return the poses from one stamp to another, nanoseconds, both included."""
+        within = (self.stamp >= first) & (self.stamp <= last)
+        return Odometry(self.stamp[within], self.pose[within])
+
     @property
     def travel(self) -> Floats:
         """Metres driven until each pose."""

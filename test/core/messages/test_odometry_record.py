@@ -31,6 +31,10 @@ def test_any_order_gives_what_a_dictionary_holds() -> None:
         assert pose.tolist() == [list(known[s]) for s in sorted(known)]
         assert len(record) == len(known), 'those that came late are in their places'
         assert record.newest == (max(known), known[max(known)])
+        first = rng.randrange(max(known) + 20)
+        late, late_pose = record.since(first)
+        assert late.tolist() == [s for s in sorted(known) if s >= first]
+        assert late_pose.tolist() == [list(known[s]) for s in sorted(known) if s >= first]
         for now_stamp, now_pose, then_stamp, then_pose in snapshots:
             assert np.array_equal(now_stamp, then_stamp)
             assert np.array_equal(now_pose, then_pose)

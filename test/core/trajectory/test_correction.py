@@ -57,6 +57,14 @@ def test_readings_go_where_the_robot_was(seed: int) -> None:
     # what is not moved is not changed
     for name in ('z', 'stamp', 'sensor', 'half_angle'):
         assert np.array_equal(getattr(moved, name), getattr(outer, name))
+    # a path of the same odometry at other stamps
+    stamps = np.sort(np.r_[odometry.stamp[::3], rng.integers(odometry.stamp[0], odometry.stamp[-1], 20)])
+    along = correction.along(Odometry(stamps, odometry.at(stamps)))
+    assert along.pose[:, :2] == pytest.approx(trajectory.at(stamps)[:, :2])
+    assert np.abs(wrapped(along.pose[:, 2] - trajectory.at(stamps)[:, 2])).max() < 1e-9
+    assert np.abs(np.diff(along.pose[:, 2])).max(initial=0.0) <= np.pi
+    beyond = correction.along(later).pose[later.stamp > odometry.stamp[-1]]
+    assert beyond[:, :2] == pytest.approx(compose(correction.last, later.pose[later.stamp > odometry.stamp[-1]])[:, :2])
     way = correction.path_of(np.r_[odometry.stamp, later.stamp], np.r_[odometry.pose, later.pose])
     at_end = int((later.stamp <= odometry.stamp[-1]).sum())
     assert len(way) == 80 - at_end

@@ -150,12 +150,6 @@ def one_sensor(readings: Readings, odometry: Odometry) -> tuple[Readings, Odomet
     return readings.select(readings.sensor == 3), odometry
 
 
-def jumping(readings: Readings, odometry: Odometry) -> tuple[Readings, Odometry]:
-    pose = odometry.pose.copy()
-    pose[len(pose) // 2 :, 0] += 5.0
-    return readings, replace(odometry, pose=pose)
-
-
 def late(readings: Readings, odometry: Odometry) -> tuple[Readings, Odometry]:
     half = len(odometry.stamp) // 2
     return readings, Odometry(odometry.stamp[half:], odometry.pose[half:])
@@ -172,7 +166,6 @@ def nothing(readings: Readings, odometry: Odometry) -> tuple[Readings, Odometry]
         (still, '0.0 m long'),
         (silent, 'have an echo'),
         (one_sensor, 'one sensor'),
-        (jumping, 'jumps by 5.0 m'),
         (late, 'no odometry'),
         (nothing, 'not at hand'),
     ],

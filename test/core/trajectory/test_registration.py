@@ -12,7 +12,14 @@ from forward_grid_mapper.core.common.errors import Cancelled
 from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.common.readings import Readings
 from forward_grid_mapper.core.trajectory.poses import compose, relative
-from forward_grid_mapper.core.trajectory.registration import Registration, moved_to, readings_moved, register
+from forward_grid_mapper.core.trajectory.registration import (
+    SILENT,
+    OnMap,
+    Registration,
+    moved_to,
+    readings_moved,
+    register,
+)
 from forward_grid_mapper.simulation.drive import Recording, drive
 from forward_grid_mapper.simulation.sonar import NOISY, front_array
 from forward_grid_mapper.simulation.world import building_tour, building_world
@@ -57,6 +64,22 @@ def test_a_drive_elsewhere_stays(two: tuple[Recording, Recording]) -> None:
     found = placed(far, begin, one.readings)
     assert found.begin is begin
     assert found.gain.sigmas < 2.3
+
+
+def test_blocks_are_the_readings_one_by_one_and_what_is_new_says_nothing(two: tuple[Recording, Recording]) -> None:
+    one, other = two
+    around = OnMap(other.readings, other.robot[0], one.readings, Parameters(), np.zeros(1, np.uint8))
+    for begin in (other.robot[0], compose(other.robot[0], np.array([0.3, -0.2, 0.2]))):
+        each = around.of_each(begin, len(other.readings))
+        blocks = np.array_split(each, 7)
+        assert around.foreseen(begin, 7) == pytest.approx(np.array([block.mean() for block in blocks]))
+        assert around.of_each(begin, 50) == pytest.approx(each[:50])
+    far = other.robot[0] + np.array([100.0, 0.0, 0.0])
+    assert np.abs(around.of_each(far, 200)).max() < SILENT
+    assert around.search(far, np.array([0.25, 0.25, 0.2]), 7) is far, 'nothing can be told there'
+    wide = compose(other.robot[0], np.array([0.4, -0.3, math.radians(18.0)]))
+    x, y, yaw = relative(other.robot[0], around.search(wide, np.array([0.25, 0.25, math.radians(10.0)]), 20))
+    assert math.hypot(x, y) < 0.1 and abs(math.degrees(yaw)) < 1.0
 
 
 def test_the_order_of_readings_does_not_matter(two: tuple[Recording, Recording]) -> None:

@@ -1,0 +1,254 @@
+"""Jumps of odometry: where they are, and where the robot was after one.
+
+Odometry that begins anew, as a driver that is started again, says nothing of where the robot is on the map, but all the
+same how it moves from there on. So what lies between two jumps is a drive of its own, and two guesses say where it
+begins: where the robot stood before the jump, or where odometry has it, as where messages are missing. Around both its
+readings are compared with the map of what was driven before.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..common.parameters import Parameters
+from ..common.readings import Readings, of_drives
+from .holding_out import Gain, gain
+from .poses import Floats, compose, inverse, relative, wrapped
+from .registration import LEAST_SIGMAS, SILENT, OnMap, moved_to, readings_moved
+from .windows import Odometry
+
+LONGEST_STEP = 1.0
+"""Metres between two poses of odometry, beyond which it jumped."""
+
+LONGEST_TURN, FASTEST_TURN = 0.5, 2 * math.pi
+"""Radians between two poses, and radians a second, beyond both of which it jumped."""
+
+FASTEST = 3.0
+"""Metres a second that a robot may have driven across a jump."""
+
+MOST_JUMPS = 20
+"""Jumps from which on it is no wheel odometry."""
+
+FEWEST_READINGS = 100
+"""Readings before a jump, and after it, that it takes to tell where the robot was."""
+
+SIGMA = np.array([0.25, 0.25, math.radians(10.0)])
+"""σ of both guesses: metres, and radians."""
+
+BLOCK = 0.8
+"""Metres of the drive that are compared as one."""
+
+FIRST_WAY, OWN = 1.0, 8.0
+"""Metres after a jump whose readings must fit, before sonars in front see what is new, and those that they are on a map
+of their own with."""
+
+GOOD, GOOD_AT_REST = 0.65, 0.4
+"""Part of the score that readings have on a map of their own which a place must have, as a place that is recognised
+while driving; and which it must have where the robot stood, if it cannot have driven: odometry begins anew far more
+often than a robot is carried. Where it stood readings had 0.5 to 0.9 of it, elsewhere in the building 0.0 to 0.66."""
+
+LEAST_KNOWN, FEWEST_KNOWN = 0.2, 30
+"""Part of the first readings, and how many, that must lie on the map."""
+
+SAME = 0.25
+"""Metres between two places that are one."""
+
+MOST_SAID = 3
+"""Jumps that are told of."""
+
+NOT_WORSE = -1.0
+"""Standard errors by which readings may be foreseen worse where the robot stood, where it cannot have driven."""
+
+
+def jumps(odometry: Odometry) -> NDArray[np.int64]:
+    """Return the numbers of the poses that odometry jumps to."""
+    step, pose = np.diff(odometry.stamp) * 1e-9, odometry.pose
+    far = np.hypot(*np.diff(pose[:, :2], axis=0).T)
+    out: NDArray[np.int64] = np.flatnonzero(jumped(far, np.diff(pose[:, 2]), step)) + 1
+    return out
+
+
+def jumped(far: Any, turn: Any, seconds: Any) -> Any:
+    """Return whether no robot moves so from one pose to the next: metres, radians, and seconds."""
+    turn = np.abs(wrapped(turn))
+    return (far > LONGEST_STEP) | ((turn > LONGEST_TURN) & (turn > FASTEST_TURN * np.asarray(seconds)))
+
+
+def since_jump(odometry: Odometry) -> Odometry:
+    """Return the odometry from the last jump on; all of it if there is none."""
+    found = jumps(odometry)
+    first = int(found[-1]) if len(found) else 0
+    return Odometry(odometry.stamp[first:], odometry.pose[first:]) if first else odometry
+
+
+class Part(NamedTuple):
+    """What lies between two jumps, or between one and an end of the drive.
+
+    Attributes
+    ----------
+    readings : Readings
+        Placed by `path`.
+    odometry, path : Odometry
+        As odometry has it, and the trajectory, which begins where odometry does.
+    lost : bool
+        Whether the heading got lost, so that nothing should be fitted to it.
+    """
+
+    readings: Readings
+    odometry: Odometry
+    path: Odometry
+    lost: bool
+
+
+class Begin(NamedTuple):
+    """Where a part begins on the map, shape (3,), and what that is taken from."""
+
+    pose: Floats
+    how: str
+
+
+FIRST, STOOD, DRIVEN, UNKNOWN = 'first', 'stood', 'driven', 'unknown'
+"""The first part that has readings; where the robot was before the jump; where odometry has it, and readings agree; and
+where odometry has it, though readings do not tell."""
+
+
+def parts_at(readings: Readings, odometry: Odometry, jumped_to: NDArray[np.int64]) -> list[tuple[Readings, Odometry]]:
+    """Return the readings and the odometry of each part; readings of the time of a jump are of none."""
+    parts = []
+    for begin, end in itertools.pairwise([0, *jumped_to.tolist(), len(odometry.stamp)]):
+        part = Odometry(odometry.stamp[begin:end], odometry.pose[begin:end])
+        within = (readings.stamp >= part.stamp[0]) & (readings.stamp <= part.stamp[-1])
+        parts.append((readings.select(within), part))
+    return parts
+
+
+def begins_of(parts: Sequence[Part], parameters: Parameters, stop: NDArray[np.uint8]) -> list[Begin]:
+    """Return where each part begins on the map of those before it.
+
+    Raises
+    ------
+    Cancelled
+        If `stop` was set.
+    """
+    out: list[Begin] = []
+    on_map: list[Readings] = []
+    # the frame of odometry on the map, and where and when the robot was last known to be
+    carry, end, stamp = np.zeros(3), np.zeros(3), 0
+    for part in parts:
+        begin = Begin(compose(carry, part.path.pose[0]), FIRST if len(part.readings) >= FEWEST_READINGS else UNKNOWN)
+        if on_map:
+            fast = _too_fast(end, begin.pose, (int(part.odometry.stamp[0]) - stamp) * 1e-9)
+            begin = _begin_after(part, (end, begin.pose), fast, of_drives(on_map), parameters, stop)
+        out.append(begin)
+        if begin.how != UNKNOWN:
+            path = moved_to(begin.pose, part.path.pose)
+            carry, end = compose(path[-1], inverse(part.odometry.pose[-1])), path[-1]
+            stamp = int(part.odometry.stamp[-1])
+            on_map.append(readings_moved(part.readings, part.path.pose[0], begin.pose))
+    return out
+
+
+def _too_fast(before: Floats, after: Floats, seconds: float) -> bool:
+    x, y, turn = relative(before, after).tolist()
+    return math.hypot(x, y) > LONGEST_STEP + FASTEST * seconds or abs(turn) > LONGEST_TURN + FASTEST_TURN * seconds
+
+
+def _begin_after(
+    part: Part,
+    guesses: tuple[Floats, Floats],
+    fast: bool,
+    others: Readings,
+    parameters: Parameters,
+    stop: NDArray[np.uint8],
+) -> Begin:
+    """Return where a part begins that follows a jump.
+
+    Parameters
+    ----------
+    part : Part
+    guesses : (float64, float64), both of shape (3,)
+        The begin on the map if the robot stood, and as odometry has it.
+    fast : bool
+        Whether the robot cannot have driven from one to the other.
+    others : Readings
+        Of the parts before, on the map.
+    parameters, stop
+        As in `begins_of`.
+    """
+    unknown = Begin(guesses[1], UNKNOWN)
+    if part.lost or len(part.readings) < FEWEST_READINGS:
+        return unknown
+    around = OnMap(part.readings, part.path.pose[0], others, parameters, stop)
+    blocks = max(int(part.path.travel[-1] / BLOCK), 1)
+    found = [around.search(guess, SIGMA, blocks) for guess in guesses]
+    usual = _Usual(part, parameters, stop)
+    stood, driven, exactly = (_said(around.foreseen(pose, blocks)) for pose in (*found, guesses[1]))
+    better = compared(driven, stood).sigmas
+    if usual.fits(around, found[0], GOOD_AT_REST if fast else GOOD) and better >= (NOT_WORSE if fast else LEAST_SIGMAS):
+        return Begin(found[0], STOOD)
+    # both guesses may lead to one place
+    same = np.hypot(*relative(found[1], found[0])[:2]) < SAME
+    if usual.fits(around, found[1], GOOD) and not fast and (-better >= LEAST_SIGMAS or same):
+        return Begin(found[1] if compared(exactly, driven).sigmas >= LEAST_SIGMAS else guesses[1], DRIVEN)
+    return unknown
+
+
+class _Usual:
+    """How well the first readings of a part fit on a map, beside how well they fit on their own."""
+
+    def __init__(self, part: Part, parameters: Parameters, stop: NDArray[np.uint8]) -> None:
+        readings, path = part.readings, part.path
+        travel = np.interp(readings.stamp - path.stamp[0], path.stamp - path.stamp[0], path.travel)
+        own = readings.select(travel <= OWN)
+        self._count = int(np.count_nonzero(travel <= FIRST_WAY))
+        begin = path.pose[0]
+        self._own = OnMap(own, begin, own, parameters, stop).of_each(begin, self._count)
+
+    def fits(self, around: OnMap, begin: Floats, least: float) -> bool:
+        """Return whether they fit so well, in parts of that, as far as they are on the map: a part of them must be."""
+        there = around.of_each(begin, self._count)
+        known = np.abs(there) > SILENT
+        if np.count_nonzero(known) < max(LEAST_KNOWN * len(known), FEWEST_KNOWN):
+            return False
+        return bool(there[known].sum() >= least * self._own[known].sum() > 0.0)
+
+
+def _said(values: Floats) -> Floats:
+    """Return what blocks say, NaN where all they read is new."""
+    out: Floats = np.where(np.abs(values) > SILENT, values, np.nan)
+    return out
+
+
+def compared(before: Floats, after: Floats) -> Gain:
+    """Return the gain of `after` over blocks that say something in either place; what is new says nothing."""
+    some = np.isfinite(before) | np.isfinite(after)
+    return gain(np.nan_to_num(before[some]), np.nan_to_num(after[some]))
+
+
+def words(begins: Sequence[Begin], parts: Sequence[Part]) -> str:
+    """Return what became of each jump."""
+    said = []
+    for k, ((before, part), begin) in enumerate(zip(itertools.pairwise(parts), begins[1:], strict=True), 1):
+        far = math.dist(before.odometry.pose[-1, :2].tolist(), part.odometry.pose[0, :2].tolist())
+        driven = sum(float(each.odometry.travel[-1]) for each in parts[:k])
+        said.append(f'odometry jumps by {far:.1f} m after {driven:.0f} m of driving{BECAME[begin.how]}')
+    more = f'; and {len(said) - MOST_SAID} more' if len(said) > MOST_SAID else ''
+    return '; '.join(said[:MOST_SAID]) + more
+
+
+BECAME = {
+    FIRST: ', where there are hardly any readings before',
+    STOOD: ': the readings fit where the robot was before it, and what follows is mapped from there',
+    DRIVEN: ', and the readings after it fit where odometry has them',
+    UNKNOWN: (
+        ', and the readings after it do not say where the robot was: they stay where odometry has them, which may be '
+        'wrong; after a jump call reset, or map what follows by itself'
+    ),
+}
+"""What became of a jump."""

@@ -1,0 +1,241 @@
+"""Odometry that jumps: the drive goes on where the robot stood if readings say so; where they do not, that is said."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from forward_grid_mapper.core.common.errors import Cancelled
+from forward_grid_mapper.core.common.parameters import Parameters
+from forward_grid_mapper.core.common.readings import Readings
+from forward_grid_mapper.core.trajectory import jumps as jumping
+from forward_grid_mapper.core.trajectory.correction import Correction
+from forward_grid_mapper.core.trajectory.following import Follower
+from forward_grid_mapper.core.trajectory.jumps import jumps, since_jump
+from forward_grid_mapper.core.trajectory.poses import compose, relative, rms_after_alignment
+from forward_grid_mapper.core.trajectory.refinement import Refinement, Refiner
+from forward_grid_mapper.core.trajectory.windows import Odometry
+from forward_grid_mapper.simulation.drift import LEVELS, with_drift
+from forward_grid_mapper.simulation.drive import Recording, drive
+from forward_grid_mapper.simulation.sonar import NOISY, sonar_ring
+from forward_grid_mapper.simulation.world import building_tour, building_world
+
+
+def odometry_of(recording: Recording) -> Odometry:
+    messages = recording.odometry
+    return Odometry.of(np.array([m.stamp for m in messages]), np.array([m.pose for m in messages], np.float64))
+
+
+def moved(readings: Readings, before: Odometry, after: Odometry) -> Readings:
+    """Readings of a drive as other odometry places them."""
+    sensors = np.stack([readings.x, readings.y, readings.yaw], 1)
+    x, y, yaw = compose(after.at(readings.stamp), relative(before.at(readings.stamp), sensors)).T
+    return replace(readings, x=x.copy(), y=y.copy(), yaw=yaw.copy())
+
+
+def begun_anew(
+    readings: Readings, odometry: Odometry, part: float, at: tuple[float, float, float] = (0.0, 0.0, 0.0)
+) -> tuple[Readings, Odometry]:
+    """The same drive, whose odometry begins anew at a pose after a part of it."""
+    first = int(part * len(odometry.stamp))
+    pose = odometry.pose.copy()
+    pose[first:] = compose(np.array(at), relative(odometry.pose[first], odometry.pose[first:]))
+    other = Odometry.of(odometry.stamp, pose)
+    return moved(readings, odometry, other), other
+
+
+def without_messages(readings: Readings, odometry: Odometry, seconds: float) -> tuple[Readings, Odometry]:
+    """The same drive with a gap in its messages."""
+    middle = int(odometry.stamp[len(odometry.stamp) // 2])
+    gone = (odometry.stamp > middle) & (odometry.stamp < middle + seconds * 1e9)
+    unread = (readings.stamp > middle) & (readings.stamp < middle + seconds * 1e9)
+    return readings.select(~unread), Odometry(odometry.stamp[~gone], odometry.pose[~gone])
+
+
+@pytest.fixture(scope='module')
+def exact() -> Recording:
+    return drive(building_world(), building_tour()[:10], 0.15, sonar_ring(16), NOISY, seed=3)
+
+
+@pytest.fixture(scope='module')
+def bent(exact: Recording) -> tuple[Readings, Odometry]:
+    recording = with_drift(exact, LEVELS['high'], 6)
+    return recording.readings, odometry_of(recording)
+
+
+@pytest.fixture(scope='module')
+def outcome(bent: tuple[Readings, Odometry]) -> tuple[Readings, Odometry, Refinement]:
+    readings, odometry = begun_anew(*bent, 0.5)
+    return readings, odometry, Refiner(Parameters()).run(readings, odometry)
+
+
+def off(exact: Recording, path: Odometry) -> float:
+    return rms_after_alignment(path.pose, odometry_of(exact).at(path.stamp))
+
+
+@pytest.mark.parametrize('seed', range(10))
+def test_a_jump_is_what_no_robot_drives(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    seconds = rng.choice([0.01, 0.1, 1.0, 10.0], 60)
+    pose = np.cumsum(rng.normal(0.0, [0.5, 0.5, 1.5], (60, 3)), 0)
+    odometry = Odometry.of(np.cumsum(np.round(seconds * 1e9)).astype(np.int64), pose)
+    expected = []
+    for k in range(1, 60):
+        far = math.dist(pose[k - 1, :2], pose[k, :2])
+        turn = abs(math.remainder(pose[k, 2] - pose[k - 1, 2], 2 * math.pi))
+        if far > 1.0 or (turn > 0.5 and turn / seconds[k] > 2 * math.pi):
+            expected.append(k)
+    assert jumps(odometry).tolist() == expected
+    assert since_jump(odometry).stamp[0] == odometry.stamp[expected[-1]]
+
+
+def test_driving_is_no_jump(bent: tuple[Readings, Odometry]) -> None:
+    _, odometry = bent
+    assert not len(jumps(odometry))
+    assert since_jump(odometry) is odometry
+    nothing = Odometry.of(np.zeros(0, np.int64), np.zeros((0, 3)))
+    assert not len(jumps(nothing)) and since_jump(nothing) is nothing
+
+
+def test_odometry_that_begins_anew_goes_on_where_the_robot_stood(
+    exact: Recording, outcome: tuple[Readings, Odometry, Refinement]
+) -> None:
+    readings, odometry, found = outcome
+    assert found.accepted and not found.unplaced
+    assert off(exact, odometry) > 2.0
+    assert off(exact, found.trajectory) < 0.2
+    assert 'the readings fit where the robot was before it' in found.jumps
+    assert found.jumps in found.reason
+    assert np.array_equal(found.trajectory.stamp, odometry.stamp)
+    assert np.hypot(*np.diff(found.trajectory.pose[:, :2], axis=0).T).max() < 0.3, 'no jump is left'
+    assert found.trajectory.pose[0] == pytest.approx(odometry.pose[0], abs=1e-6)
+    expected = moved(readings, odometry, found.trajectory)
+    assert found.readings.x == pytest.approx(expected.x, abs=1e-9)
+    begin, end = found.stretch
+    assert found.noise > 0.0 and odometry.stamp[0] <= begin < end <= odometry.stamp[-1]
+
+
+def test_exact_odometry_that_begins_anew_is_put_together_and_otherwise_stays(exact: Recording) -> None:
+    true = odometry_of(exact)
+    readings, odometry = begun_anew(exact.readings, true, 0.4, (5.0, -3.0, 2.0))
+    found = Refiner(Parameters()).run(readings, odometry)
+    assert found.accepted and not found.unplaced
+    assert off(exact, found.trajectory) < 0.08
+    first = int(0.4 * len(true.stamp))
+    assert found.trajectory.pose[:first] == pytest.approx(odometry.pose[:first], abs=1e-9)
+    steps = relative(found.trajectory.pose[first:-1], found.trajectory.pose[first + 1 :])
+    assert steps == pytest.approx(relative(true.pose[first:-1], true.pose[first + 1 :]), abs=1e-6)
+    assert found.calibration == {}
+
+
+def test_missing_messages_are_no_reason_to_move_exact_odometry(exact: Recording) -> None:
+    readings, odometry = without_messages(exact.readings, odometry_of(exact), 5.0)
+    assert len(jumps(odometry)) == 1
+    found = Refiner(Parameters()).run(readings, odometry)
+    assert not found.accepted and not found.unplaced
+    assert 'fit where odometry has them' in found.jumps
+    assert found.readings is readings and found.trajectory is odometry
+
+
+def test_a_robot_that_was_carried_away_is_told_of(exact: Recording, bent: tuple[Readings, Odometry]) -> None:
+    readings, odometry = bent
+    other = drive(building_world(), building_tour()[12:20], 0.15, sonar_ring(16), NOISY, seed=5)
+    elsewhere, gap = odometry_of(other), int(odometry.stamp[-1]) + 10**8
+    there = replace(other.readings, stamp=other.readings.stamp - elsewhere.stamp[0] + gap)
+    stamp = np.concatenate([odometry.stamp, elsewhere.stamp - elsewhere.stamp[0] + gap])
+    away = np.array([60.0, 40.0, 0.3])
+    sensors = compose(away, np.stack([there.x, there.y, there.yaw], 1))
+    there = replace(there, x=sensors[:, 0].copy(), y=sensors[:, 1].copy(), yaw=sensors[:, 2].copy())
+    columns = {
+        name: np.concatenate([getattr(readings, name), getattr(there, name)])
+        for name in ('x', 'y', 'yaw', 'z', 'z_max', 'half_angle', 'sigma', 'stamp', 'sensor')
+    }
+    both = replace(readings, **columns)
+    whole = Odometry.of(stamp, np.concatenate([odometry.pose, compose(away, elsewhere.pose)]))
+    found = Refiner(Parameters()).run(both, whole)
+    assert found.unplaced
+    assert 'do not say where the robot was' in found.jumps and 'reset' in found.jumps
+    before, after = found.trajectory.between(0, int(odometry.stamp[-1])), found.trajectory.between(gap, stamp[-1])
+    assert off(exact, before) < 0.2, 'what came before is refined all the same'
+    assert np.hypot(*(after.pose[0] - before.pose[-1])[:2]) > 30.0
+
+
+def test_a_few_readings_after_a_jump_are_not_enough(bent: tuple[Readings, Odometry]) -> None:
+    readings, odometry = begun_anew(*bent, 0.98)
+    found = Refiner(Parameters()).run(readings, odometry)
+    assert found.unplaced and 'do not say' in found.jumps
+    assert found.accepted, 'the part before is refined'
+    first = int(0.98 * len(odometry.stamp))
+    correction = Correction(
+        odometry.between(0, odometry.stamp[first - 1]), found.trajectory.between(0, odometry.stamp[first - 1])
+    )
+    assert found.trajectory.pose[first:, :2] == pytest.approx(
+        correction.extended(odometry.stamp, odometry.pose).pose[first:, :2], abs=1e-6
+    ), 'as odometry has it'
+
+
+def test_a_few_messages_before_a_jump_do_not_matter(exact: Recording, bent: tuple[Readings, Odometry]) -> None:
+    readings, odometry = begun_anew(*bent, 0.01, (30.0, 0.0, 0.0))
+    found = Refiner(Parameters()).run(readings, odometry)
+    assert found.accepted
+    first = jumps(odometry)[0]
+    assert off(exact, found.trajectory.between(int(odometry.stamp[first]), int(odometry.stamp[-1]))) < 0.2
+
+
+def test_odometry_that_always_jumps_is_refused(bent: tuple[Readings, Odometry]) -> None:
+    readings, odometry = bent
+    pose = odometry.pose.copy()
+    pose[:: len(pose) // 50] += np.array([4.0, 0.0, 0.0])
+    left = Refiner(Parameters()).run(readings, replace(odometry, pose=pose))
+    assert not left.accepted and 'no wheel odometry' in left.reason
+    assert left.readings is readings
+
+
+def test_it_can_be_cancelled_while_parts_are_placed(
+    bent: tuple[Readings, Odometry], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    refiner = Refiner(Parameters())
+    monkeypatch.setattr(refiner, '_whole', lambda readings, odometry: Refinement(False, '', readings, odometry, {}))
+    place = jumping.OnMap
+
+    def cancels(*arguments: object) -> object:
+        refiner.cancel()
+        return place(*arguments)
+
+    monkeypatch.setattr(jumping, 'OnMap', cancels)
+    with pytest.raises(Cancelled):
+        refiner.run(*begun_anew(*bent, 0.5))
+
+
+def test_following_begins_behind_the_last_jump(exact: Recording, bent: tuple[Readings, Odometry]) -> None:
+    readings, odometry = begun_anew(*bent, 0.3)
+    true = odometry_of(exact)
+    known = int(np.searchsorted(true.travel, 0.75 * true.travel[-1]))
+    begun = Correction(
+        Odometry(odometry.stamp[:known], odometry.pose[:known]), Odometry(odometry.stamp[:known], true.pose[:known])
+    )
+    follower = Follower(begun, {}, Parameters(), 0.03)
+    assert follower.follow(readings, odometry)
+    assert not follower.obstacle and follower.windows > 5
+    said = follower.correction.extended(odometry.stamp, odometry.pose).pose
+    assert np.hypot(*(said - true.pose)[known:, :2].T).max() < 0.35
+    assert follower._past.stamp.min() < odometry.stamp[jumps(odometry)[0]], 'what was driven before it is a place, too'
+
+
+def test_following_needs_some_way_behind_a_jump(bent: tuple[Readings, Odometry]) -> None:
+    readings, odometry = begun_anew(*bent, 0.9)
+    follower = Follower(Correction(odometry, odometry), {}, Parameters())
+    assert not follower.follow(readings, odometry)
+    assert 'odometry jumped, and the robot drove no more than' in follower.obstacle
+
+
+def test_following_ends_where_odometry_jumps(bent: tuple[Readings, Odometry]) -> None:
+    readings, odometry = begun_anew(*bent, 0.7)
+    half = odometry.between(0, int(odometry.stamp[len(odometry.stamp) // 2]))
+    follower = Follower(Correction(half, half), {}, Parameters())
+    follower.follow(readings, odometry)
+    assert follower.obstacle.startswith('odometry jumped by ')
+    assert follower.correction.end < odometry.stamp[jumps(odometry)[0]]

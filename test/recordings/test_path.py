@@ -1,0 +1,76 @@
+"""How far the robot drove, whatever the order in which odometry comes."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from forward_grid_mapper.core.messages.message_types import OdometryMessage, Pose2
+from forward_grid_mapper.core.messages.pose_association import PoseAssociator
+from forward_grid_mapper.recordings.drive import length_of, path_of
+
+
+def drive(order: np.ndarray, stamps: np.ndarray) -> PoseAssociator:
+    """An associator that got the poses of a drive of ten metres in some order."""
+    associator = PoseAssociator(lambda base, frame, stamp: None, patient=True)
+    for k in order.tolist():
+        pose = Pose2(0.1 * k, 0.5 * math.sin(0.02 * k), 0.0)
+        associator.add_odometry(OdometryMessage(int(stamps[k]), 'odom', 'base_link', pose))
+    return associator
+
+
+def shuffled(seed: int, count: int) -> np.ndarray:
+    """Poses that overtake others by up to eight messages."""
+    return np.argsort(np.arange(count) + np.random.default_rng(seed).uniform(0.0, 8.0, count))
+
+
+@pytest.mark.parametrize('seed', range(5))
+def test_poses_out_of_order_are_not_driven_twice(seed: int) -> None:
+    stamps = np.arange(1, 102) * 50_000_000
+    straight, mixed = drive(np.arange(101), stamps), drive(shuffled(seed, 101), stamps)
+    assert length_of(straight) == pytest.approx(10.0, abs=0.1)
+    assert np.array_equal(path_of(mixed), path_of(straight))
+    arrived = np.hypot(*np.diff(np.array(mixed.path), axis=0).T).sum()
+    assert arrived > 1.5 * length_of(mixed), 'the sample is out of order'
+
+
+def test_in_order_the_path_is_as_it_came() -> None:
+    associator = drive(np.arange(101), np.arange(1, 102) * 50_000_000)
+    assert not associator.record.late
+    assert np.array_equal(path_of(associator), np.array(associator.path))
+
+
+def test_a_pose_that_comes_again_changes_nothing() -> None:
+    stamps = np.arange(1, 102) * 50_000_000
+    again = drive(np.repeat(np.arange(101), 2), stamps)
+    assert again.record.late == 101
+    assert np.array_equal(path_of(again), path_of(drive(np.arange(101), stamps)))
+
+
+def test_where_the_clock_jumped_back_the_whole_drive_counts() -> None:
+    stamps = np.arange(1, 102) * 50_000_000
+    stamps[60:] -= 3_000_000_000
+    order = np.arange(101)
+    order[[90, 91]] = 91, 90
+    associator = drive(order, stamps)
+    assert associator.time_jumps == 1 and associator.record.late
+    assert length_of(associator) == pytest.approx(10.2, abs=0.1)
+
+
+def test_nothing_and_one_place_have_no_length() -> None:
+    for count in (0, 1):
+        associator = drive(np.arange(count), np.arange(1, 102) * 50_000_000)
+        assert length_of(associator) == 0.0
+
+
+def test_a_jump_is_not_driven() -> None:
+    associator = PoseAssociator(lambda base, frame, stamp: None, patient=True)
+    for k in range(101):
+        x = 0.1 * k + (30.0 if k > 40 else 0.0)
+        associator.add_odometry(OdometryMessage((k + 1) * 50_000_000, 'odom', 'base_link', Pose2(x, 0.0, 0.0)))
+    assert length_of(associator) == pytest.approx(9.9, abs=0.1)
+    # messages that are missing are
+    associator.add_odometry(OdometryMessage(20 * 10**9, 'odom', 'base_link', Pose2(44.0, 0.0, 0.0)))
+    assert length_of(associator) == pytest.approx(13.9, abs=0.1)
