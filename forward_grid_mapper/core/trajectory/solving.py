@@ -51,7 +51,7 @@ UNSEEN, LEAST_YAW = 2.0, math.radians(1.0)
 metres, and what drifts within these is not seen. Wheels that slip now and then keep the yaw well in between."""
 
 OF_YAWS = EVERY / SPAN
-"""What the yaw that votes measure at a place counts: an echo votes at all places that are near."""
+"""What the loss of a yaw that votes measure counts: an echo votes at all places that are near, and counts once."""
 
 OF_WAYS = np.array([1.0, 1.0, 0.0, 0.0])
 """The part of a calibration that is left where the yaw is known."""
@@ -89,7 +89,7 @@ class Solver:
         count = np.arange(len(windows))
         self._steps = Edges(count[:-1], count[1:], motion, information)
         yaw = windows.node[heading.at, 2] + heading.measured
-        self._yaws = Yaws(heading.at, yaw, OF_YAWS * heading.information)
+        self._yaws = Yaws(heading.at, yaw, heading.information, OF_YAWS)
 
     def calibration_of(self, solution: Solution) -> Floats:
         """Return the whole calibration of the odometry, shape (4,)."""

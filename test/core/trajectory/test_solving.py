@@ -64,7 +64,7 @@ def test_an_echo_counts_once(exact) -> None:
     at = windows.node_progress[found.at]
     places = (np.abs(windows.progress[inner, None] - at) <= SPAN / 2).sum(1)
     assert places.mean() * OF_YAWS == pytest.approx(1.0, rel=0.1)
-    assert solver_of(exact, found)._yaws.information == pytest.approx(OF_YAWS * found.information)
+    assert solver_of(exact, found)._yaws.part == OF_YAWS
 
 
 def test_walls_that_say_nothing_else_turn_nothing(exact) -> None:
