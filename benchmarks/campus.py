@@ -1,14 +1,16 @@
 #!/usr/bin/env python3
 """A campus by workers: time, memory a worker, and how well work is shared, as drives become more.
 
-usage: campus.py [--drives 1,10] [--readings 100000] [--workers 2] [--tiles 30] [--compare] [--folder DIR] [--plot FILE]
+usage: campus.py [--drives 1,10] [--readings 100000] [--workers 2] [--tiles 30] [--compare] [--whole]
+                 [--folder DIR] [--plot FILE]
 
 For each number of drives: a campus with as many buildings is simulated (kept in DIR, and taken from there if it is
 there), and `process_bag --workers` maps it, in a process of its own. Printed are readings, area, seconds of the wall
 clock, CPU seconds of all tasks, the memory of the largest worker, how often a reading is evaluated, and what would come
 of 1 to 8 workers: the CPU seconds of all tasks, by those that the busiest worker would have if each worker took the
 next task as soon as it is free, and waited at the end of each stage. That is counted work, which other processes on the
-machine do not change. With --compare one worker is timed as well.
+machine do not change. With --compare one worker is timed as well; with --whole the map is made by one process without
+tiles, too, and what differs is printed.
 """
 
 from __future__ import annotations
@@ -24,9 +26,13 @@ import tempfile
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+import numpy as np
 from measuring import machine
+
+from forward_grid_mapper.core.common.grid import UNKNOWN
+from forward_grid_mapper.files.map_archive import MapArchive, read_npz
 
 ACROSS = range(1, 9)
 """Simulated workers."""
@@ -49,16 +55,39 @@ def run(*words: object) -> str:
     return subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True).stdout
 
 
-def mapped(campus: Path, workers: int, tiles: float) -> tuple[float, dict[str, Any], list[tuple[str, float]]]:
-    """Return the seconds of a job, its report, and the stage and CPU seconds of each task."""
+class Job(NamedTuple):
+    """A job that is done: its seconds, report, and maps, and the stage and CPU seconds of each task."""
+
+    seconds: float
+    report: dict[str, Any]
+    maps: MapArchive
+    costs: list[tuple[str, float]]
+
+
+def mapped(campus: Path, *options: object) -> Job:
+    """Map all drives of a campus."""
     with tempfile.TemporaryDirectory(dir=campus.parent) as folder:
-        begun = time.perf_counter()
-        run('process_bag', campus / 'drives', '-o', f'{folder}/maps', '--workers', workers, '--tiles', tiles, '-q')
+        begun, out = time.perf_counter(), Path(folder, 'maps')
+        run('process_bag', campus / 'drives', '-o', out, '-q', *options)
         seconds = time.perf_counter() - begun
-        report: dict[str, Any] = json.loads(Path(folder, 'maps', 'report.json').read_text())
-        with Path(folder, 'maps', 'tasks.csv').open() as file:
-            costs = [(row['stage'], float(row['cpu_seconds'])) for row in csv.DictReader(file)]
-    return seconds, report, costs
+        report: dict[str, Any] = json.loads((out / 'report.json').read_text())
+        tasks, costs = out / 'tasks.csv', []
+        if tasks.exists():
+            with tasks.open() as file:
+                costs = [(row['stage'], float(row['cpu_seconds'])) for row in csv.DictReader(file)]
+        return Job(seconds, report, read_npz(out / 'maps.npz'), costs)
+
+
+def print_differences(whole: Job, tiled: Job) -> None:
+    """Print what the map of one process has that the map in tiles has not."""
+    a, b = (job.report['statistics']['searched_objective'] for job in (whole, tiled))
+    differ = np.count_nonzero(whole.maps.ml != tiled.maps.ml)
+    known = np.count_nonzero(whole.maps.ml != UNKNOWN)
+    print(
+        f' whole, one process: {whole.seconds:.0f} s, objective {a:,.1f}, in tiles {b:,.1f} ({b / a - 1:+.5%}); '
+        f'{differ} of {known:,} cells differ',
+        flush=True,
+    )
 
 
 def efficiency(costs: Sequence[tuple[str, float]], workers: int) -> float:
@@ -81,6 +110,7 @@ def main() -> None:
     options.add_argument('--workers', type=int, default=2)
     options.add_argument('--tiles', type=float, default=30.0)
     options.add_argument('--compare', action='store_true', help='time one worker, too')
+    options.add_argument('--whole', action='store_true', help='make the map in one process without tiles, too')
     options.add_argument('--folder', type=Path, default=Path(tempfile.gettempdir()) / 'campus')
     options.add_argument('--plot', type=Path, help='write CPU seconds against readings into this picture')
     chosen = options.parse_args()
@@ -91,7 +121,9 @@ def main() -> None:
     print(''.join(f'{head:>11}' for head in heads))
     for drives in map(int, chosen.drives.split(',')):
         campus = campus_of(chosen.folder, drives, chosen.readings)
-        seconds, report, costs = mapped(campus, chosen.workers, chosen.tiles)
+        tiles = '--tiles', chosen.tiles
+        job = mapped(campus, '--workers', chosen.workers, *tiles)
+        seconds, report, _, costs = job
         s, grid = report['statistics'], report['map']
         readings, area = report['result']['readings'], grid['width'] * grid['height'] * grid['resolution'] ** 2 / 1e6
         rows.append((readings, s['cpu_seconds']))
@@ -104,11 +136,13 @@ def main() -> None:
         shares = ', '.join(f'{n}: {efficiency(costs, n):.2f}' for n in ACROSS)
         print(f' efficiency of simulated workers: {shares}', flush=True)
         if chosen.compare:
-            alone, *_ = mapped(campus, 1, chosen.tiles)
+            alone = mapped(campus, '--workers', 1, *tiles).seconds
             print(
                 f' one worker {alone:.0f} s, {chosen.workers} workers {seconds:.0f} s: {alone / seconds:.2f}x',
                 flush=True,
             )
+        if chosen.whole:
+            print_differences(mapped(campus, '--set', 'max_readings=0'), job)
     if chosen.plot:
         draw(chosen.plot, rows)
 

@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 
 import forward_grid_mapper
 from forward_grid_mapper.core.common.grid import Grid
-from forward_grid_mapper.core.common.parameters import TABLE, Parameters
+from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.common.readings import Readings
 from forward_grid_mapper.core.mapping import Mapper
 from forward_grid_mapper.core.warm_up import warm_up
@@ -63,8 +63,8 @@ def reach(source: Path, target: Path) -> None:
         values = json.loads(str(file['values']))
         readings = Readings.from_columns(tuple(file['names'].tolist()), **{name: file[name] for name in COLUMNS})
     # what this checkout does not know it does not do
-    known = {row.name for row in TABLE}
-    parameters = Parameters.from_flat({name: value for name, value in values.items() if name in known})
+    known = Parameters().complete()
+    parameters = Parameters.restored({name: value for name, value in values.items() if name in known})
     warm_up()
     seconds = []
     for _ in range(RUNS):
@@ -143,7 +143,7 @@ def compare(options: argparse.Namespace) -> None:
         wide = 11 * len(heads)
         print(f'{"":24s}{"readings":>9s}{"J":>{wide}s}{"":11s}{"occupied":>{wide}s}{"F1":>{wide}s}{"seconds":>{wide}s}')
         print(f'{"":33s}', *(f'{h:>10s}' for h in (*heads, 'more', *heads, *heads, *heads)))
-        parameters = Parameters.from_flat(values)
+        parameters = Parameters().varied(values)
         prior = math.log(parameters.search.prior / (1 - parameters.search.prior))
         for name, readings, recording in found:
             reached = [reached_in(checkout, readings, values) for checkout in checkouts]

@@ -46,7 +46,7 @@ from quality_scores import (
 )
 from quality_worlds import Case, drawn_cases, on_grid, recorded_cases, scoring_tool, simulated_cases
 
-from forward_grid_mapper.core.common.parameters import Parameters
+from forward_grid_mapper.core.common.parameters import CONSTANTS, Parameters
 from forward_grid_mapper.core.evidence.evidence import Evidence
 from forward_grid_mapper.core.evidence.fixed_point import QUANTUM
 from forward_grid_mapper.core.mapping import Mapper
@@ -75,8 +75,7 @@ ABLATIONS: dict[str, dict[str, Any]] = {
     'unknown': {'least_passed': 0.0},
     'walls that look any way (unknown)': {'least_noticed': 0.0},
     'lost echoes': {'p_lost': 0.0},
-    'neighbours (uncertainty)': {'neighbour_weight': 0.0, 'alpha': 0.8, 'uncertainty_prior': 0.3},
-    'all of these but lost echoes': {**PLAIN, 'neighbour_weight': 0.0, 'alpha': 0.8, 'uncertainty_prior': 0.3},
+    'all of these but lost echoes': {**PLAIN, 'alpha': 0.8},
 }
 """What the default is without each of its parts."""
 
@@ -194,7 +193,7 @@ def print_ablations(groups: dict[str, list[Case]], base: dict[str, Any], whole: 
     print(f'{"":34s}{"F1":>7s}{"open":>6s}{"F1":>8s}{"dots":>6s}{"cover":>7s}{"smooth":>8s}', end='')
     print(f'{"F1":>7s}{"nav":>7s}{"cover":>7s}' + f'{"F1":>7s}{"nav":>6s}' * len(recordings) + f'{"loss":>9s}')
     for title, changes in {'nothing': None, **ABLATIONS}.items():
-        r = whole if changes is None else results(groups, Parameters.from_flat({**base, **changes}), tool)
+        r = whole if changes is None else results(groups, Parameters().varied({**base, **changes}), tool)
         least = min(r.figures[n].door for n in doors)
         row = (
             f'{title:34s}{mean(r, doors, "f1"):7.3f}{least:6.1f}{mean(r, hall, "f1"):8.3f}{mean(r, hall, "dots"):6.0f}'
@@ -208,7 +207,7 @@ def print_ablations(groups: dict[str, list[Case]], base: dict[str, Any], whole: 
 def with_true_rest(case: Case, model: dict[str, Any], known: Any) -> float:
     """Return the log loss at the cells `known` of (43) given all other cells of the true map, at its best prior."""
     assert case.world is not None
-    p = Parameters.from_flat({**model, 'max_incidence_angle': math.pi / 2})
+    p = Parameters().varied({**model, 'max_incidence_angle': math.pi / 2})
     grid = grid_of(case.readings, p.model, p.grid)
     walls = on_grid(case.world, grid)
     evidence = Evidence(grid, p.model, start=walls.astype(np.uint8))
@@ -228,7 +227,7 @@ def print_drawn(base: dict[str, Any], quick: bool) -> None:
         for case in drawn_cases(model, quick):
             losses = []
             for changes in ({}, model):
-                maps = Mapper(Parameters.from_flat({**base, **changes})).run(case.readings)
+                maps = Mapper(Parameters().varied({**base, **changes})).run(case.readings)
                 uncertainty = on_truth(maps.uncertainty, maps.grid, case, None)
                 said = belief(uncertainty, case)
                 losses.append(said.loss)
@@ -254,7 +253,7 @@ def print_resolutions(groups: dict[str, list[Case]], base: dict[str, Any], tool:
         case = groups[name][0]
         assert case.world is not None
         for resolution in RESOLUTIONS:
-            maps = Mapper(Parameters.from_flat({**base, 'resolution': resolution})).run(case.readings)
+            maps = Mapper(Parameters().varied({**base, 'resolution': resolution})).run(case.readings)
             s = score_map(maps.ml, maps.grid, case.world, case.met > 0)
             nav = nav_of(maps.ml, maps.grid, case, tool)
             spent = sum(maps.statistics['seconds'].values())
@@ -274,7 +273,7 @@ def print_cost(base: dict[str, Any], paper: dict[str, Any], runs: int) -> None:
     seconds: dict[str, list[float]] = {name: [] for name in variants}
     for _ in range(runs):
         for name, flat in variants.items():
-            spent = Mapper(Parameters.from_flat(flat)).run(readings).statistics['seconds']
+            spent = Mapper(Parameters().varied(flat)).run(readings).statistics['seconds']
             seconds[name].append(sum(spent[stage] for stage in ('index', 'search', 'uncertainty')))
     print(
         f'\nSeconds for the corridor, {len(readings)} readings: index, search and uncertainty; medians of {runs} runs'
@@ -283,6 +282,13 @@ def print_cost(base: dict[str, Any], paper: dict[str, Any], runs: int) -> None:
     for name, spent in seconds.items():
         middle = statistics.median(spent)
         print(f'  {name:32s}{middle:7.2f} s   the default takes {ours / middle:.2f} times as long')
+
+
+def setting(text: str) -> tuple[str, Any]:
+    """Return the name and the value of `name=value`, of a parameter or of a constant of the model."""
+    name, _, value = (part.strip() for part in text.partition('='))
+    constants = {row.name: row for row in CONSTANTS}
+    return (name, type(constants[name].default)(value)) if name in constants else parse_setting(text)
 
 
 def main() -> None:
@@ -294,7 +300,7 @@ def main() -> None:
     parser.add_argument('--runs', type=int, default=5, help='runs of the timing')
     parser.add_argument('--pictures', type=Path, metavar='DIR', help='draw maps into this folder')
     options = parser.parse_args()
-    base = dict(parse_setting(text) for text in options.set)
+    base = dict(setting(text) for text in options.set)
     paper = dict(load_parameters(PAPER).values)
     print(f'{platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}, ', end='')
     print(f'numpy {np.__version__}, numba {numba.__version__}' + (f'; changed: {base}' if base else ''))
@@ -304,7 +310,7 @@ def main() -> None:
     if tool is not None:
         groups |= groups_of(recorded_cases(tool))
     variants = {'default': base, 'paper, plain ML': paper}
-    rows = {title: results(groups, Parameters.from_flat(flat), tool) for title, flat in variants.items()}
+    rows = {title: results(groups, Parameters().varied(flat), tool) for title, flat in variants.items()}
     print_table(rows, groups, tool)
     for title, result in rows.items():
         print(f'\nReliability of the uncertainty map, all simulated worlds: {title}')

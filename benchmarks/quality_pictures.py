@@ -43,7 +43,7 @@ def _draw(path: Path, case: Case, base: dict[str, Any], paper: dict[str, Any], t
     grid, ml = standard.map(gains)
     tiles = [Tile(_label('standard map, gains of the best F1', standard.figures(gains)), grid, ml)]
     for title, flat in (("paper's plain ML", paper), ('default', base)):
-        maps = Mapper(Parameters.from_flat(flat)).run(case.readings)
+        maps = Mapper(Parameters().varied(flat)).run(case.readings)
         tiles.append(Tile(_label(title, score(maps.ml, maps.grid, case, tool)), maps.grid, maps.ml))
     tiles.append(Tile('default: probability of an obstacle', maps.grid, maps.uncertainty))
     height, width = case.truth.shape

@@ -203,7 +203,7 @@ def drawn_cases(model: dict[str, float], quick: bool) -> Iterator[Case]:
 def drawn(group: str, recording: Recording, model: dict[str, float], seed: int = 0) -> Case:
     """Return the drive with its ranges replaced by draws from the forward model, given the world's true map."""
     rng = np.random.default_rng(seed)
-    p = Parameters.from_flat(dict(model))
+    p = Parameters().varied(dict(model))
     old = recording.readings
     far = dataclasses.replace(old, z=old.z_max.copy())
     grid = grid_of(far, p.model, p.grid)

@@ -58,7 +58,7 @@ JOBS = (
 def measure_job(readings: Readings, resolution: float, runs: int) -> dict[str, float]:
     """Return the figures of one job."""
     warm_up()
-    parameters = Parameters.from_flat({'resolution': resolution})
+    parameters = Parameters().varied({'resolution': resolution})
     peak = PeakMemory()
     Mapper(parameters).run(readings)
     growth = peak.growth
@@ -129,7 +129,7 @@ def threads(runs: int) -> None:
     for job in JOBS:
         readings = job.drive()
         one, two = (
-            Timing(Parameters.from_flat({'resolution': job.resolution, 'threads': n}), readings, runs) for n in (1, 2)
+            Timing(Parameters().varied({'resolution': job.resolution, 'threads': n}), readings, runs) for n in (1, 2)
         )
         assert_equal(one.maps, two.maps)
         ratio, others = one['total'] / two['total'], max(one.others, two.others)
@@ -153,7 +153,7 @@ def memory(runs: int) -> None:
         readings = job.drive()
         first: Timing | None = None
         for bound in bounds:
-            parameters = Parameters.from_flat({'resolution': job.resolution, 'max_memory': bound})
+            parameters = Parameters().varied({'resolution': job.resolution, 'max_memory': bound})
             timing, growth = in_own_process(bounded, readings, parameters, runs)
             first = first or timing
             assert_equal(first.maps, timing.maps)
@@ -192,7 +192,7 @@ def table_2(runs: int) -> None:
     """Compare with the loops of the paper's Table 2, on as many readings as they can take."""
     print("\nEM against the paper's Table 2, both from the empty map until no cell flips, on one thread, for J")
     print('without what the defaults add: ' + ', '.join(PLAIN))
-    parameters = Parameters.from_flat({**PLAIN, 'threads': 1})
+    parameters = Parameters().varied({**PLAIN, 'threads': 1})
     prior = math.log(parameters.search.prior / (1 - parameters.search.prior))
     readings = corridor_drive(0).readings
     timing = Timing(parameters, readings, runs)

@@ -28,9 +28,12 @@ FOLDERS = (ROOT, PACKAGE, PACKAGE / 'core', ROOT / 'test')
 SHOWN = r'(?:benchmarks|config|docs|launch|rviz|scripts|test|core|files|bags|node|commands|\.ci)/[\w./-]*\w'
 """A path inside the repository, in a command line or in prose."""
 
-PARAMETERS = {parameter.name: parameter for parameter in table.TABLE}
+SETTABLE = {row.name for row in table.TABLE}
 
-DEPRECATED = {*former_parameters.DEPRECATED, *former_parameters.RENAMED}
+PARAMETERS = {row.name: row for row in (*table.TABLE, *table.CONSTANTS)}
+"""Parameters, and the constants that a page may name beside them."""
+
+DEPRECATED = {*former_parameters.DEPRECATED, *former_parameters.RENAMED} - {*PARAMETERS}
 """Former names of parameters, which a page may give only where it says so."""
 
 SAYS_SO = re.compile(r'deprecated|former|was called|old name|until the next version', re.IGNORECASE)
@@ -141,7 +144,7 @@ def launch_arguments() -> frozenset[str]:
 
 def is_value(name: str) -> bool:
     """Whether `name` is a number, or a parameter's default or one of its choices."""
-    texts = {text for row in PARAMETERS.values() for text in row.choices}
+    texts = {text for row in table.TABLE for text in row.choices}
     for row in PARAMETERS.values():
         default = row.default
         texts |= set(default) | {f'[{", ".join(default)}]'} if isinstance(default, tuple) else {str(default)}
@@ -215,7 +218,7 @@ def command_line(text: str, page: Path) -> str:
     ours = 'forward_grid_mapper' in text or 'ros2 run' not in text
     for name in re.findall(r'(?:-p|--set) (\w+):?=', text) if ours else ():
         # NAME stands for any
-        if name not in PARAMETERS and name != 'NAME':
+        if name not in SETTABLE and name != 'NAME':
             return f'{name} is no parameter'
     words = text.split('#', maxsplit=1)[0].split()
     for k, word in enumerate(words):
@@ -234,7 +237,7 @@ def is_option(name: str) -> bool:
 
 
 def is_setting(name: str) -> bool:
-    """Whether `name` is a parameter, with or without a value."""
+    """Whether `name` is a parameter or a constant, with or without a value."""
     first = re.split(r'[ =:<>≤≥]', name)[0]
     if ':=' in name and first in launch_arguments():
         return True

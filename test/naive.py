@@ -412,6 +412,38 @@ def evidence(
     return full - free
 
 
+def calibrated(evidence: np.ndarray, passed: np.ndarray, ml: np.ndarray, alpha: float = 1.0) -> np.ndarray:
+    """The calibrated marginals of all cells, shape (height, width), cell by cell: the docstring of `uncertainty`."""
+    out = np.zeros(ml.shape)
+    for row in range(ml.shape[0]):
+        for column in range(ml.shape[1]):
+            square = [(row + dy, column + dx) for dx in (-1, 0, 1) for dy in (-1, 0, 1)]
+            inside = [(0 <= r < ml.shape[0]) and (0 <= k < ml.shape[1]) for r, k in square]
+            near = [passed[at] if there else 0.0 for at, there in zip(square, inside, strict=True)]
+            walls = [
+                (k - column, r - row)
+                for (r, k), there in zip(square, inside, strict=True)
+                if there and ml[r, k] == 1 and (r, k) != (row, column)
+            ]
+            sides = [(dx, dy) for dx, dy in walls if not dx * dy]
+            cosines = [
+                (a[0] * b[0] + a[1] * b[1]) / math.hypot(*a) / math.hypot(*b) for a in walls for b in walls if a != b
+            ]
+            if any(cosine < -0.7 for cosine in cosines):
+                kind = 1.10 if len(sides) >= 3 else 0.20
+            elif len(sides) == 2:
+                kind = -0.20
+            elif not walls:
+                kind = -1.95
+            else:
+                kind = -2.56 if sides and len(walls) >= 3 else -1.23
+            told = evidence[row, column]
+            logit = alpha * math.copysign(math.log(1 + abs(told)), told) + kind + (1.31 if ml[row, column] == 1 else 0)
+            logit += -1.30 * math.log(1 + min(near)) + 0.29 * math.log(1 + sum(near) / 9)
+            out[row, column] = 1 / (1 + math.exp(-logit))
+    return out
+
+
 STEPS = [(1, 0), (1, 1), (0, 1), (-1, 1), (-1, 0), (-1, -1), (0, -1), (1, -1)]
 
 

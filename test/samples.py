@@ -25,7 +25,6 @@ PLAIN_MODEL: dict[str, Any] = {
 PLAIN_SEARCH: dict[str, Any] = {
     'end_cost': 0.0,
     'least_passed': 0.0,
-    'neighbour_weight': 0.0,
 }
 """Independent cells, and nothing made of the map that the search found."""
 

@@ -88,14 +88,19 @@ def choose_range_topics(contents: Contents, range_topics: Sequence[str] | None) 
 
 def _moving(contents: Contents, kinds: Sequence[str]) -> str:
     """Return what to do where transforms may have the poses; empty where they have none."""
-    topics = [topic for topic in _of_type(contents, TF_MESSAGE) if not topic.endswith('tf_static')]
+    topics = _of_type(contents, TF_MESSAGE)
     if not topics or TF_MESSAGE not in kinds:
         return ''
     return f' `--odom-topic {topics[0]}` takes those of {BASE_FRAMES[0]} from its transforms.'
 
 
 def _of_type(contents: Contents, msgtype: str) -> list[str]:
-    return sorted(topic for topic, (kind, count) in contents.items() if kind == msgtype and count)
+    # transforms that stand still are no poses of a robot
+    return sorted(
+        topic
+        for topic, (kind, count) in contents.items()
+        if kind == msgtype and count and not (kind == TF_MESSAGE and topic.endswith('tf_static'))
+    )
 
 
 def _named(contents: Contents, name: str, kinds: tuple[str, ...], option: str) -> str:

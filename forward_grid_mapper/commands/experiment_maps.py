@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..core.common.parameters import Parameters
+from ..core.common.parameters import CONSTANTS, Parameters
 from ..core.mapping import Mapper
 from ..core.maps.log_odds_map import LogOddsMap
 from ..files.panels import Tile
@@ -27,24 +27,20 @@ GAINS = tuple(
 )
 """The settings of the standard map among which the best is taken, which a user could not know; see `standard_map`."""
 
-ONE_SUM = {'live_directions': 1, 'live_echo_width': 1000.0}
+ONE_SUM = {row.name: row.plain for row in CONSTANTS if row.name in ('live_directions', 'live_echo_width')}
 """The standard map as in the paper: readings of all directions in one sum, and arcs as a whole."""
 
 PAPER = {
+    'plain_model': True,
     'p_hit': 0.9,
     'p_rand': 0.05,
     'p_lost': 0.0,
     'sigma': 0.05,
-    'surface_offset': 0.0,
     'prior': 0.5,
     'max_incidence_angle': math.pi / 2,
     'end_cost': 0.0,
-    'least_passed': 0.0,
-    'likelihood_exponent': 1.0,
     'live_p_occupied': 0.8,
     'live_p_free': 0.25,
-    'live_p_free_no_echo': 0.3,
-    **ONE_SUM,
 }
 """Maximum likelihood without a prior, as printed in the paper, and its standard map."""
 
@@ -100,7 +96,7 @@ def forward(cases: Iterable[Case], parameters: Parameters, title: str) -> Outcom
 def standard_map(gains: dict[str, float]) -> LogOddsMap:
     """Return an empty standard map with these gains, of which `depth` is half the depth of its arcs, metres."""
     values = {k: v for k, v in gains.items() if k != 'depth'}
-    return LogOddsMap(Parameters.from_flat({**values, **ONE_SUM}), (gains['depth'], gains['depth']))
+    return LogOddsMap(Parameters().varied({**values, **ONE_SUM}), (gains['depth'], gains['depth']))
 
 
 def standard(cases: Iterable[Case], gains: dict[str, float], title: str) -> Outcome:

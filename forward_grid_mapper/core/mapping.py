@@ -11,22 +11,20 @@ from typing import Any, Concatenate, ParamSpec, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from .common.constants import EXTENSION
 from .common.grid import Grid, part_of
 from .common.parameters import Parameters
 from .common.readings import Readings, in_canonical_order
 from .evidence.evidence import Evidence
 from .evidence.neighbourhood import patterns
 from .maps.dynamic import dynamic_echoes
+from .maps.handed_out import HandedOut, hand_out
 from .maps.log_odds_map import LogOddsMap, map_grid
 from .maps.map_set import MapSet
-from .maps.post_processing import post_process
 from .maps.traversed import traversed_cells
-from .maps.uncertainty import uncertainty_map
 from .runtime.cancelling import check
 from .runtime.memory import memory_for_pairs
 from .runtime.threads import cores
-from .search.prior import has_walls, log_prior, odds_given_neighbours
+from .search.prior import log_prior
 from .search.search import Progress, Search, SearchResult
 from .sensor.forward_model import ForwardModel
 
@@ -122,8 +120,8 @@ class Mapper:
         live = self._standard_map(given)
         evidence = self._index(given, start)
         found = self._search(given, evidence)
-        ml = self._post_process(given, evidence)
-        return self._judge(given, evidence, found, live, ml)
+        told = self._hand_out(given, evidence)
+        return self._judge(given, evidence, found, live, told)
 
     def _prepare(self, readings: Readings) -> _Given:
         readings, p = in_canonical_order(readings), self._parameters
@@ -153,10 +151,8 @@ class Mapper:
         return live.probability(given.grid)
 
     @_stage('post-processing')
-    def _post_process(self, given: _Given, evidence: Evidence) -> NDArray[np.int8]:
-        search = self._parameters.search
-        extension = EXTENSION if has_walls(search) else 0.0
-        return post_process(evidence, extension, search.least_passed, search.least_noticed, given.traversed)
+    def _hand_out(self, given: _Given, evidence: Evidence) -> HandedOut:
+        return hand_out(evidence, self._parameters.search, given.traversed)
 
     @_stage('uncertainty')
     def _judge(
@@ -165,10 +161,11 @@ class Mapper:
         evidence: Evidence,
         found: SearchResult,
         live: NDArray[np.float32],
-        ml: NDArray[np.int8],
+        told: HandedOut,
     ) -> MapSet:
         """Return the maps with what they say of the readings, and the readings of them."""
-        p, prior, occupied = self._parameters, found.prior, (ml == 1).astype(np.uint8)
+        ml, p, prior = told.ml, self._parameters, found.prior
+        occupied = (ml == 1).astype(np.uint8)
         forward = ForwardModel(given.readings, given.grid, p.model, evidence.state.normals, evidence.cones)
         e = forward.expectations(ml)
         log_likelihood = float(e.log_likelihood.sum())
@@ -177,7 +174,7 @@ class Mapper:
             grid=given.grid,
             live=live,
             ml=ml,
-            uncertainty=uncertainty_map(found.evidence, odds_given_neighbours(prior, ml == 1), ml, p.search),
+            uncertainty=told.uncertainty,
             readings=given.readings,
             unexplained=unexplained,
             log_likelihood=log_likelihood,

@@ -19,19 +19,18 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from .common.constants import EXTENSION, FORBIDDEN
+from .common.constants import FORBIDDEN
 from .common.grid import Grid, Window, part_of, united
 from .common.parameters import Parameters
 from .common.readings import Readings
 from .evidence.evidence import Evidence
+from .maps.handed_out import hand_out
 from .maps.log_odds_map import map_grid
-from .maps.post_processing import post_process
 from .maps.traversed import STRIDES, mark_traversed
-from .maps.uncertainty import uncertainty_map
 from .runtime.memory import memory_for_pairs
 from .runtime.threads import cores
 from .search.flips import flip_in_order, promising
-from .search.prior import has_walls, odds_given_neighbours, wall_prior
+from .search.prior import wall_prior
 from .search.search import LEAST, Search
 from .sensor.cone_table import effective_sigma, grid_of
 
@@ -288,8 +287,5 @@ class OnlineMap:
             return self.grid, np.zeros((0, 0), np.int8), np.zeros((0, 0), np.float32)
         evidence, search = self._evidence, self._parameters.search
         window = evidence.grid.window(self.grid)
-        extension = EXTENSION if has_walls(search) else 0.0
-        ml = post_process(evidence, extension, search.least_passed, search.least_noticed, self._traversed)
-        neighbours = odds_given_neighbours(self._prior, ml == 1)
-        uncertainty = uncertainty_map(evidence.of_occupancy(), neighbours, ml, search)
-        return self.grid, ml[window], uncertainty[window]
+        told = hand_out(evidence, search, self._traversed)
+        return self.grid, told.ml[window], told.uncertainty[window]

@@ -55,7 +55,7 @@ def write_npz(path: Path | str, maps: MapSet) -> None:
         resolution=np.float64(maps.grid.resolution),
         log_likelihood=np.float64(maps.log_likelihood),
         objective=np.float64(maps.objective),
-        parameters=np.array(json.dumps(maps.parameters.flat())),
+        parameters=np.array(json.dumps(maps.parameters.complete())),
     )
     with output_errors(path):
         path.write_bytes(packed.getvalue())
@@ -85,7 +85,7 @@ def read_npz(path: Path | str) -> MapArchive:
                 uncertainty=data['uncertainty_map'],
                 log_likelihood=float(data['log_likelihood']),
                 objective=float(data['objective']),
-                parameters=Parameters.from_flat(json.loads(str(data['parameters']))),
+                parameters=Parameters.restored(json.loads(str(data['parameters']))),
             )
     except FileNotFoundError as error:
         raise InputError(f'{path} does not exist') from error

@@ -11,7 +11,7 @@ from typing import Any
 import yaml
 
 from ..core.common.parameter import Parameter
-from ..core.common.parameters import TABLE, Parameters
+from ..core.common.parameters import CONSTANTS, TABLE, Parameters
 from ..core.sensor.bounds import reading_bounds
 
 _WIDTH = 100
@@ -39,7 +39,7 @@ def dump_parameters(parameters: Parameters) -> str:
 
 
 def parameters_markdown() -> str:
-    """Return the reference of all parameters: a Markdown table for each group."""
+    """Return the reference of all parameters and constants: a Markdown table for each group."""
     lines = []
     for title, rows in _groups():
         lines += [f'## {title}', '', '| parameter | default | admitted | unit | meaning |', '|---|---|---|---|---|']
@@ -49,7 +49,25 @@ def parameters_markdown() -> str:
         lines.append('')
         if rows[0].group == 'model':
             lines += [*_bounds_markdown(Parameters()), '']
-    return '\n'.join(lines)
+    return '\n'.join([*lines, *_constants_markdown()]) + '\n'
+
+
+def _constants_markdown() -> list[str]:
+    """Return the table of the model's constants."""
+    lines = [
+        '## Constants of the model',
+        '',
+        'These are no parameters. *Plain* is the value with `plain_model`, that of the paper; lengths of gaps, walls '
+        'and margins are in `core/common/constants.py`.',
+        '',
+        '| constant | default | plain | unit | meaning |',
+        '|---|---|---|---|---|',
+    ]
+    for row in CONSTANTS:
+        values = (f'`{_yaml_value(value)}`' for value in (row.default, row.plain))
+        cells = (f'`{row.name}`', *values, row.unit, row.help)
+        lines.append('| ' + ' | '.join(cell.replace('|', '\\|') for cell in cells) + ' |')
+    return lines
 
 
 def _bounds_markdown(parameters: Parameters) -> list[str]:

@@ -78,7 +78,7 @@ def _became(found: dict[str, Any]) -> str:
     places = found.get('places_recognised') or 0
     return (
         f'refined: odometry{calibrated} was off by {found["odometry_off_m"]:.2f} m and '
-        f'{found["odometry_off_deg"]:.1f}° in the root mean square; '
+        f'{found["odometry_off_deg"]:.1f}° in the root mean square, both paths laid over each other; '
         f'{places} {"place" if places == 1 else "places"} recognised; '
         + '; '.join(filter(None, [found['reason'], found.get('fitted')]))
     )

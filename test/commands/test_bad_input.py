@@ -128,6 +128,14 @@ def test_no_range(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert '/odom: ' in said and '/tf_static: ' in said
 
 
+def test_transforms_that_stand_still_are_not_offered_as_odometry(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bag = write_tape(tmp_path / 'bag', tape())
+    said = refusal(capsys, tmp_path, bag, '-o', tmp_path / 'maps', '--odom-topic', '/nowhere')
+    assert "no topic '/nowhere'" in said and '/odom' in said and '/tf_static' not in said
+
+
 def test_no_odometry(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     said = refused_drive(capsys, tmp_path, tape()._replace(odometry=[]))
     assert 'no nav_msgs/Odometry' in said

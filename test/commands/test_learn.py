@@ -84,7 +84,7 @@ def test_the_file_is_what_process_bag_takes(
     values, extrinsics, node = load_parameters(output)
     assert node == {'use_sim_time': True}
     assert set(extrinsics) == {frame, 'other'} and extrinsics[frame] == pytest.approx(pose)
-    parameters = Parameters.from_flat(values)
+    parameters = Parameters().varied(values)
     assert parameters.search.prior == 0.3 and parameters.node.range_topics == ('a', 'b')
     assert parameters.model.p_rand != 0.3
     assert output.read_text().startswith('# Learned from')

@@ -60,6 +60,10 @@ class Case:
         return self.maps.readings, self.maps.grid, self.searched
 
     @property
+    def passes(self) -> np.ndarray:
+        return naive.passed(*self.told, self.maps.parameters.model)
+
+    @property
     def prior(self) -> Prior:
         search = self.maps.parameters.search
         return wall_prior(search, self.traversed.ravel(), self.maps.grid.resolution)
@@ -139,17 +143,20 @@ def test_the_map_that_is_handed_out(seed: int) -> None:
 def test_the_uncertainty_map(seed: int) -> None:
     c = case(seed)
     search, grid = c.maps.parameters.search, c.maps.grid
-    base = math.log(search.uncertainty_prior / (1 - search.uncertainty_prior))
-    filled = (c.maps.ml == 1).astype(np.uint8)
-    told = evidence(seed)
+    told, passes = evidence(seed), c.passes
+    expected = naive.calibrated(
+        told.reshape(grid.shape), passes.sum(axis=0).reshape(grid.shape), c.maps.ml, search.alpha
+    )
+    noticing = naive.noticing(passes, c.maps.parameters.model.p_hit, c.maps.parameters.model.max_incidence_angle)
     for cell, q in enumerate(c.maps.uncertainty.ravel()):
         if np.isnan(q):
-            assert c.maps.ml.ravel()[cell] == -1 and abs(told[cell]) < 0.1 + 1e-4
-            continue
-        neighbours = naive.prior_gain(c.prior, filled, cell, grid.shape) * (-1 if filled.ravel()[cell] else 1)
-        logit = search.alpha * told[cell] + search.neighbour_weight * neighbours + base
-        # where the robot was, a cell cannot be occupied
-        assert q == pytest.approx(1 / (1 + math.exp(-max(logit, -500.0))), abs=1e-4)
+            assert c.maps.ml.ravel()[cell] == -1
+            assert abs(told[cell]) < 0.1 + 1e-4 or (told[cell] < 0 and noticing[cell] < 0.1 + 1e-4)
+        elif c.traversed.ravel()[cell]:
+            # where the robot was, a cell cannot be occupied
+            assert q == 0
+        else:
+            assert q == pytest.approx(expected.ravel()[cell], abs=1e-4)
 
 
 def in_room(x: float, y: float, bearing: float, half: float) -> float:

@@ -111,7 +111,7 @@ def test_values_are_accepted_where_the_first_ones_are_wrong_and_refused_where_th
     """The simulated sonar has a noise of 5 cm."""
     long, short = corridor_drive(0, 1, NOISY, False).readings, door_drive(3, NOISY, 0).readings
     for readings, given, accepted in ((long, {'sigma': 0.3}, True), (short, {}, False)):
-        parameters = Parameters.from_flat(given)
+        parameters = Parameters().varied(given)
         found = only_if_foreseen(learn_jointly(readings, parameters, 2), readings, parameters, 2)
         assert (found.accepted > 0) == accepted
         assert found.foresight is not None and found.foresight.better == accepted

@@ -42,9 +42,9 @@ def walls_of(learned: Learned) -> list[str]:
 @pytest.mark.parametrize('seed', [0, 1])
 def test_values_that_lose_the_smooth_wall_are_refused(seed: int) -> None:
     recording = corridor(seed)
-    learned = learn_jointly(recording.readings, Parameters.from_flat(PLAIN))
+    learned = learn_jointly(recording.readings, Parameters().varied(PLAIN))
     last = learned.rounds[-1]
-    refused = Mapper(dataclasses.replace(Parameters.from_flat(PLAIN), model=last.model)).run(recording.readings)
+    refused = Mapper(dataclasses.replace(Parameters().varied(PLAIN), model=last.model)).run(recording.readings)
     assert smooth_recall(refused, recording) < 0.5
     (warning,) = walls_of(learned)
     assert 'p_hit rose' in warning and 'refused' in warning and 'smooth walls' in warning
@@ -60,7 +60,7 @@ def test_values_that_lose_the_smooth_wall_are_refused(seed: int) -> None:
 
 
 def test_they_are_handed_out_on_request() -> None:
-    learned = learn_jointly(corridor(1).readings, Parameters.from_flat(PLAIN), 2, keep_going=True)
+    learned = learn_jointly(corridor(1).readings, Parameters().varied(PLAIN), 2, keep_going=True)
     assert learned.accepted == 2
     assert learned.parameters.model == learned.rounds[2].model
     assert 'handed out all the same' in walls_of(learned)[0]
@@ -70,11 +70,11 @@ def test_they_are_handed_out_on_request() -> None:
 def test_without_smooth_walls_nothing_is_refused_and_the_map_fits_too_well() -> None:
     recording = door_drive(3, NoiseModel(sigma=0.07, p_random=0.08, p_lost=0.1), 0)
     readings = recording.readings
-    learned = learn_jointly(readings, Parameters.from_flat(PLAIN), 10)
+    learned = learn_jointly(readings, Parameters().varied(PLAIN), 10)
     assert not walls_of(learned) and learned.accepted == len(learned.rounds) - 1
     model = learned.parameters.model
     world = recording.world
-    known = settle(ForwardModel(readings, world.grid, Parameters.from_flat(PLAIN).model), world.reference)
+    known = settle(ForwardModel(readings, world.grid, Parameters().varied(PLAIN).model), world.reference)
     sure = estimates(ForwardModel(readings, world.grid, known), world.reference)
     for name, truth in (('p_rand', 0.08), ('p_lost', 0.1)):
         assert sure[name].low < truth < sure[name].high
@@ -119,24 +119,22 @@ def test_a_search_that_ends_in_another_basin_is_called_so(monkeypatch: pytest.Mo
 def test_weak_values_are_called_so() -> None:
     readings = random_readings(np.random.default_rng(0), Grid(0.1, 0, 0, 30, 30), 150)
     readings.half_angle[:] = 0.1
-    learned = learn_jointly(readings, Parameters.from_flat(PLAIN), 2, keep_going=True)
+    learned = learn_jointly(readings, Parameters().varied(PLAIN), 2, keep_going=True)
     told = ' '.join(learned.warnings)
     assert 'inform p_hit; take it as a guess' in told
-    assert (
-        'had not come to rest' in learn_jointly(readings, Parameters.from_flat(PLAIN), 1, keep_going=True).warnings[0]
-    )
+    assert 'had not come to rest' in learn_jointly(readings, Parameters().varied(PLAIN), 1, keep_going=True).warnings[0]
 
 
 def test_much_chance_is_called_so() -> None:
     recording = door_drive(3, NoiseModel(sigma=0.05, p_random=0.6), 0)
-    learned = learn_jointly(recording.readings, Parameters.from_flat({**PLAIN, 'prior': 0.05}), 3)
+    learned = learn_jointly(recording.readings, Parameters().varied({**PLAIN, 'prior': 0.05}), 3)
     assert any('more than a sonar makes up by itself' in warning for warning in learned.warnings)
 
 
 def test_no_readings() -> None:
     with pytest.raises(InputError):
         learn_jointly(
-            Readings.from_columns(z=[], x=[], y=[], yaw=[], z_max=[], half_angle=[]), Parameters.from_flat(PLAIN)
+            Readings.from_columns(z=[], x=[], y=[], yaw=[], z_max=[], half_angle=[]), Parameters().varied(PLAIN)
         )
 
 
@@ -151,7 +149,7 @@ def facing_wall() -> MapSet:
     )
     nothing = np.full(grid.shape, np.nan, np.float32)
     unexplained = np.zeros(len(x), bool)
-    return MapSet(grid, nothing, ml, nothing, readings, unexplained, 0.0, 0.0, Parameters.from_flat(PLAIN))
+    return MapSet(grid, nothing, ml, nothing, readings, unexplained, 0.0, 0.0, Parameters().varied(PLAIN))
 
 
 def test_lost_walls() -> None:

@@ -12,12 +12,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import naive
-from forward_grid_mapper.core import mapping
 from forward_grid_mapper.core.common.errors import Cancelled, InputError
 from forward_grid_mapper.core.common.grid import Grid
 from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.common.readings import Readings
 from forward_grid_mapper.core.mapping import Mapper
+from forward_grid_mapper.core.maps import handed_out
 from forward_grid_mapper.core.maps.map_set import MapSet
 from forward_grid_mapper.core.maps.traversed import traversed_cells
 from forward_grid_mapper.core.search.prior import wall_prior
@@ -30,7 +30,7 @@ AREA = Grid(0.1, -13, 4, 30, 20)
 
 
 def run(readings: Readings, **values: object) -> MapSet:
-    return Mapper(Parameters.from_flat(values)).run(readings)
+    return Mapper(Parameters().varied(values)).run(readings)
 
 
 def some(seed: int = 0, count: int = 400) -> Readings:
@@ -145,7 +145,7 @@ def test_the_objective_is_the_tempered_likelihood_and_the_prior_of_the_map_that_
     exponent: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # as it is before walls are extended and free told from unknown; the likelihood is that of whole cones
-    monkeypatch.setattr(mapping, 'EXTENSION', 0.0)
+    monkeypatch.setattr(handed_out, 'EXTENSION', 0.0)
     whole = {**PLAIN_MODEL, 'least_passed': 0.0, 'likelihood_exponent': exponent}
     maps = run(some(), **whole)
     likelihood = log_likelihood(maps.readings, maps.grid, maps.ml, maps.parameters.model)
@@ -228,7 +228,7 @@ def test_beside_a_larger_live_map_the_likelihood_stays_the_same() -> None:
 
 
 def test_the_map_so_far_is_known_while_the_search_runs() -> None:
-    mapper, seen = Mapper(Parameters.from_flat(PLAIN)), []
+    mapper, seen = Mapper(Parameters().varied(PLAIN)), []
     assert mapper.so_far() is None
     maps = mapper.run(some(), lambda stage, progress: seen.append(mapper.so_far()) if progress else None)
     assert len(seen) == maps.statistics['iterations']

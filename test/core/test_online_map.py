@@ -88,7 +88,7 @@ def test_a_grid_that_grows_in_the_middle_loses_nothing(monkeypatch: pytest.Monke
     near = some()
     away = dataclasses.replace(near, x=near.x + 25.0, y=near.y - 18.0, stamp=near.stamp + 10**12)
     # few readings, which say enough for walls
-    online = in_sweeps(near, Parameters.from_flat({'p_rand': 0.3, 'p_lost': 0.4}))
+    online = in_sweeps(near, Parameters().varied({'p_rand': 0.3, 'p_lost': 0.4}))
     grid, before = online.maps()[:2]
     room = online._evidence.grid
     traversed = online._traversed.copy()
@@ -109,7 +109,7 @@ def test_a_grid_that_grows_in_the_middle_loses_nothing(monkeypatch: pytest.Monke
 @pytest.mark.parametrize('values', [PLAIN, {}], ids=['plain', 'whole'])
 def test_readings_that_say_the_same_add_weight_and_nothing_else(values: dict[str, float]) -> None:
     readings = some()
-    online = in_sweeps(readings, Parameters.from_flat(values), 150)
+    online = in_sweeps(readings, Parameters().varied(values), 150)
     count, taken = len(online), online._evidence.nbytes
     for _ in range(3):
         online.add(readings)
@@ -233,7 +233,7 @@ def test_a_jump_is_not_driven_over() -> None:
 
 
 def test_a_reading_too_far_away_is_refused_and_changes_nothing() -> None:
-    online = in_sweeps(some(), Parameters.from_flat({'max_cells': 100_000}))
+    online = in_sweeps(some(), Parameters().varied({'max_cells': 100_000}))
     count, before = len(online), [array.copy() for array in online.maps()[1:]]
     far = dataclasses.replace(some(count=1), x=np.array([1e5]))
     with pytest.raises(InputError, match='max_cells'):
@@ -247,10 +247,10 @@ def test_many_readings_at_once_are_searched_like_a_batch(monkeypatch: pytest.Mon
     monkeypatch.setattr(online_map, 'MANY', 100)
     values = {**PLAIN, 'resolution': 0.1}
     readings = some(count=140)
-    online = OnlineMap(Parameters.from_flat(values))
+    online = OnlineMap(Parameters().varied(values))
     online.add(readings)
     assert len(online) == len(readings)
-    maps = Mapper(Parameters.from_flat(values)).run(readings)
+    maps = Mapper(Parameters().varied(values)).run(readings)
     grid, ml, uncertainty = online.maps()
     assert grid == maps.grid
     assert np.array_equal(ml, maps.ml)
@@ -286,7 +286,7 @@ def test_readings_that_say_the_same_may_come_in_one_call() -> None:
 
 
 def fed(parts: list[Readings], values: dict[str, float]) -> OnlineMap:
-    online = OnlineMap(Parameters.from_flat(values))
+    online = OnlineMap(Parameters().varied(values))
     for part in parts:
         online.add(part)
     return online

@@ -113,7 +113,7 @@ def terms(readings: Readings, t: int, grid: Grid, occupied: np.ndarray, model: M
 
 def test_one_reading_gives_back_its_inverse_model_and_not_eq_4_as_printed() -> None:
     values = {'resolution': 0.1, 'live_p_occupied': 0.8, 'live_p_free': 0.25}
-    live = LogOddsMap(Parameters.from_flat({**values}))
+    live = LogOddsMap(Parameters().varied({**values}))
     live.add(along(0.55))
     p, log_odds = live.probability(LINE)[0], live.log_odds(LINE)[0]
     assert p[2] == pytest.approx(0.25, abs=1e-5)
@@ -124,7 +124,7 @@ def test_one_reading_gives_back_its_inverse_model_and_not_eq_4_as_printed() -> N
 
 def test_readings_that_say_nothing_leave_the_standard_map_at_its_prior() -> None:
     silent = {'live_p_occupied': 0.5, 'live_p_free': 0.5, 'live_p_free_no_echo': 0.5}
-    live = LogOddsMap(Parameters.from_flat({'resolution': 0.1, **silent}))
+    live = LogOddsMap(Parameters().varied({'resolution': 0.1, **silent}))
     live.add(random_readings(np.random.default_rng(0), AREA, 50))
     p = live.probability()
     assert np.isfinite(p).sum() > 50
@@ -140,7 +140,7 @@ def closed_form(each: np.ndarray, prior: float) -> np.ndarray:
 
 
 def test_the_standard_map_is_the_closed_form_of_eq_16_with_logarithms() -> None:
-    parameters = Parameters.from_flat({'resolution': 0.1, **ONE_SUM})
+    parameters = Parameters().varied({'resolution': 0.1, **ONE_SUM})
     readings = random_readings(np.random.default_rng(1), AREA, 40)
     live = LogOddsMap(parameters)
     live.add(readings)
@@ -389,7 +389,7 @@ def test_the_mixed_marginal_is_that_of_eq_42_to_45_with_the_prior_counted_once()
     result = search(readings, prior=0.3).run()
     occupied = result.occupied.reshape(LINE.shape)
     alpha, prior = 0.6, 0.2
-    q = marginals(result.evidence, np.zeros(LINE.size), plain_search(alpha=alpha, uncertainty_prior=prior))
+    q = marginals(result.evidence, plain_search(alpha=alpha, prior=prior))
     for c in range(LINE.size):
         both = [occupied.copy(), occupied.copy()]
         both[0][0, c], both[1][0, c] = 0, 1
@@ -403,7 +403,7 @@ def test_without_evidence_the_marginal_is_the_prior_at_any_alpha() -> None:
     prior = 0.2
     h = math.log(prior / (1 - prior))
     for alpha in (0.0, 0.3, 1.0):
-        q = float(marginals(np.zeros(1), np.zeros(1), plain_search(alpha=alpha, uncertainty_prior=prior))[0])
+        q = float(marginals(np.zeros(1), plain_search(alpha=alpha, prior=prior))[0])
         assert q == pytest.approx(prior)
         # Table 2's last line mixes in the prior as if the likelihood ratio contained it already
         printed = 1 / (1 + math.exp(-(1 - alpha) * h))
@@ -430,7 +430,7 @@ def test_eq_26_alone_says_nothing_of_the_free_space_before_an_obstacle() -> None
     assert alone == pytest.approx(0.0)
     summed = search(readings, start=occupied).run().evidence[2]
     assert summed == pytest.approx(5 * math.log(1 - PAPER.p_hit), abs=0.2)
-    q = marginals(np.array([alone, summed]), np.zeros(2), plain_search(alpha=1.0, uncertainty_prior=0.5))
+    q = marginals(np.array([alone, summed]), plain_search(alpha=1.0, prior=0.5))
     assert q[0] == pytest.approx(0.5)
     assert q[1] < 0.02
 
@@ -441,7 +441,7 @@ def test_eq_26_alone_says_nothing_of_the_free_space_before_an_obstacle() -> None
 def test_readings_without_echo_hold_the_free_space() -> None:
     # two ranges by chance in the open, where ten others heard nothing
     readings = along(0.55, 0.55, *[1.1] * 10)
-    parameters = replace(Parameters.from_flat({**PLAIN, 'resolution': 0.1, 'prior': 0.3}), model=PAPER)
+    parameters = replace(Parameters().varied({**PLAIN, 'resolution': 0.1, 'prior': 0.3}), model=PAPER)
     whole, echoes = (Mapper(parameters).run(part) for part in (readings, readings.select(readings.echo)))
     assert (whole.ml[-whole.grid.row, :11] == 0).all()
     assert echoes.ml[-echoes.grid.row, 5] == 1, 'a dot'

@@ -44,6 +44,6 @@ def made_maps(
         unexplained=np.arange(readings) % 10 == 0,
         log_likelihood=-123.5,
         objective=-150.25,
-        parameters=Parameters.from_flat(settings or {}),
+        parameters=Parameters().varied(settings or {}),
         statistics=statistics or {},
     )

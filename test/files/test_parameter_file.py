@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from forward_grid_mapper.core.common.errors import ParameterError
 from forward_grid_mapper.core.common.parameter import Parameter
-from forward_grid_mapper.core.common.parameters import TABLE, Parameters
+from forward_grid_mapper.core.common.parameters import CONSTANTS, TABLE, Parameters
 from forward_grid_mapper.core.messages.message_types import Pose2
 from forward_grid_mapper.files.parameter_file import ParameterFile, load_parameters, parse_sensor, parse_setting
 from forward_grid_mapper.files.parameter_text import dump_parameters, parameters_markdown
@@ -64,9 +64,10 @@ def test_dump_is_commented_and_plain_yaml() -> None:
 def test_markdown_has_a_row_for_each() -> None:
     text = parameters_markdown()
     rows = [line for line in text.splitlines() if line.startswith('| `')]
-    assert len(rows) == len(TABLE)
-    assert all(row.replace('\\|', '').count('|') == 6 for row in rows)
-    assert text.count('\n## ') == len({row.group for row in TABLE}) - 1
+    assert len(rows) == len(TABLE) + len(CONSTANTS)
+    columns = {row.split('`')[1]: row.replace('\\|', '').count('|') for row in rows}
+    assert columns == {row.name: 6 for row in TABLE} | {row.name: 6 for row in CONSTANTS}
+    assert text.count('\n## ') == len({row.group for row in TABLE})
 
 
 @pytest.mark.parametrize(

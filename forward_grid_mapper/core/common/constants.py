@@ -87,6 +87,9 @@ lies behind holes in walls is free. With `FREE_MARGIN` it is less than the margi
 LEAST_EVIDENCE = 0.1
 """Nats, either way, from which on a cell counts as observed though the maximum likelihood map does not know it."""
 
+LEAST_LOOK = 0.1
+"""Readings that it takes as well, of those that any surface there would have noticed, where they speak against one."""
+
 # The standard map
 
 ARC = (0.05, 0.1)

@@ -1,4 +1,4 @@
-"""One row of the table of parameters: its type, bounds and words, and the check of a value."""
+"""One row of the table of parameters: its type, bounds and words, and the check of a value; and constants beside it."""
 
 from __future__ import annotations
 
@@ -33,6 +33,23 @@ def param(
             'read_only': read_only,
         },
     )
+
+
+def constant(default: Any, plain: Any, help: str, unit: str = '') -> Any:
+    """Return the field of a dataclass that is a constant of the model: `plain` is its value with `plain_model`."""
+    return dataclasses.field(default=default, metadata={'plain': plain, 'help': help, 'unit': unit})
+
+
+@dataclass(frozen=True)
+class Constant:
+    """A constant of the model, which no user sets; `plain` is its value with `plain_model`."""
+
+    name: str
+    group: str
+    default: Any
+    plain: Any
+    unit: str
+    help: str
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,8 @@
 """The parameter table: every name, default, unit, range and help text, once.
 
 The dataclasses below are the table. The YAML file, the command line, the ROS parameters and `docs/parameters.md` are
-made from `TABLE`, which is read off their fields.
+made from `TABLE`, which is read off their fields. Fields that are `CONSTANTS` are no parameters: they have two values,
+the default and that of `plain_model`, the paper's.
 """
 
 from __future__ import annotations
@@ -9,13 +10,14 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import logging
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, get_origin, get_type_hints
 
 from .errors import ParameterError
 from .former_parameters import DEPRECATED, RENAMED, deprecation
-from .parameter import Parameter, param
+from .parameter import Constant, Parameter, constant, param
 
 LOG = logging.getLogger('forward_grid_mapper')
 
@@ -96,6 +98,12 @@ class ModelParameters:
     hangs on one reading, and smooth walls, which many readings meet without an echo, stand by the few that heard them.
     """
 
+    plain_model: bool = param(
+        False,
+        'The model of the paper, without what it does not have: the constants in the table below are the plain ones. '
+        'config/paper.yaml has the other values of the paper.',
+        read_only=True,
+    )
     p_hit: float = param(
         0.65,
         'Probability that 0.1 m of a surface in the cone returns the echo; the same for cells of any size.',
@@ -110,14 +118,6 @@ class ModelParameters:
         'probability',
         0.0,
         0.95,
-    )
-    likelihood_exponent: float = param(
-        1.0,
-        'Weight of the readings against the prior: the exponent of p(Z | m). Readings are not independent, so together '
-        'they say less than their sum; 1 is the paper.',
-        '',
-        0.01,
-        1.0,
     )
     sigma: float = param(
         0.1,
@@ -134,12 +134,14 @@ class ModelParameters:
         0.1,
         1.5708,
     )
-    surface_offset: float = param(
-        0.3,
-        'How far before the center of its cell the surface of an obstacle lies; 0 is the paper.',
-        'cells',
-        0.0,
-        0.5,
+    surface_offset: float = constant(
+        0.3, 0.0, 'How far before the center of its cell the surface of an obstacle lies.', 'cells'
+    )
+    likelihood_exponent: float = constant(
+        1.0,
+        1.0,
+        'Weight of the readings against the prior: the exponent of p(Z | m). Below 1 readings that are not independent '
+        'say less together than their sum.',
     )
 
     def __post_init__(self) -> None:
@@ -156,8 +158,9 @@ class SearchParameters:
 
     prior: float = param(
         0.4,
-        'Prior probability of an occupied cell in the first part of the search, which takes cells as independent; 0.5 '
-        "is the paper's plain ML, less removes dots and thins walls.",
+        'Prior probability of an occupied cell in the first part of the search, which takes cells as independent, and '
+        "of the uncertainty map if that is the only one; 0.5 is the paper's plain ML, less removes dots and thins "
+        'walls.',
         'probability',
         1e-6,
         0.5,
@@ -171,20 +174,18 @@ class SearchParameters:
         0.0,
         100.0,
     )
-    least_passed: float = param(
+    least_passed: float = constant(
         0.88,
+        0.0,
         'Readings that are expected to have passed through a cell for it to be known as free; 0 takes all cells seen.',
         'readings',
-        0.0,
-        100.0,
     )
-    least_noticed: float = param(
+    least_noticed: float = constant(
         1.0,
+        0.0,
         'What readings from different directions must say for floor to be known as free, counted in readings that '
         'would notice a wall whatever way it faces; 0 takes it as free from wherever it was seen.',
         'readings',
-        0.0,
-        100.0,
     )
     max_iterations: int = param(
         200, 'Bound on the iterations of the search; the report says when it was reached.', 'iterations', 1, 100_000
@@ -197,30 +198,7 @@ class SearchParameters:
         0,
         1_000_000,
     )
-    alpha: float = param(
-        1.0,
-        'Weight of the evidence in the uncertainty map, (45) of the paper. It, neighbour_weight and uncertainty_prior '
-        'are the coefficients of a logistic calibration, fitted to simulated worlds.',
-        '',
-        0.0,
-        1.0,
-    )
-    neighbour_weight: float = param(
-        0.6,
-        'Weight of what the neighbours of a cell say in the uncertainty map, by the prior of walls (the second '
-        'coefficient of the calibration); 0 is the paper.',
-        '',
-        0.0,
-        1.0,
-    )
-    uncertainty_prior: float = param(
-        0.38,
-        'Occupancy that the uncertainty map states without evidence and without neighbours (the offset of the '
-        'calibration).',
-        'probability',
-        1e-6,
-        0.999999,
-    )
+    alpha: float = param(1.0, 'Weight of the evidence in the uncertainty map, (45) of the paper.', '', 0.0, 1.0)
 
 
 @dataclass(frozen=True)
@@ -244,26 +222,25 @@ class LiveMapParameters:
         0.5,
         read_only=True,
     )
-    live_p_free_no_echo: float = param(
-        0.34, 'The same for a reading without echo, which may be a lost one.', 'probability', 0.001, 0.5, read_only=True
+    live_p_free_no_echo: float = constant(
+        0.34,
+        0.3,
+        'Occupancy of a cell on the axis, given one reading without echo, which may be a lost one.',
+        'probability',
     )
-    live_echo_width: float = param(
+    live_echo_width: float = constant(
         0.2,
+        1000.0,
         'Length of surface that an echo speaks for; of each cell of a longer arc it says as much less. With 1000 it '
         'says all of every cell.',
         'm',
-        0.01,
-        1000.0,
-        read_only=True,
     )
-    live_directions: int = param(
+    live_directions: int = constant(
         4,
-        'Directions of looking, over half a turn, whose readings are summed apart, so that readings at a slant do not '
-        "wipe out walls; 1 is the paper's one sum.",
-        'directions',
         1,
-        16,
-        read_only=True,
+        'Directions of looking, over half a turn, whose readings are summed apart, so that readings at a slant do not '
+        'wipe out walls.',
+        'directions',
     )
 
 
@@ -348,45 +325,78 @@ class Parameters:
         ParameterError
             For an unknown name, a wrong type or a value out of range.
         """
-        changes: dict[str, dict[str, Any]] = {}
+        given = {}
         for name, value in values.items():
             if name in DEPRECATED or name in RENAMED:
                 LOG.warning('%s', deprecation(name))
-            if name in DEPRECATED:
-                continue
-            row = find(name)
-            changes.setdefault(row.group, {})[row.name] = row.check(value)
-        base = base or cls()
+            if name not in DEPRECATED:
+                row = find(name)
+                given[row.name] = row.check(value)
+        return (base or cls()).varied(given)
+
+    @classmethod
+    def restored(cls, values: Mapping[str, Any]) -> Parameters:
+        """Return what `complete` returned, of this version or of one whose constants were parameters.
+
+        Raises
+        ------
+        ParameterError
+            As `from_flat`.
+        """
+        constants = {name: value for name, value in values.items() if name in _CONSTANTS}
+        for name, value in constants.items():
+            kind = type(_CONSTANTS[name].default)
+            if type(value) is not kind or not math.isfinite(value):
+                raise ParameterError(f'{name}: {value!r} is no finite {kind.__name__}')
+        others = {name: value for name, value in values.items() if name not in constants}
+        return cls.from_flat(others).varied(constants)
+
+    def varied(self, values: Mapping[str, Any]) -> Parameters:
+        """Return these with the named values changed, constants among them; nothing is checked but how they fit.
+
+        Another `plain_model` changes all constants that are not named.
+
+        Raises
+        ------
+        ParameterError
+            If values do not fit together, or no parameter and no constant has this name.
+        """
+        plain, changes = values.get('plain_model', self.model.plain_model), dict[str, dict[str, Any]]()
+        if plain != self.model.plain_model:
+            values = {row.name: row.plain if plain else row.default for row in CONSTANTS} | dict(values)
+        for name, value in values.items():
+            group = _CONSTANTS[name].group if name in _CONSTANTS else find(name).group
+            changes.setdefault(group, {})[name] = value
         return dataclasses.replace(
-            base,
-            **{group: dataclasses.replace(getattr(base, group), **change) for group, change in changes.items()},
+            self, **{group: dataclasses.replace(getattr(self, group), **change) for group, change in changes.items()}
         )
 
     def flat(self) -> dict[str, Any]:
-        """Return every value by name, in the table's order."""
+        """Return every parameter's value by name, in the table's order."""
         return {row.name: getattr(getattr(self, row.group), row.name) for row in TABLE}
 
+    def complete(self) -> dict[str, Any]:
+        """Return every value by name, those of constants too."""
+        return self.flat() | {row.name: getattr(getattr(self, row.group), row.name) for row in CONSTANTS}
 
-def _read_table() -> tuple[Parameter, ...]:
-    rows = []
+
+def _read_table() -> tuple[tuple[Parameter, ...], tuple[Constant, ...]]:
+    rows, constants = [], []
     for group in dataclasses.fields(Parameters):
         kind: Any = type(group.default)
         hints = get_type_hints(kind)
         for field in dataclasses.fields(kind):
-            rows.append(
-                Parameter(
-                    name=field.name,
-                    group=group.name,
-                    type=get_origin(hints[field.name]) or hints[field.name],
-                    default=field.default,
-                    **field.metadata,
-                )
-            )
-    return tuple(rows)
+            about = {'name': field.name, 'group': group.name, 'default': field.default, **field.metadata}
+            if 'plain' in about:
+                constants.append(Constant(**about))
+            else:
+                rows.append(Parameter(type=get_origin(hints[field.name]) or hints[field.name], **about))
+    return tuple(rows), tuple(constants)
 
 
-TABLE = _read_table()
+TABLE, CONSTANTS = _read_table()
 _BY_NAME = {row.name: row for row in TABLE}
+_CONSTANTS = {row.name: row for row in CONSTANTS}
 
 
 def find(name: str) -> Parameter:

@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 
 from ..common.constants import FREE_MARGIN, LED_ON
 from ..evidence.evidence import Evidence
-from .free_space import expected_passes
+from .free_space import Passes, expected_passes
 from .wall_extension import extend
 
 
@@ -57,6 +57,7 @@ def post_process(
     least_passed: float,
     least_noticed: float,
     traversed: NDArray[np.bool_],
+    passes: Passes | None = None,
 ) -> NDArray[np.int8]:
     """Return the maximum likelihood map that is handed out, shape `grid.shape`: 1 occupied, 0 free, -1 not observed.
 
@@ -74,13 +75,15 @@ def post_process(
         leads there within `LED_ON`; 0 asks for no such.
     traversed : bool, shape `grid.shape`
         Cells that are known to be free, though no reading may see them.
+    passes : Passes, optional
+        `expected_passes`, where they are known already.
     """
     ml = evidence.observed()
     # no cone holds the middle of the robot
     ml[traversed & (ml < 0)] = 0
     barred = known = traversed & (ml == 0)
     if least_passed > 0:
-        passes = expected_passes(evidence, evidence.state.maps.occupied)
+        passes = passes or expected_passes(evidence, evidence.state.maps.occupied)
         passed = known | ((passes.all >= least_passed).reshape(ml.shape) & (ml == 0))
         noticed = (passes.noticing >= least_noticed).reshape(ml.shape)
         # walls are not drawn out over what may be free

@@ -10,16 +10,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..common.constants import EXTENSION
 from ..common.grid import Grid
 from ..common.parameters import Parameters
 from ..common.readings import Readings
 from ..evidence.evidence import NEVER, NO_INCIDENCE_LIMIT, Evidence
 from ..maps.dynamic import dynamic_echoes
-from ..maps.post_processing import post_process
-from ..maps.uncertainty import uncertainty_map
+from ..maps.handed_out import hand_out
 from ..runtime.memory import memory_for_pairs
-from ..search.prior import has_walls, odds_given_neighbours, wall_prior
 from ..search.search import Progress, Search
 from ..sensor.cone_table import cone_table
 from ..sensor.forward_model import ForwardModel
@@ -163,14 +160,11 @@ def finished(given: Given, parameters: Parameters) -> Finished:
     """Return the maps of the core that go with the map that the search found."""
     p = parameters
     evidence = _evidence(given, p)
-    searched, of_occupancy = evidence.observed(), evidence.of_occupancy()
-    extension = EXTENSION if has_walls(p.search) else 0.0
-    ml = post_process(evidence, extension, p.search.least_passed, p.search.least_noticed, given.traversed)
-    prior = wall_prior(p.search, given.traversed.ravel(), given.box.resolution)
-    odds = odds_given_neighbours(prior, ml == 1)
+    searched = evidence.observed()
+    ml, uncertainty = hand_out(evidence, p.search, given.traversed)
     return Finished(
         given.core(ml),
-        given.core(uncertainty_map(of_occupancy, odds, ml, p.search)),
+        given.core(uncertainty),
         given.core(searched),
         evidence.log_likelihood_of(given.own),
         evidence.pairs,

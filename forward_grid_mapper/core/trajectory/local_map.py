@@ -68,8 +68,7 @@ class LocalMap(NamedTuple):
 
 def for_matching(parameters: Parameters) -> Parameters:
     """Return the parameters that scans are matched with: those of the maps but for `RESOLUTION` and `MODEL`."""
-    grid, model = replace(parameters.grid, resolution=RESOLUTION), replace(parameters.model, **MODEL)
-    return replace(parameters, grid=grid, model=model)
+    return parameters.varied({'resolution': RESOLUTION, **MODEL})
 
 
 def at_poses(readings: Readings, poses: Floats) -> Readings:

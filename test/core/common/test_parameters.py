@@ -6,7 +6,7 @@ import pytest
 
 from forward_grid_mapper.core.common.errors import ParameterError
 from forward_grid_mapper.core.common.former_parameters import DEPRECATED, RENAMED, deprecation
-from forward_grid_mapper.core.common.parameters import TABLE, Parameters, find
+from forward_grid_mapper.core.common.parameters import CONSTANTS, TABLE, Parameters, find
 
 
 @pytest.mark.parametrize('row', TABLE, ids=lambda row: row.name)
@@ -62,3 +62,27 @@ def test_former_names_are_taken_with_a_warning(old: str, new: str, caplog: pytes
     assert Parameters.from_flat({old: value}) == Parameters.from_flat({new: value})
     assert caplog.messages == [deprecation(old)]
     assert new in deprecation(old)
+
+
+def test_constants_have_two_values_and_are_no_parameters() -> None:
+    assert not {row.name for row in CONSTANTS} & {row.name for row in TABLE}
+    plain = Parameters.from_flat({'plain_model': True})
+    assert plain == Parameters().varied({'plain_model': True, **{row.name: row.plain for row in CONSTANTS}})
+    assert Parameters.from_flat({'plain_model': False}, base=plain) == Parameters()
+    # what does not name it leaves them alone
+    other = Parameters().varied({'least_passed': 0.5})
+    assert Parameters.from_flat({'p_hit': 0.5, 'plain_model': False}, base=other).search.least_passed == 0.5
+
+
+def test_what_is_complete_is_restored() -> None:
+    other = Parameters().varied({'least_passed': 0.5, 'live_directions': 2, 'p_hit': 0.5, 'plain_model': True})
+    assert Parameters.restored(other.complete()) == other
+    assert Parameters.from_flat(other.flat()) != other
+    assert Parameters.restored({'least_passed': 0.5}) == Parameters().varied({'least_passed': 0.5})
+    for bad in (float('nan'), 'word', None, True):
+        with pytest.raises(ParameterError, match='least_passed'):
+            Parameters.restored({'least_passed': bad})
+    with pytest.raises(ParameterError, match='p_hit'):
+        Parameters.restored({**other.complete(), 'p_hit': 2.0})
+    with pytest.raises(ParameterError, match='zzz'):
+        Parameters().varied({'zzz': 1})

@@ -29,7 +29,7 @@ def asked(maps: MapSet, row: int, column: int) -> CellEvidence:
 def test_what_readings_say_is_the_difference_of_two_maps(seed: int, exponent: float) -> None:
     rng = np.random.default_rng(seed)
     readings = random_readings(rng, AREA, 150, z_max=1.5)
-    maps = Mapper(Parameters.from_flat({'likelihood_exponent': exponent, 'end_cost': 0.05, 'prior': 0.5})).run(readings)
+    maps = Mapper(Parameters().varied({'likelihood_exponent': exponent, 'end_cost': 0.05, 'prior': 0.5})).run(readings)
     occupied = (maps.ml == 1).astype(np.int8)
 
     def likelihoods(changed: np.ndarray) -> np.ndarray:

@@ -34,7 +34,7 @@ PAPER = {'live_directions': 1, 'live_echo_width': 1000.0}
 @pytest.mark.parametrize('width', [0.1, 1000.0])
 def test_log_odds_are_those_of_the_twin(arc: tuple[float, float], directions: int, width: float) -> None:
     readings = random_readings(np.random.default_rng(directions), AREA, 80)
-    parameters = Parameters.from_flat({'live_directions': directions, 'live_echo_width': width})
+    parameters = Parameters().varied({'live_directions': directions, 'live_echo_width': width})
     live = LogOddsMap(parameters, arc)
     live.add(readings)
     p = parameters.live
@@ -61,7 +61,7 @@ def test_a_cone_along_the_lattice_has_the_cells_of_the_twin(half_angle: float, d
 def test_readings_at_a_slant_leave_a_wall_that_others_meet_head_on() -> None:
     # a wall along y, 1 m before the sensor
     def seen(directions: int) -> float:
-        live = LogOddsMap(Parameters.from_flat({'live_directions': directions}))
+        live = LogOddsMap(Parameters().varied({'live_directions': directions}))
         beam = {'half_angle': 0.1, 'z_max': 5.0}
         live.add(Readings.from_columns(x=0.05, y=0.05, yaw=0.0, z=[1.0] * 3, **beam))
         live.add(Readings.from_columns(x=1.05, y=-0.95, yaw=math.pi / 2, z=[3.0] * 20, **beam))
@@ -73,7 +73,7 @@ def test_readings_at_a_slant_leave_a_wall_that_others_meet_head_on() -> None:
 
 
 def test_what_nobody_calls_occupied_is_as_free_as_all_readings_say() -> None:
-    one, four = (LogOddsMap(Parameters.from_flat({'live_directions': n})) for n in (1, 4))
+    one, four = (LogOddsMap(Parameters().varied({'live_directions': n})) for n in (1, 4))
     yaw = np.linspace(0.0, 3.0, 9)
     readings = Readings.from_columns(x=0.05, y=0.05, yaw=yaw, z=np.full(9, 2.0), z_max=2.0, half_angle=0.6)
     for live in (one, four):
@@ -96,7 +96,7 @@ def test_a_long_arc_says_less_of_each_of_its_cells() -> None:
 
 
 def test_the_weight_falls_with_the_sine_of_the_angle_from_the_axis_to_the_edge() -> None:
-    live = LogOddsMap(Parameters.from_flat({'live_p_free': 0.2}))
+    live = LogOddsMap(Parameters().varied({'live_p_free': 0.2}))
     live.add(Readings.from_columns(x=0.0, y=0.0, yaw=0.0, z=[4.0], z_max=5.0, half_angle=0.6))
     rows, columns = live.grid.cells_of(np.full(5, 3.05), np.array([0.05, 0.55, 1.05, 1.55, 2.05]))
     sines = np.sin(np.arctan2([0.05, 0.55, 1.05, 1.55, 2.05], 3.05))
@@ -107,7 +107,7 @@ def test_the_weight_falls_with_the_sine_of_the_angle_from_the_axis_to_the_edge()
 
 @pytest.mark.parametrize('half_angle', [1e-6, 0.005, 0.02])
 def test_a_thin_cone_is_one_and_a_half_cells_wide(half_angle: float) -> None:
-    live = LogOddsMap(Parameters.from_flat({'live_p_free': 0.2}))
+    live = LogOddsMap(Parameters().varied({'live_p_free': 0.2}))
     # the axis leaves the centres of its cells by up to half a cell
     readings = Readings.from_columns(x=0.05, y=0.05, yaw=0.1, z=[3.0], z_max=5.0, half_angle=half_angle)
     live.add(readings)
@@ -153,7 +153,7 @@ def test_the_map_can_be_asked_for_on_a_larger_grid() -> None:
 
 
 def test_a_map_that_would_be_too_large_is_refused_and_nothing_changes() -> None:
-    live = LogOddsMap(Parameters.from_flat({'max_cells': 10_000}))
+    live = LogOddsMap(Parameters().varied({'max_cells': 10_000}))
     near = random_readings(np.random.default_rng(4), AREA, 5, z_max=1.0)
     live.add(near)
     before = live.log_odds()
@@ -165,7 +165,7 @@ def test_a_map_that_would_be_too_large_is_refused_and_nothing_changes() -> None:
 
 
 def test_evidence_that_cancels_leaves_a_known_cell() -> None:
-    live = LogOddsMap(Parameters.from_flat({'live_p_occupied': 0.8, 'live_p_free': 0.2}))
+    live = LogOddsMap(Parameters().varied({'live_p_occupied': 0.8, 'live_p_free': 0.2}))
     both = Readings.from_columns(x=0.05, y=0.05, yaw=0.0, z=[1.0, 2.0], z_max=4.0, half_angle=0.1)
     live.add(both)
     row, column = live.grid.cells_of(np.array(1.05), np.array(0.05))

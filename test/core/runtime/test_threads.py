@@ -96,7 +96,7 @@ def test_the_maps_do_not_depend_on_threads_or_memory(monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(threads, 'LEAST_PART', 50)
     readings = random_readings(np.random.default_rng(5), AREA, 1500, z_max=3.0)
     made = [
-        Mapper(Parameters.from_flat(values)).run(readings)
+        Mapper(Parameters().varied(values)).run(readings)
         for values in ({'threads': 1}, {'threads': 4}, {'threads': 0, 'max_memory': 0}, {'max_memory': 1})
     ]
     assert made[0].statistics['readings_not_stored'] == 0

@@ -18,7 +18,7 @@ from forward_grid_mapper.core.common.parameters import ModelParameters, SearchPa
 from forward_grid_mapper.core.common.readings import Readings
 from forward_grid_mapper.core.evidence.evidence import Evidence
 from forward_grid_mapper.core.evidence.updates import flip
-from forward_grid_mapper.core.maps.uncertainty import LEAST_EVIDENCE, marginals, uncertainty_map
+from forward_grid_mapper.core.maps.uncertainty import marginals
 from forward_grid_mapper.core.search import search as search_module
 from forward_grid_mapper.core.search.flips import gain_of
 from forward_grid_mapper.core.search.prior import Prior, independent_prior, odds_given_neighbours, wall_prior
@@ -203,7 +203,7 @@ def test_marginals_are_those_of_eq_43_by_brute_force() -> None:
     result = make(readings, grid).run()
     occupied = result.occupied.reshape(grid.shape)
     for alpha, prior in ((1.0, 0.5), (0.3, 0.2)):
-        q = marginals(result.evidence, np.zeros(grid.size), plain_search(alpha=alpha, uncertainty_prior=prior))
+        q = marginals(result.evidence, plain_search(alpha=alpha, prior=prior))
         for c in range(grid.size):
             likelihood = []
             for value in (0, 1):
@@ -215,7 +215,7 @@ def test_marginals_are_those_of_eq_43_by_brute_force() -> None:
 
 
 def test_alpha_zero_leaves_the_prior() -> None:
-    q = marginals(np.array([-50.0, 0.0, 1e9]), np.zeros(3), plain_search(alpha=0.0, uncertainty_prior=0.3))
+    q = marginals(np.array([-50.0, 0.0, 1e9]), plain_search(alpha=0.0, prior=0.3))
     assert q == pytest.approx(0.3)
 
 
@@ -413,26 +413,3 @@ def test_a_search_changes_nothing_outside_of_its_window() -> None:
     assert occupied[inside].any()
     # shifts and gaps may end a cell or a few beyond it
     assert not occupied[naive.box_sum(inside.astype(int)) == 0].any()
-
-
-@pytest.mark.parametrize('weight', [0.0, 0.6])
-def test_uncertainty_mixes_evidence_neighbours_and_prior(weight: float) -> None:
-    rng = np.random.default_rng(0)
-    evidence, neighbours = rng.normal(0, 5, (4, 5)), rng.normal(0, 2, (4, 5))
-    parameters = SearchParameters(alpha=0.7, neighbour_weight=weight, uncertainty_prior=0.3)
-    told = marginals(evidence, neighbours, parameters)
-    assert told.shape == (4, 5)
-    odds = np.exp(evidence) ** 0.7 * np.exp(neighbours) ** weight * 0.3 / 0.7
-    assert told == pytest.approx(odds / (1 + odds), abs=1e-6)
-    far = marginals(np.array([-1e9, 1e9]), np.zeros(2), parameters)
-    assert far.tolist() == [pytest.approx(0.0), 1.0]
-
-
-def test_the_uncertainty_map_says_nothing_where_the_readings_do_not() -> None:
-    ml = np.array([[1, 0, -1, -1], [1, 0, -1, -1]], np.int8)
-    evidence = np.array([0.0, 0.0, 0.0, 0.9, 2.0, -2.0, -0.9, 1.1]) * LEAST_EVIDENCE
-    told = uncertainty_map(evidence, np.zeros(8), ml, SearchParameters())
-    assert told.dtype == np.float32
-    assert np.isnan(told).tolist() == [[False, False, True, True], [False, False, True, False]]
-    expected = marginals(evidence, np.zeros(8), SearchParameters()).reshape(ml.shape)
-    assert np.array_equal(told[~np.isnan(told)], expected[~np.isnan(told)])

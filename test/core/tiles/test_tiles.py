@@ -47,7 +47,7 @@ def tour() -> Readings:
 
 @lru_cache
 def whole(**settings: Any) -> MapSet:
-    return Mapper(Parameters.from_flat(settings)).run(tour())
+    return Mapper(Parameters().varied(settings)).run(tour())
 
 
 def mosaic(readings: Readings, parameters: Parameters, size: float) -> Mosaic:
@@ -109,7 +109,7 @@ def test_every_reading_that_touches_a_window_is_its_own(seed: int, size: float) 
 @pytest.mark.parametrize('size', [2.0, 5.0])
 @pytest.mark.parametrize('settings', [{}, PAPER])
 def test_normals_evidence_and_maps_of_cores_are_those_of_the_whole(size: float, settings: dict[str, Any]) -> None:
-    p, maps = Parameters.from_flat(settings), whole(**settings)
+    p, maps = Parameters().varied(settings), whole(**settings)
     made = with_normals(mosaic(tour(), p, size), p)
     np.testing.assert_array_equal(made.all_normals().x, maps.normals.x)
     np.testing.assert_array_equal(made.all_normals().known, maps.normals.known)
@@ -171,7 +171,7 @@ def _objective(evidence: Evidence, prior: Any) -> float:
 
 @pytest.mark.parametrize(('size', 'settings'), [(2.0, {}), (5.0, {}), (5.0, PAPER)])
 def test_no_flip_gains_anywhere_at_the_end(size: float, settings: dict[str, Any]) -> None:
-    p = Parameters.from_flat(settings)
+    p = Parameters().varied(settings)
     maps = TiledMapper(p, size).run(tour())
     occupied = (maps.searched == 1).astype(np.uint8)
     evidence = Evidence(maps.grid, p.model, start=occupied)
@@ -239,7 +239,7 @@ def test_it_can_be_cancelled_and_says_what_is_wrong() -> None:
     with pytest.raises(Cancelled):
         mapper.run(tour(), lambda stage, progress: mapper.cancel() if stage == 'search' else None)
     with pytest.raises(InputError, match='max_cells'):
-        TiledMapper(Parameters.from_flat({'max_cells': 10_000, 'resolution': 0.05}), 3.0).run(tour())
+        TiledMapper(Parameters().varied({'max_cells': 10_000, 'resolution': 0.05}), 3.0).run(tour())
     with pytest.raises(InputError, match='nothing to map'):
         TiledMapper(Parameters(), 3.0).run(tour().select(slice(0, 0)))
 

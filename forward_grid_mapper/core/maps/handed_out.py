@@ -1,0 +1,42 @@
+"""The maps that are handed out, once the search is done: the same for the offline tool, the node and tiles."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..common.constants import EXTENSION
+from ..common.parameters import SearchParameters
+from ..evidence.evidence import Evidence
+from ..search.prior import has_walls
+from .free_space import expected_passes
+from .post_processing import post_process
+from .uncertainty import uncertainty_map
+
+
+class HandedOut(NamedTuple):
+    """The maximum likelihood map, int8, and the uncertainty map, float32, with values as in `MapSet`."""
+
+    ml: NDArray[np.int8]
+    uncertainty: NDArray[np.float32]
+
+
+def hand_out(evidence: Evidence, search: SearchParameters, traversed: NDArray[np.bool_]) -> HandedOut:
+    """Return the maps that go with the map that the search found, shape `grid.shape`.
+
+    Parameters
+    ----------
+    evidence : Evidence
+        After the search.
+    search : SearchParameters
+    traversed : bool, shape `grid.shape`
+        Cells that are known to be free, though no reading may see them.
+    """
+    walls = has_walls(search)
+    passes = expected_passes(evidence, evidence.state.maps.occupied) if walls or search.least_passed > 0 else None
+    extension = EXTENSION if walls else 0.0
+    ml = post_process(evidence, extension, search.least_passed, search.least_noticed, traversed, passes)
+    told = passes if walls else None
+    return HandedOut(ml, uncertainty_map(evidence.of_occupancy(), told, ml, traversed, search))
