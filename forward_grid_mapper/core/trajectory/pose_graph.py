@@ -71,11 +71,14 @@ class Yaws(NamedTuple):
         Radians.
     information : float64, shape (Y,)
         In 1/rad².
+    part : float
+        What the loss of each counts: less than 1 where they measure the same.
     """
 
     node: NDArray[np.int64]
     yaw: Floats
     information: Floats
+    part: float = 1.0
 
 
 class Walls(NamedTuple):
@@ -277,7 +280,7 @@ class _Normal:
         self.omega = sparse.block_diag(list(self.information), format='csr')
         self.h = self.j.T @ self.omega @ self.j
         self.gradient = self.j.T @ (self.omega @ r.ravel())
-        self.pulled = [self._add(*self._yaws()), self._add(*self._walls())]
+        self.pulled = [self._add(*self._yaws(), graph.yaws.part), self._add(*self._walls())]
         self._add_prior()
 
     def _yaws(self) -> tuple[Any, Floats, Floats]:
@@ -300,11 +303,11 @@ class _Normal:
         j = sparse.csr_matrix((values.ravel(), (rows.ravel(), columns.ravel())), (count, self.size))
         return j, off, walls.information
 
-    def _add(self, j: Any, off: Floats, information: Floats) -> tuple[Any, Floats]:
-        """Add what is measured with the loss of Geman and McClure; return its part in a draw."""
+    def _add(self, j: Any, off: Floats, information: Floats, part: float = 1.0) -> tuple[Any, Floats]:
+        """Add a part of the loss of Geman and McClure of what is measured; return what it has to do with a draw."""
         far = 1.0 + off**2 * information / ROBUST_YAW**2
-        self.cost += float((off**2 * information / far).sum())
-        pull = information / far**2
+        self.cost += part * float((off**2 * information / far).sum())
+        pull = part * information / far**2
         self.h = self.h + j.T @ sparse.diags(pull) @ j
         self.gradient += j.T @ (pull * off)
         return j, np.sqrt(pull)

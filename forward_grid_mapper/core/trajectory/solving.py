@@ -28,6 +28,7 @@ from .pose_graph import Edges, Graph, Solution, Walls, Yaws, joined, no_edges, s
 from .poses import Floats, rms_after_alignment
 from .scans import Scans
 from .wall_distances import Distances
+from .walls import EVERY, SPAN
 from .windows import Odometry, Windows
 
 WALL_ROUNDS = 3
@@ -45,9 +46,12 @@ OF_MATCHES = 0.2
 SETTLED = 0.1
 """Metres, in the root mean square, by which matching must have moved the nodes for it to be done again: a cell."""
 
-UNSEEN, LEAST_YAW = 2.0, math.radians(2.0)
+UNSEEN, LEAST_YAW = 2.0, math.radians(1.0)
 """Times that the yaw drifts more than walls say, and radians a √metre at least: an echo votes with all others of three
-metres, and what drifts within these is not seen."""
+metres, and what drifts within these is not seen. Wheels that slip now and then keep the yaw well in between."""
+
+OF_YAWS = EVERY / SPAN
+"""What the loss of a yaw that votes measure counts: an echo votes at all places that are near, and counts once."""
 
 OF_WAYS = np.array([1.0, 1.0, 0.0, 0.0])
 """The part of a calibration that is left where the yaw is known."""
@@ -85,7 +89,7 @@ class Solver:
         count = np.arange(len(windows))
         self._steps = Edges(count[:-1], count[1:], motion, information)
         yaw = windows.node[heading.at, 2] + heading.measured
-        self._yaws = Yaws(heading.at, yaw, heading.information)
+        self._yaws = Yaws(heading.at, yaw, heading.information, OF_YAWS)
 
     def calibration_of(self, solution: Solution) -> Floats:
         """Return the whole calibration of the odometry, shape (4,)."""
