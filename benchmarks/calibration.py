@@ -3,9 +3,9 @@
 
 usage: calibration.py [--buildings 24]
 
-A logistic regression on three parts that count alike: every other drive of quality_worlds.py, buildings of
-material_worlds.py, and these again where walls are what most rays of the laser say. Held out: the other drives, and
-twelve more buildings by both truths. What the readings say has the weight one. Prints the constants of
+A logistic regression on three parts: every other drive of quality_worlds.py, buildings of material_worlds.py, and these
+again where walls are what most rays of the laser say. Held out: the other drives, and twelve more buildings by both
+truths. What the readings say has the weight one. Prints the constants of
 `core/maps/uncertainty.py` beside those that are there, and log losses in nats a cell with either.
 """
 
@@ -34,6 +34,10 @@ Floats = NDArray[np.float64]
 NAMES = ('HOLE', 'INSIDE', 'STEP', 'END', 'BESIDE', 'ALONE', 'OCCUPIED', 'LEAST_AROUND', 'MEAN_AROUND')
 CLIP = 0.02
 """Probabilities are clipped to this and one less it, as score_map.py does."""
+
+SHARES = (0.57, 0.215, 0.215)
+"""What each of the three parts counts for: with less for the worlds, which have thin walls along the lattice, gaps of
+their walls are taken for walls."""
 
 HELD = 12
 
@@ -74,17 +78,18 @@ def cells_of(case: Case) -> Cells:
 
 
 def fitted(parts: Iterable[list[Cells]]) -> Floats:
-    """Return the weights with the least log loss; all parts count alike, and so do all drives of a part."""
-    drives = [(cells, 1.0 / len(part) / len(cells.said)) for part in parts for cells in part]
+    """Return the weights with the least log loss; all drives of a part count alike."""
+    shares = zip(SHARES, parts, strict=True)
+    drives = [(cells, share / len(part) / len(cells.said)) for share, part in shares for cells in part]
     said = np.concatenate([cells.said for cells, _ in drives])
     features = np.concatenate([cells.features for cells, _ in drives])
     occupied = np.concatenate([cells.occupied for cells, _ in drives]).astype(float)
-    share = np.concatenate([np.full(len(cells.said), weight) for cells, weight in drives])
+    weight = np.concatenate([np.full(len(cells.said), each) for cells, each in drives])
 
     def loss(weights: Floats) -> tuple[float, Floats]:
         logit = said + features @ weights
         error = 1 / (1 + np.exp(-logit)) - occupied
-        return float(share @ (np.logaddexp(0, logit) - occupied * logit)), features.T @ (share * error)
+        return float(weight @ (np.logaddexp(0, logit) - occupied * logit)), features.T @ (weight * error)
 
     return np.asarray(minimize(loss, np.zeros(len(NAMES)), jac=True, method='L-BFGS-B').x)
 
