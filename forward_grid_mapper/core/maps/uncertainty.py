@@ -62,6 +62,9 @@ def kind_of(pattern: int) -> float:
     return BESIDE if sides and len(bits) >= 3 else END
 
 
+BLOCK = 50_000
+"""Cells that are calibrated at once, so that memory for them is bounded."""
+
 KINDS = np.array([kind_of(pattern) for pattern in range(256)])
 
 
@@ -99,7 +102,9 @@ def around(passed: Floats) -> tuple[Floats, Floats]:
     return least, (total[:, :-2] + total[:, 1:-1] + total[:, 2:]) / 9.0
 
 
-def calibrated(evidence: Floats, passed: Floats, ml: NDArray[np.int8], parameters: SearchParameters) -> Floats:
+def calibrated(
+    evidence: Floats, passed: Floats, ml: NDArray[np.int8], parameters: SearchParameters
+) -> NDArray[np.float32]:
     """Return the occupancy probability of cells, shape `ml.shape`.
 
     Parameters
@@ -114,10 +119,17 @@ def calibrated(evidence: Floats, passed: Floats, ml: NDArray[np.int8], parameter
         Of which `alpha` counts.
     """
     occupied = (ml == 1).astype(np.uint8)
-    kinds = KINDS[patterns(occupied.ravel(), ml.shape)].reshape(ml.shape)
-    least, mean = around(passed)
-    logit = parameters.alpha * repeated(evidence) + kinds + OCCUPIED * occupied
-    return _probability(logit + LEAST_AROUND * np.log1p(least) + MEAN_AROUND * np.log1p(mean))
+    kinds = patterns(occupied.ravel(), ml.shape).reshape(ml.shape)
+    out = np.empty(ml.shape, np.float32)
+    height, width = ml.shape
+    step = max(BLOCK // max(width, 1), 1)
+    for begin in range(0, height, step):
+        rows, first = slice(begin, begin + step), max(begin - 1, 0)
+        # with the rows beside them, whose own neighbours do not count
+        least, mean = (of[begin - first :][:step] for of in around(passed[first : begin + step + 1]))
+        logit = parameters.alpha * repeated(evidence[rows]) + KINDS[kinds[rows]] + OCCUPIED * occupied[rows]
+        out[rows] = _probability(logit + LEAST_AROUND * np.log1p(least) + MEAN_AROUND * np.log1p(mean))
+    return out
 
 
 def uncertainty_map(
@@ -145,10 +157,10 @@ def uncertainty_map(
     told = evidence.reshape(ml.shape)
     silent = np.abs(told) < LEAST_EVIDENCE
     if passes is None:
-        probability = marginals(told, parameters)
+        probability = marginals(told, parameters).astype(np.float32)
     else:
         probability = calibrated(told, passes.all.reshape(ml.shape), ml, parameters)
         silent |= (told < 0) & (passes.noticing.reshape(ml.shape) < LEAST_LOOK)
         probability[traversed] = 0.0
     probability[(ml < 0) & silent] = np.nan
-    return probability.astype(np.float32)
+    return probability

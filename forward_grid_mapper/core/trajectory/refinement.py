@@ -172,15 +172,16 @@ class Refiner:
         watch, cuts, outcomes = self._watch, parts_at(readings, odometry, jumped_to), []
         for k, (own, part) in enumerate(cuts, 1):
             self._watch = partial(_named, watch, f'part {k} of {len(cuts)}, ')
-            outcomes.append(self._whole(own, part))
+            # to be placed, a part needs the best heading that there is, however little it moves
+            outcomes.append(self._whole(own, part, 0.0))
         self._watch = watch
         self._say('what follows jumps of odometry')
         parts = [Part(o.readings, part, o.trajectory, o.lost) for (_, part), o in zip(cuts, outcomes, strict=True)]
         begins = begins_of(parts, self._parameters, self._stop)
         return joined_parts(readings, odometry, parts, outcomes, begins)
 
-    def _whole(self, readings: Readings, odometry: Odometry) -> Refinement:
-        """Return the trajectory of a drive whose odometry does not jump."""
+    def _whole(self, readings: Readings, odometry: Odometry, least_moved: float = LEAST_MOVED) -> Refinement:
+        """Return the trajectory of a drive whose odometry does not jump; one that moves it by less is not taken."""
         reason = unfit(readings, odometry)
         if reason:
             return Refinement(False, reason, readings, odometry, {})
@@ -214,7 +215,7 @@ class Refiner:
             named = dict(zip(CALIBRATION, solver.calibration_of(solution).tolist(), strict=True))
         trajectory = refined(odometry, windows, nodes)
         moved, turned = differences(odometry, trajectory)
-        if moved < LEAST_MOVED:
+        if moved < least_moved:
             reason = f'odometry is off by {moved:.2f} m, which is no more than sonar can tell'
             return Refinement(False, reason, readings, odometry, named, gain=better.mean)
         placed, noise = replaced(readings, odometry, trajectory), walls.drifts.noise

@@ -198,7 +198,9 @@ def test_it_can_be_cancelled_while_parts_are_placed(
     bent: tuple[Readings, Odometry], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     refiner = Refiner(Parameters())
-    monkeypatch.setattr(refiner, '_whole', lambda readings, odometry: Refinement(False, '', readings, odometry, {}))
+    monkeypatch.setattr(
+        refiner, '_whole', lambda readings, odometry, least: Refinement(False, '', readings, odometry, {})
+    )
     place = jumping.OnMap
 
     def cancels(*arguments: object) -> object:
