@@ -26,6 +26,7 @@ from ..files.report import json_text, report_text
 from ..files.rerun_recording import NAME as RECORDING
 from ..files.rerun_recording import check_rerun, write_rerun
 from ..files.results import write_results
+from ..recordings.drive import jumps_note
 from ..recordings.drives import Drives, read_drives
 from ..recordings.refined import Given, refine_drives
 from .console import Ticker, run
@@ -144,6 +145,10 @@ def process(options: argparse.Namespace) -> int:
         seconds = {'reading the bag' if len(drives.drives) == 1 else 'reading the bags': read}
         if refined is not None:
             seconds['trajectory'] = time.perf_counter() - begin - read
+        if not options.refine_poses:
+            for drive in drives.drives:
+                name = f'{drive.source["bag"]}: ' if len(drives.drives) > 1 else ''
+                source['warnings'] += [name + note for note in jumps_note(drive.associator)]
         along = drives if refined is None else refined
         maps = along.with_live(map_and_learn(along.readings, parameters, options.learn, ticker.mapping, mapper))
         maps.statistics['seconds'] = {**seconds, **maps.statistics['seconds']}

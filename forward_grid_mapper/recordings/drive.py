@@ -20,6 +20,9 @@ from ..core.messages.robot_path import RobotPath
 from ..core.trajectory.jumps import FASTEST, LONGEST_STEP
 from ..files.quality_warning import thinned
 
+MOST_JUMPED = 0.1
+"""Part of the steps that are jumps, from which on poses are in another unit, or none of a robot."""
+
 
 @dataclass(frozen=True)
 class Part:
@@ -166,10 +169,29 @@ def path_of(associator: PoseAssociator) -> NDArray[np.float64]:
 def length_of(associator: PoseAssociator) -> float:
     """Return the metres that the robot drove; where odometry jumps faster than a robot drives it did not."""
     whole = np.hypot(*np.diff(path_of(associator), axis=0).T).sum()
-    stamp, pose = associator.record.snapshot()
-    steps = np.hypot(*np.diff(pose[:, :2], axis=0).T)
-    jumped = steps > LONGEST_STEP + FASTEST * np.diff(stamp) / NANOSECONDS
+    steps, jumped = _steps(associator)
     return max(float(whole - steps[jumped].sum()), 0.0)
+
+
+def jumps_note(associator: PoseAssociator) -> list[str]:
+    """Return a note where odometry jumps, for those who map it as it is; not where it seems to do nothing else."""
+    steps, jumped = _steps(associator)
+    count = int(np.count_nonzero(jumped))
+    if not 0 < count < MOST_JUMPED * len(steps):
+        return []
+    first = int(np.flatnonzero(jumped)[0])
+    return [
+        f'odometry jumps {"once" if count == 1 else f"{count} times"}, by {steps[first]:.1f} m after '
+        f'{steps[:first].sum():.0f} m of driving{"" if count == 1 else " first"}: the map has what comes after it '
+        f'in another place; --refine-poses puts it where readings fit, or map a part alone with --start and --duration'
+    ]
+
+
+def _steps(associator: PoseAssociator) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """Return the metres between poses of odometry, and which of these steps no robot drives."""
+    stamp, pose = associator.record.snapshot()
+    steps: NDArray[np.float64] = np.hypot(*np.diff(pose[:, :2], axis=0).T)
+    return steps, steps > LONGEST_STEP + FASTEST * np.diff(stamp) / NANOSECONDS
 
 
 def thinning_note(associator: PoseAssociator) -> list[str]:

@@ -9,7 +9,7 @@ import pytest
 
 from forward_grid_mapper.core.messages.message_types import OdometryMessage, Pose2
 from forward_grid_mapper.core.messages.pose_association import PoseAssociator
-from forward_grid_mapper.recordings.drive import length_of, path_of
+from forward_grid_mapper.recordings.drive import jumps_note, length_of, path_of
 
 
 def drive(order: np.ndarray, stamps: np.ndarray) -> PoseAssociator:
@@ -71,6 +71,17 @@ def test_a_jump_is_not_driven() -> None:
         x = 0.1 * k + (30.0 if k > 40 else 0.0)
         associator.add_odometry(OdometryMessage((k + 1) * 50_000_000, 'odom', 'base_link', Pose2(x, 0.0, 0.0)))
     assert length_of(associator) == pytest.approx(9.9, abs=0.1)
+    (note,) = jumps_note(associator)
+    assert 'jumps once, by 30.1 m after 4 m' in note and '--refine-poses' in note
     # messages that are missing are
     associator.add_odometry(OdometryMessage(20 * 10**9, 'odom', 'base_link', Pose2(44.0, 0.0, 0.0)))
     assert length_of(associator) == pytest.approx(13.9, abs=0.1)
+
+
+def test_neither_driving_nor_poses_in_another_unit_are_jumps() -> None:
+    for metres, messages in ((0.1, 100), (2.5, 100), (100.0, 100), (0.0, 1)):
+        associator = PoseAssociator(lambda base, frame, stamp: None, patient=True)
+        for k in range(messages):
+            # a second each: fast, and far too fast
+            associator.add_odometry(OdometryMessage((k + 1) * 10**9, 'odom', 'base_link', Pose2(metres * k, 0.0, 0.0)))
+        assert jumps_note(associator) == []

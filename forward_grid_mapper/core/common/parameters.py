@@ -348,7 +348,8 @@ class Parameters:
             kind = type(_CONSTANTS[name].default)
             if type(value) is not kind or not math.isfinite(value):
                 raise ParameterError(f'{name}: {value!r} is no finite {kind.__name__}')
-        others = {name: value for name, value in values.items() if name not in constants}
+        # what no longer is there was none that a user chose for this version
+        others = {name: value for name, value in values.items() if name not in constants and name not in DEPRECATED}
         return cls.from_flat(others).varied(constants)
 
     def varied(self, values: Mapping[str, Any]) -> Parameters:

@@ -29,6 +29,9 @@ LONGEST_STEP = 1.0
 LONGEST_TURN, FASTEST_TURN = 0.5, 2 * math.pi
 """Radians between two poses, and radians a second, beyond both of which it jumped."""
 
+LONGEST_OUTLIER = 0.5
+"""Seconds between the poses before and after others that are outliers."""
+
 FASTEST = 3.0
 """Metres a second that a robot may have driven across a jump."""
 
@@ -62,9 +65,6 @@ SAME = 0.25
 MOST_SAID = 3
 """Jumps that are told of."""
 
-NOT_WORSE = -1.0
-"""Standard errors by which readings may be foreseen worse where the robot stood, where it cannot have driven."""
-
 
 def jumps(odometry: Odometry) -> NDArray[np.int64]:
     """Return the numbers of the poses that odometry jumps to."""
@@ -85,6 +85,21 @@ def since_jump(odometry: Odometry) -> Odometry:
     found = jumps(odometry)
     first = int(found[-1]) if len(found) else 0
     return Odometry(odometry.stamp[first:], odometry.pose[first:]) if first else odometry
+
+
+def without_outliers(odometry: Odometry) -> Odometry:
+    """Return odometry without poses that it jumps to and soon back from, to where it goes on as if they were not there.
+
+    The same object if there are none.
+    """
+    stay, found = np.ones(len(odometry.stamp), np.bool_), jumps(odometry).tolist()
+    for begin, end in itertools.pairwise(found):
+        around = [begin - 1, end]
+        seconds = float(np.diff(odometry.stamp[around])[0]) * 1e-9
+        x, y, turn = np.diff(odometry.pose[around], axis=0)[0].tolist()
+        if stay[begin - 1] and seconds <= LONGEST_OUTLIER and not jumped(math.hypot(x, y), turn, seconds):
+            stay[begin:end] = False
+    return odometry if stay.all() else Odometry.of(odometry.stamp[stay], odometry.pose[stay])
 
 
 class Part(NamedTuple):
@@ -138,20 +153,31 @@ def begins_of(parts: Sequence[Part], parameters: Parameters, stop: NDArray[np.ui
     """
     out: list[Begin] = []
     on_map: list[Readings] = []
-    # the frame of odometry on the map, and where and when the robot was last known to be
-    carry, end, stamp = np.zeros(3), np.zeros(3), 0
+    # the frames of odometry on the map, the latest last, and where and when the robot was
+    frames, end, stamp = [np.zeros(3)], np.zeros(3), 0
     for part in parts:
-        begin = Begin(compose(carry, part.path.pose[0]), FIRST if len(part.readings) >= FEWEST_READINGS else UNKNOWN)
+        seconds = (int(part.odometry.stamp[0]) - stamp) * 1e-9
+        driven = [compose(frame, part.path.pose[0]) for frame in reversed(frames)]
+        begin = Begin(driven[0], FIRST if len(part.readings) >= FEWEST_READINGS else UNKNOWN)
+        stood = driven[0]
         if on_map:
-            fast = _too_fast(end, begin.pose, (int(part.odometry.stamp[0]) - stamp) * 1e-9)
-            begin = _begin_after(part, (end, begin.pose), fast, of_drives(on_map), parameters, stop)
+            # odometry may be back in a frame that it was in before
+            guess = next((pose for pose in driven if not _too_fast(end, pose, seconds)), None)
+            stood, other = end, driven[0] if guess is None else guess
+            begin = _begin_after(part, (stood, other), guess is None, of_drives(on_map), parameters, stop)
         out.append(begin)
-        if begin.how != UNKNOWN:
-            path = moved_to(begin.pose, part.path.pose)
-            carry, end = compose(path[-1], inverse(part.odometry.pose[-1])), path[-1]
-            stamp = int(part.odometry.stamp[-1])
+        known = begin.how != UNKNOWN
+        path = moved_to(begin.pose if known else stood, part.path.pose)
+        end, stamp = path[-1], int(part.odometry.stamp[-1])
+        if known:
+            frame = compose(end, inverse(part.odometry.pose[-1]))
+            frames = [*(each for each in frames if not _same(each, frame)), frame]
             on_map.append(readings_moved(part.readings, part.path.pose[0], begin.pose))
     return out
+
+
+def _same(one: Floats, other: Floats) -> bool:
+    return bool(np.all(np.abs(relative(one, other)) < SIGMA))
 
 
 def _too_fast(before: Floats, after: Floats, seconds: float) -> bool:
@@ -190,7 +216,7 @@ def _begin_after(
     usual = _Usual(part, parameters, stop)
     stood, driven, exactly = (_said(around.foreseen(pose, blocks)) for pose in (*found, guesses[1]))
     better = compared(driven, stood).sigmas
-    if usual.fits(around, found[0], GOOD_AT_REST if fast else GOOD) and better >= (NOT_WORSE if fast else LEAST_SIGMAS):
+    if usual.fits(around, found[0], GOOD_AT_REST if fast else GOOD) and (fast or better >= LEAST_SIGMAS):
         return Begin(found[0], STOOD)
     # both guesses may lead to one place
     same = np.hypot(*relative(found[1], found[0])[:2]) < SAME

@@ -23,7 +23,7 @@ from ..common.readings import Readings
 from ..runtime.cancelling import check
 from .heading import NOISES, Heading, heading
 from .holding_out import Gain, blocks_of, foreseen, gain, held_out, held_out_blocks
-from .jumps import MOST_JUMPS, UNKNOWN, Begin, Part, begins_of, jumps, parts_at, words
+from .jumps import MOST_JUMPS, UNKNOWN, Begin, Part, begins_of, jumps, parts_at, without_outliers, words
 from .local_map import at_poses, for_matching
 from .odometry_model import CALIBRATION
 from .passes import BLOCK
@@ -157,10 +157,13 @@ class Refiner:
             If `cancel` was called.
         """
         self._watch = watch
+        reason = without_times(readings, odometry)
+        if not reason and (sound := without_outliers(odometry)) is not odometry:
+            found = self.run(replaced(readings, odometry, sound), sound, watch)
+            return with_outliers(found, readings, odometry, len(odometry.stamp) - len(sound.stamp))
         jumped_to = jumps(odometry)
         if not len(jumped_to):
             return self._whole(readings, odometry)
-        reason = without_times(readings, odometry)
         if not reason and len(jumped_to) > MOST_JUMPS:
             reason = f'odometry jumps {len(jumped_to)} times: it is no wheel odometry, or messages are missing'
         if reason:
@@ -316,7 +319,9 @@ def joined_parts(
     taken = [k for k, outcome in enumerate(outcomes) if outcome.accepted]
     best = max(taken, key=lambda k: float(parts[k].odometry.travel[-1]), default=0)
     of, span = outcomes[best], parts[best].odometry.stamp
-    reason = f'{said}; {of.reason}' if of.reason else said
+    reason = said
+    if taken:
+        reason += f'; of the {parts[best].odometry.travel[-1]:.0f} m before or after, {of.reason}'
     same = all(
         np.allclose(begin.pose, part.odometry.pose[0], atol=1e-9) for begin, part in zip(begins, parts, strict=True)
     )
@@ -343,6 +348,16 @@ def joined_parts(
         unplaced=unplaced,
         stretch=(int(span[0]), int(span[-1])),
     )
+
+
+def with_outliers(found: Refinement, readings: Readings, odometry: Odometry, count: int) -> Refinement:
+    """Return what became of a drive from what became of it without so many poses of its odometry."""
+    named = f'{count} poses that odometry jumps to and back are outliers' if count > 1 else 'one pose is an outlier'
+    reason = f'{found.reason}; {named}'
+    if not found.accepted:
+        return replace(found, reason=reason, readings=readings, trajectory=odometry)
+    trajectory = Odometry.of(odometry.stamp, found.trajectory.at(odometry.stamp))
+    return replace(found, reason=reason, trajectory=trajectory)
 
 
 def _named(watch: Watch, name: str, stage: str, part: float) -> None:

@@ -14,7 +14,7 @@ from forward_grid_mapper.core.common.readings import Readings
 from forward_grid_mapper.core.trajectory import jumps as jumping
 from forward_grid_mapper.core.trajectory.correction import Correction
 from forward_grid_mapper.core.trajectory.following import Follower
-from forward_grid_mapper.core.trajectory.jumps import jumps, since_jump
+from forward_grid_mapper.core.trajectory.jumps import jumps, since_jump, without_outliers
 from forward_grid_mapper.core.trajectory.poses import compose, relative, rms_after_alignment
 from forward_grid_mapper.core.trajectory.refinement import Refinement, Refiner
 from forward_grid_mapper.core.trajectory.windows import Odometry
@@ -188,10 +188,59 @@ def test_a_few_messages_before_a_jump_do_not_matter(exact: Recording, bent: tupl
 def test_odometry_that_always_jumps_is_refused(bent: tuple[Readings, Odometry]) -> None:
     readings, odometry = bent
     pose = odometry.pose.copy()
-    pose[:: len(pose) // 50] += np.array([4.0, 0.0, 0.0])
+    pose[np.arange(len(pose)) // (len(pose) // 50) % 2 == 1] += np.array([4.0, 0.0, 0.0])
     left = Refiner(Parameters()).run(readings, replace(odometry, pose=pose))
     assert not left.accepted and 'no wheel odometry' in left.reason
     assert left.readings is readings
+
+
+def test_odometry_may_begin_anew_again_and_again(exact: Recording, bent: tuple[Readings, Odometry]) -> None:
+    readings, odometry = begun_anew(*begun_anew(*bent, 0.4), 0.7)
+    assert len(jumps(odometry)) == 2
+    found = Refiner(Parameters()).run(readings, odometry)
+    assert found.accepted and not found.unplaced
+    assert found.jumps.count('the readings fit where the robot was before it') == 2
+    assert off(exact, found.trajectory) < 0.2
+
+
+def test_odometry_that_jumps_back_is_where_it_was(exact: Recording) -> None:
+    readings, true = exact.readings, odometry_of(exact)
+    first, second = (int(part * len(true.stamp)) for part in (0.4, 0.6))
+    pose = true.pose.copy()
+    pose[first:second, 0] += 5.0
+    odometry = Odometry.of(true.stamp, pose)
+    found = Refiner(Parameters()).run(moved(readings, true, odometry), odometry)
+    assert found.accepted and not found.unplaced
+    assert off(exact, found.trajectory) < 0.1
+
+
+@pytest.mark.parametrize('count', [1, 3])
+def test_poses_that_odometry_jumps_to_and_back_are_left_out(
+    exact: Recording, bent: tuple[Readings, Odometry], count: int
+) -> None:
+    readings, odometry = bent
+    pose = odometry.pose.copy()
+    for at in np.linspace(20, len(pose) - 20, 30).astype(int).tolist():
+        pose[at : at + count] = (50.0, -20.0, 1.0)
+    wild = Odometry.of(odometry.stamp, pose)
+    sound = without_outliers(wild)
+    assert np.isin(odometry.stamp, sound.stamp).sum() == len(sound.stamp) == len(pose) - 30 * count
+    assert without_outliers(odometry) is odometry
+    found = Refiner(Parameters()).run(moved(readings, odometry, wild), wild)
+    assert found.accepted and f'{30 * count} poses that odometry jumps to and back are outliers' in found.reason
+    assert np.array_equal(found.trajectory.stamp, wild.stamp)
+    assert off(exact, found.trajectory) < 0.2
+
+
+def test_with_outliers_a_drive_that_is_left_alone_is_as_it_came(exact: Recording) -> None:
+    readings, true = exact.readings, odometry_of(exact)
+    pose = true.pose.copy()
+    pose[100] += np.array([3.0, 2.0, 1.0])
+    wild = Odometry.of(true.stamp, pose)
+    came = moved(readings, true, wild)
+    found = Refiner(Parameters()).run(came, wild)
+    assert not found.accepted and 'one pose is an outlier' in found.reason
+    assert found.readings is came and found.trajectory is wild
 
 
 def test_it_can_be_cancelled_while_parts_are_placed(
