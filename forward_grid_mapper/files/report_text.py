@@ -85,8 +85,9 @@ def _became(found: dict[str, Any]) -> str:
 
 
 def _wheels(found: dict[str, Any]) -> str:
-    words = found.get('odometry')
-    return f'{words}; it is what fits this drive: measure before you set it' if words else ''
+    words = found.get('odometry') or ''
+    some = found.get('told') is None or found['told']
+    return f'{words}; it is what fits this drive: measure before you set it' if words and some else words
 
 
 def _counts(data: dict[str, Any]) -> Iterator[str]:
