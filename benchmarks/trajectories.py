@@ -6,7 +6,8 @@
     python benchmarks/trajectories.py --distance 250 500 1000    # how time and memory grow
 
 Each run prints the absolute trajectory error (rms after rigid alignment, metres) of odometry and of what `Refiner`
-makes of it, whether that was taken, and the time of one core a metre; each group ends with a summary.
+makes of it, whether that was taken, and the time of one core a metre; each group ends with a summary. Of recordings the
+map is scored as well, by ../shared/tools/score_map.py with --align.
 """
 
 from __future__ import annotations
@@ -17,11 +18,16 @@ import math
 import resource
 import time
 from pathlib import Path
+from types import ModuleType
+from typing import Any
 
 import numpy as np
+from quality_worlds import scoring_tool
 
+from forward_grid_mapper.core.common.grid import UNKNOWN
 from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.common.readings import Readings
+from forward_grid_mapper.core.mapping import Mapper
 from forward_grid_mapper.core.trajectory.poses import rms_after_alignment
 from forward_grid_mapper.core.trajectory.refinement import Refiner
 from forward_grid_mapper.core.trajectory.windows import Odometry
@@ -112,7 +118,7 @@ def odometry_of(recording: Recording) -> Odometry:
     return Odometry.of(np.array([m.stamp for m in messages]), np.array([m.pose for m in messages], np.float64))
 
 
-def run(name: str, readings: Readings, odometry: Odometry, true: Odometry) -> dict[str, float | bool | str]:
+def run(name: str, readings: Readings, odometry: Odometry, true: Odometry) -> dict[str, Any]:
     """Refine one drive, print a row and return its figures."""
     began = time.process_time()
     outcome = Refiner(Parameters()).run(readings, odometry)
@@ -123,10 +129,17 @@ def run(name: str, readings: Readings, odometry: Odometry, true: Odometry) -> di
     print(
         f'{name:<34} {before:7.2f} → {after:6.3f} m  {spent:4.0f} ms/m  {"WORSE  " if worse else ""}{taken}', flush=True
     )
-    return {'before': before, 'after': after, 'worse': worse, 'taken': outcome.accepted, 'ms': spent}
+    return {
+        'before': before,
+        'after': after,
+        'worse': worse,
+        'taken': outcome.accepted,
+        'ms': spent,
+        'readings': outcome.readings,
+    }
 
 
-def simulated(robot: str, level: str, seeds: range, first: int) -> list[dict[str, float | bool | str]]:
+def simulated(robot: str, level: str, seeds: range, first: int) -> list[dict[str, Any]]:
     """Run the simulated worlds of one robot and level."""
     sonars, spacing, noise = ROBOTS[robot]
     rows = []
@@ -155,9 +168,9 @@ def far(robot: str, level: str, distances: list[float], seed: int) -> None:
         print(f'{"":<34} {len(exact.readings)} readings; {before:.0f} MB before, {peak:.0f} MB at the peak', flush=True)
 
 
-def recorded(folder: Path) -> list[dict[str, float | bool | str]]:
+def recorded(folder: Path) -> list[dict[str, Any]]:
     """Run the recordings that have corrected odometry beside the raw one."""
-    rows = []
+    rows, tool = [], scoring_tool()
     for name in RECORDINGS:
         if not (folder / name).exists():
             continue
@@ -166,10 +179,25 @@ def recorded(folder: Path) -> list[dict[str, float | bool | str]]:
         )
         odometry, true = (Odometry.of(*each.associator.odometry) for each in (raw, right))
         rows.append(run(name, raw.associator.readings, odometry, true))
+        if tool is not None:
+            print_map_score(rows[-1]['readings'], folder / name, tool)
     return rows
 
 
-def summary(title: str, rows: list[dict[str, float | bool | str]]) -> None:
+def print_map_score(readings: Readings, folder: Path, tool: ModuleType) -> None:
+    """Print how good the map of readings is, turned and moved onto the reference."""
+    maps = Mapper(Parameters()).run(readings)
+    probability = np.where(maps.ml == UNKNOWN, np.nan, maps.ml)
+    truth, corner, cell = tool.load(folder / 'reference.yaml')
+    origin, resolution = np.array(maps.grid.origin), maps.grid.resolution
+    motion = tool.rigid(probability, origin, resolution, truth, corner, cell)
+    moved = tool.resample_moved(probability, origin, resolution, motion, truth.shape, corner, cell)
+    path = tool.path_cells(np.loadtxt(folder / 'trajectory.csv', delimiter=',', ndmin=2), corner, cell, truth.shape)
+    said = tool.score(moved, truth, path, cell)
+    print(f'{"":<34} F1 of the map {said["f1"]:.3f}, nav_iou {said["nav_iou"]:.3f}', flush=True)
+
+
+def summary(title: str, rows: list[dict[str, Any]]) -> None:
     """Print what a group of runs comes to."""
     before, after, spent = (np.array([row[key] for row in rows], float) for key in ('before', 'after', 'ms'))
     taken, worse = (sum(bool(row[key]) for row in rows) for key in ('taken', 'worse'))
