@@ -66,13 +66,15 @@ class BagParser(argparse.ArgumentParser):
             options.bags = found
         elif found:
             options.bag = found[-1]
-        if not (options.bags if self._takes_bags else options.bag):
+        # the parameters are shown without reading anything
+        shown = getattr(options, 'dump_config', False)
+        if not shown and not (options.bags if self._takes_bags else options.bag):
             taken = next((name for name in self._several if getattr(options, name, None)), None)
             hint = ''
             if taken is not None:
                 option, words = f'--{taken.replace("_", "-")}', ' '.join(map(quoted, getattr(options, taken)))
                 hint = f'; {option} took all of: {words}. Give the bag first: {self.prog} BAG {option} {words}'
-            self.error(f'no bag is given, or it does not exist{hint}')
+            self.error(f'no bag is given, or it does not exist; a bag is a folder, or a .mcap, .db3 or .bag file{hint}')
         if getattr(options, 'range_topics', None) is not None:
             # a comma cannot be part of a topic's name
             options.range_topics = [t for word in options.range_topics for t in word.split(',') if t.strip()]

@@ -17,7 +17,7 @@ from ..core.messages.message_batch import MessageBatch
 from ..core.messages.message_types import NANOSECONDS, Pose2
 from ..core.messages.pose_association import PoseAssociator
 from ..core.messages.robot_path import RobotPath
-from ..core.trajectory.jumps import FASTEST, LONGEST_STEP
+from ..core.trajectory.jumps import too_far
 from ..files.quality_warning import thinned
 
 MOST_JUMPED = 0.1
@@ -191,7 +191,7 @@ def _steps(associator: PoseAssociator) -> tuple[NDArray[np.float64], NDArray[np.
     """Return the metres between poses of odometry, and which of these steps no robot drives."""
     stamp, pose = associator.record.snapshot()
     steps: NDArray[np.float64] = np.hypot(*np.diff(pose[:, :2], axis=0).T)
-    return steps, steps > LONGEST_STEP + FASTEST * np.diff(stamp) / NANOSECONDS
+    return steps, too_far(steps, np.diff(stamp) / NANOSECONDS)
 
 
 def thinning_note(associator: PoseAssociator) -> list[str]:

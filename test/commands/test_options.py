@@ -208,6 +208,12 @@ def test_the_parameters_of_a_call_are_shown_as_a_file(
     assert {path.name for path in tmp_path.iterdir()} == {'bag', 'dumped.yaml'}
 
 
+@pytest.mark.parametrize('main', [process_bag.main, learn.main])
+def test_parameters_are_shown_without_a_bag(main: Callable[..., int], capsys: pytest.CaptureFixture[str]) -> None:
+    assert code_of(main, '--set', 'p_hit=0.55', '--dump-config') == 0
+    assert '\n    p_hit: 0.55\n' in capsys.readouterr().out
+
+
 @pytest.mark.parametrize('name', sorted(COMMANDS))
 def test_every_command_tells_its_version(name: str, capsys: pytest.CaptureFixture[str]) -> None:
     main = importlib.import_module(f'forward_grid_mapper.{COMMANDS[name][0]}').main

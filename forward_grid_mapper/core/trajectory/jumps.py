@@ -80,6 +80,11 @@ def jumped(far: Any, turn: Any, seconds: Any) -> Any:
     return (far > LONGEST_STEP) | ((turn > LONGEST_TURN) & (turn > FASTEST_TURN * np.asarray(seconds)))
 
 
+def too_far(metres: Any, seconds: Any) -> Any:
+    """Return whether no robot drives so far in that time, though messages may be missing."""
+    return metres > LONGEST_STEP + FASTEST * seconds
+
+
 def since_jump(odometry: Odometry) -> Odometry:
     """Return the odometry from the last jump on; all of it if there is none."""
     found = jumps(odometry)
@@ -182,7 +187,7 @@ def _same(one: Floats, other: Floats) -> bool:
 
 def _too_fast(before: Floats, after: Floats, seconds: float) -> bool:
     x, y, turn = relative(before, after).tolist()
-    return math.hypot(x, y) > LONGEST_STEP + FASTEST * seconds or abs(turn) > LONGEST_TURN + FASTEST_TURN * seconds
+    return bool(too_far(math.hypot(x, y), seconds)) or abs(turn) > LONGEST_TURN + FASTEST_TURN * seconds
 
 
 def _begin_after(
