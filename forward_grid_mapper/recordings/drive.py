@@ -180,10 +180,11 @@ def jumps_note(associator: PoseAssociator) -> list[str]:
     if not 0 < count < MOST_JUMPED * len(steps):
         return []
     first = int(np.flatnonzero(jumped)[0])
+    often = 'once,' if count == 1 else f'{count} times, first'
     return [
-        f'odometry jumps {"once" if count == 1 else f"{count} times"}, by {steps[first]:.1f} m after '
-        f'{steps[:first].sum():.0f} m of driving{"" if count == 1 else " first"}: the map has what comes after it '
-        f'in another place; --refine-poses puts it where readings fit, or map a part alone with --start and --duration'
+        f'odometry jumps {often} by {steps[first]:.1f} m after {steps[:first].sum():.0f} m of driving: the map has what '
+        f'comes after it in another place; --refine-poses puts it where readings fit, or map a part alone with --start '
+        f'and --duration'
     ]
 
 

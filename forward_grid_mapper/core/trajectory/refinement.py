@@ -321,7 +321,7 @@ def joined_parts(
     of, span = outcomes[best], parts[best].odometry.stamp
     reason = said
     if taken:
-        reason += f'; of the {parts[best].odometry.travel[-1]:.0f} m before or after, {of.reason}'
+        reason += f'; in the longest part that was refined, {parts[best].odometry.travel[-1]:.0f} m, {of.reason}'
     same = all(
         np.allclose(begin.pose, part.odometry.pose[0], atol=1e-9) for begin, part in zip(begins, parts, strict=True)
     )
