@@ -183,8 +183,8 @@ def jumps_note(associator: PoseAssociator) -> list[str]:
     often = 'once,' if count == 1 else f'{count} times, first'
     return [
         f'odometry jumps {often} by {steps[first]:.1f} m after {steps[:first].sum():.0f} m of driving: the map has '
-        f'what comes after it in another place; --refine-poses puts it where readings fit, or map a part alone with --start '
-        f'and --duration'
+        f'what comes after it in another place; --refine-poses puts it where readings fit, or map a part alone with '
+        f'--start and --duration'
     ]
 
 
