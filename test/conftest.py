@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import signal
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+
+from forward_grid_mapper.commands.domain import own_domain
 
 sys.path.insert(0, str(Path(__file__).parent))
 
@@ -19,6 +22,13 @@ def shared() -> Path:
     if not (SHARED / 'data').is_dir():
         pytest.skip(f'the real recordings are not at {SHARED}')
     return SHARED
+
+
+@pytest.fixture
+def domain() -> Iterator[int]:
+    """A DDS domain that nobody else has: no other test, and no other run of the tests on this machine."""
+    with own_domain() as number:
+        yield number
 
 
 def pytest_configure() -> None:

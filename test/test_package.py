@@ -33,7 +33,8 @@ DEPENDENCIES = {
         'python3-yaml',
     },
     'test_depend': {
-        *('python3-argcomplete', 'python3-hypothesis', 'python3-pil', 'python3-pytest', 'python3-pytest-xdist'),
+        *('python3-argcomplete', 'python3-hypothesis', 'python3-pil'),
+        *('python3-pytest', 'python3-pytest-timeout', 'python3-pytest-xdist'),
     },
 }
 """Names of ROS packages, and keys of rosdep for the rest."""

@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -16,6 +17,7 @@ from ..core.common.errors import MapperError
 from ..core.common.parameters import Parameters
 from ..core.messages.message_types import Pose2
 from ..files.parameter_text import dump_parameters
+from .domain import own_domain
 from .signals import ENDS_WITH_STDIN
 
 NODE = '/forward_grid_mapper'
@@ -66,9 +68,8 @@ class LiveNode:
         lines = [dump_parameters(parameters), '\n    # ---- Poses of the sensors on the robot\n\n']
         lines += [f'    sensors.{frame}.pose: [{p.x!r}, {p.y!r}, {p.yaw!r}]\n' for frame, p in extrinsics]
         (folder / 'parameters.yaml').write_text(''.join(lines), encoding='utf-8')
-        # neither other robots nor another demo may receive this one's messages
-        domain = str(1 + os.getpid() % 100)
-        self.environment = {**os.environ, 'ROS_DOMAIN_ID': domain, 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST'}
+        self.environment = dict(os.environ)
+        self._domain = ExitStack()
         self._client: Any = None
         self._process: subprocess.Popen[bytes] | None = None
 
@@ -82,6 +83,9 @@ class LiveNode:
         return self
 
     def _start(self) -> None:
+        # neither other robots nor another demo may receive this one's messages
+        domain = str(self._domain.enter_context(own_domain()))
+        self.environment.update(ROS_DOMAIN_ID=domain, ROS_AUTOMATIC_DISCOVERY_RANGE='LOCALHOST')
         with self._log.open('wb') as log:
             arguments = ['mapper', '--ros-args', '--params-file', str(self._folder / 'parameters.yaml')]
             self._process = start_child(arguments, self.environment, stdout=log, stderr=subprocess.STDOUT)
@@ -105,6 +109,7 @@ class LiveNode:
         finally:
             if self._process is not None:
                 end_child(self._process)
+            self._domain.close()
 
     def run(self, *arguments: str) -> None:
         """Run another of our commands beside the node, and wait for its end.

@@ -17,7 +17,6 @@ from forward_grid_mapper.core.common import shell
 from forward_grid_mapper.core.messages.message_types import Pose2
 from forward_grid_mapper.files import drawing
 
-LEAD = f'{shell.module_line("forward_grid_mapper")} '
 PARSERS = {'process_bag': process_bag.parser, 'learn': learn.parser, 'replay_bag': replay_bag.parser}
 NAMES = ['plain', 'with space', 'a, b', 'it\'s $HOME `x` "y"', 'a;b&c|d>e', '-dash', 'Büro 日本', '*?[a]', '#1', '~']
 
@@ -39,7 +38,9 @@ def words_of(line: str) -> list[str]:
 
 def commands_in(text: str) -> list[list[str]]:
     """The commands among the lines of an output, without the interpreter and the package."""
-    return [words_of(line.strip())[3:] for line in text.splitlines() if line.strip().startswith(LEAD)]
+    # what a shell calls the interpreter depends on the folder
+    lead = f'{shell.module_line("forward_grid_mapper")} '
+    return [words_of(line.strip())[3:] for line in text.splitlines() if line.strip().startswith(lead)]
 
 
 def two_odometries() -> Tape:

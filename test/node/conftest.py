@@ -1,9 +1,7 @@
-"""Fixtures of the tests of the node; every test has a DDS domain of its own."""
+"""Fixtures of the tests of the node."""
 
 from __future__ import annotations
 
-import itertools
-import os
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -12,27 +10,6 @@ from typing import Any
 import pytest
 
 sys.path.insert(0, str(Path(__file__).parent))
-
-
-LAST_DOMAIN = 96
-"""Beyond are those of other rooms' tests; ports of domains above 101 may be in use."""
-
-
-def _domains_of_this_process() -> Iterator[int]:
-    """Yield domains that no process beside this one has, beginning with another one in each run of the tests."""
-    worker = int(os.environ.get('PYTEST_XDIST_WORKER', 'gw0').removeprefix('gw'))
-    count = max(int(os.environ.get('PYTEST_XDIST_WORKER_COUNT', '1')), 1)
-    own = max(LAST_DOMAIN // count, 1)
-    for k in itertools.count(os.getpid()):
-        yield 1 + (own * worker + k % own) % LAST_DOMAIN
-
-
-_domains = _domains_of_this_process()
-
-
-@pytest.fixture
-def domain() -> int:
-    return next(_domains)
 
 
 @pytest.fixture

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import random
 import signal
 import time
 from collections.abc import Iterator
@@ -15,13 +14,10 @@ from replay_samples import CLOCK, ODOMETRY, RANGE, SENSORS, START, Wire, message
 
 from forward_grid_mapper.core.messages.message_types import NANOSECONDS, stamp_of
 
-DOMAIN = random.randint(97, 101)
-"""None of those of the node's tests."""
-
 
 @pytest.fixture
-def dds() -> Iterator[Wire]:
-    with wire(DOMAIN) as made:
+def dds(domain: int) -> Iterator[Wire]:
+    with wire(domain) as made:
         yield made
 
 

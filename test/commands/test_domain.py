@@ -1,0 +1,55 @@
+"""A DDS domain that nobody else has."""
+
+from __future__ import annotations
+
+import os
+import socket
+import subprocess
+import sys
+from contextlib import ExitStack
+from pathlib import Path
+
+import pytest
+
+from forward_grid_mapper.commands import domain
+from forward_grid_mapper.commands.domain import own_domain
+from forward_grid_mapper.core.common.errors import MapperError
+
+
+def test_domains_that_are_held_at_once_differ_and_come_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(domain, 'LAST', 3)
+    with ExitStack() as stack:
+        with own_domain() as one, own_domain() as other:
+            assert one != other
+            stack.enter_context(own_domain())
+            with pytest.raises(MapperError, match=r'every DDS domain from 1 to 3 is in use'), own_domain():
+                pass
+        with own_domain() as again:
+            assert again in (one, other)
+
+
+def test_a_domain_with_a_participant_is_passed_over() -> None:
+    with own_domain() as found:
+        pass
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as participant:
+        participant.bind(('', 7400 + 250 * found + 10))
+        with own_domain() as other:
+            assert other != found
+
+
+def test_the_port_of_a_participant_is_that_of_the_middleware(tmp_path: Path) -> None:
+    pytest.importorskip('rclpy', reason='rclpy is not installed (the extra ros, or a sourced ROS 2)')
+    with own_domain() as found:
+        environment = {**os.environ, 'ROS_DOMAIN_ID': str(found), 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST'}
+        script = tmp_path / 'participant.py'
+        script.write_text(
+            "import rclpy\nrclpy.init()\nnode = rclpy.create_node('a')\nprint('made', flush=True)\ninput()\n"
+        )
+        with subprocess.Popen(
+            [sys.executable, str(script)], env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        ) as process:
+            assert process.stdout is not None and process.stdout.readline() == 'made\n'
+            port = 7400 + domain.PORTS * found + domain.FIRST_PARTICIPANT
+            with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken, pytest.raises(OSError, match='in use'):
+                taken.bind(('', port))
+            process.communicate('\n', timeout=60.0)
