@@ -90,22 +90,24 @@ class Worker:
         """
         ended = threading.Event()
         found: list[T] = []
-        why: list[str] = []
+        why = list[str]()
 
         def do() -> None:
             found.append(work())
             ended.set()
 
         def fail(text: str) -> None:
-            why.append(text)
-            ended.set()
+            try:
+                why.append(text)
+            finally:
+                ended.set()
 
         self.put(do, fail)
         while not ended.wait(0.5):
             if self._closed:
                 raise MapperError(f'{self.name} has ended')
-        if why:
-            raise MapperError(why[0])
+        if not found:
+            raise MapperError(why[0] if why else 'there is not enough memory')
         return found[0]
 
     def forgive(self) -> None:
@@ -145,8 +147,9 @@ class Worker:
                     self._wake.wait()
                 if self._closed:
                     return
-                task = self._tasks.popleft()
+                # in this order, so that nobody who looks meanwhile finds that all is done
                 self._busy = True
+                task = self._tasks.popleft()
             try:
                 task.work()
                 if not self._lasting:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import threading
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -23,7 +23,7 @@ from ..core.runtime.memory import shortage
 from ..core.runtime.threads import cores
 from ..core.search.search import Progress
 from ..files.quality_warning import quality_warning
-from .background import Worker
+from .background import Worker, reason
 from .refining import RefiningMapper
 
 
@@ -45,10 +45,10 @@ class Outcome:
 class Run:
     """One run of EM on what `readings` returns, from map `start` or from the empty one.
 
-    `stage` and `progress` say where it stands; `ended` is set when its thread has done all that it does for it. `found`
-    is called with the maps as soon as they are there, in the thread. `shown` says whether the map so far was published,
-    `asked` whether somebody asked for its end alone. `by_itself` says whether nobody has asked for it so far, `fresh`
-    whether it looks at all that there is by now. In `then` is who waits for the run after it.
+    `stage` and `progress` say where it stands. `found` is called with the maps as soon as they are there, in the
+    thread. `shown` says whether the map so far was published, `asked` whether somebody asked for its end alone.
+    `by_itself` says whether nobody has asked for it so far, `fresh` whether it looks at all that there is by now. In
+    `then` is who waits for the run after it.
     """
 
     mapper: Mapper | RefiningMapper
@@ -66,7 +66,6 @@ class Run:
     by_itself: bool = False
     fresh: Callable[[], bool] = lambda: True
     then: list[Callable[[Outcome], object]] = field(default_factory=list)
-    ended: threading.Event = field(default_factory=threading.Event)
     waiting: list[Callable[[Outcome], object]] = field(default_factory=list)
 
     @property
@@ -184,10 +183,11 @@ class EmWorker:
                 try:
                     done(outcome)
                 except Exception as error:
-                    # one that fails must not keep the others waiting
+                    # one that fails must not keep the others waiting, nor wait itself
                     self._log(f'EM has ended, and not everybody could be told: {error!r}')
+                    with suppress(Exception):
+                        done(Outcome(None, f'EM has ended, and what comes then failed: {reason(error)}'))
 
-        run.ended.set()
         self._conclude(conclude)
 
 

@@ -40,13 +40,16 @@ Taken = tuple[int, Readings, Any]
 """Number of readings accepted, those that are held, and stamps and poses of odometry."""
 
 
-def _waited_for(taken: queue.SimpleQueue[Taken], run: Run) -> Taken:
-    """Return what the executor takes for a run, unless this is cancelled."""
+def _waited_for(taken: queue.SimpleQueue[Taken | Exception], run: Run) -> Taken:
+    """Return what the executor takes for a run, or raise what it met, unless this is cancelled."""
     while True:
         if run.cancelled:
             raise Cancelled('cancelled before it began')
         with suppress(queue.Empty):
-            return taken.get(timeout=0.1)
+            found = taken.get(timeout=0.1)
+            if isinstance(found, Exception):
+                raise found
+            return found
 
 
 def _tell_all(waiting: list[Callable[[Outcome], object]], why: str) -> None:
@@ -214,8 +217,16 @@ class EmService:
         taken, begun = [self._take()], threading.Event()
 
         def take_now() -> Taken:
-            asked = queue.SimpleQueue[Taken]()
-            self._inbox.put(lambda: asked.put(self._take()))
+            asked = queue.SimpleQueue[Taken | Exception]()
+
+            def take() -> None:
+                try:
+                    asked.put(self._take())
+                except Exception as error:
+                    # the run would wait for ever
+                    asked.put(error)
+
+            self._inbox.put(take)
             return _waited_for(asked, run)
 
         def readings() -> Readings:

@@ -88,8 +88,9 @@ class Kernels:
 
     def _end(self) -> None:
         self.stage = ''
-        # what a picture needs is a hundred thousand objects more, and there as well by now
-        with suppress(ImportError):
+        # what a picture needs is a hundred thousand objects more, and there as well by now; a fault in it is told of
+        # when pictures are drawn, and must not leave the collector off
+        with suppress(Exception):
             importlib.import_module('..files.drawing', __package__)
         # what is there by now stays; the collector need not look at it again
         gc.freeze()

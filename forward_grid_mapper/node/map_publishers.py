@@ -71,6 +71,7 @@ class MapPublishers:
         self._updates = MapUpdates.of(node, self._out['live_map'])
         self._lock = threading.Lock()
         self._pending: dict[str, tuple[Grid, NDArray[Any]]] = {}
+        self._asked: set[str] = set()
         self._nothing = Grid(resolution, 0, 0, 1, 1), np.full((1, 1), -1, np.int8)
         self._ml_map = self._nothing
         nothing = Grid(resolution, 0, 0, 0, 0)
@@ -94,12 +95,13 @@ class MapPublishers:
         with self._lock:
             if generation != self.generation:
                 return
-            waits = name in self._pending
+            waits = name in self._asked
+            self._asked.add(name)
             self._pending[name] = grid, values
             if name == 'ml_map':
                 self._ml_map = grid, values
         if not waits:
-            self.worker.put(partial(self._publish, name))
+            self.worker.put(partial(self._publish, name), partial(self._not_published, name))
 
     @property
     def ml_map(self) -> tuple[Grid, NDArray[np.int8]]:
@@ -122,6 +124,9 @@ class MapPublishers:
 
     def _publish(self, name: str) -> None:
         with self._lock:
+            self._asked.discard(name)
+            if name not in self._pending:
+                return
             grid, values = self._pending.pop(name)
         message = self._message(grid, values)
         self.latest[name] = message
@@ -129,6 +134,11 @@ class MapPublishers:
             self._updates.publish(message)
         else:
             self._out[name].publish(message)
+
+    def _not_published(self, name: str, why: str) -> None:
+        # where no thread could start, the next map tries again
+        with self._lock:
+            self._asked.discard(name)
 
     def _message(self, grid: Grid, values: NDArray[Any]) -> OccupancyGrid:
         # tf2 refuses the leading slash that ROS 1 had

@@ -22,7 +22,7 @@ from ..core.messages.reading_buffer import bounded
 from . import ros_parameters
 from .background import Inbox, Worker
 from .complaints import of_ros
-from .deferred import DeferredService, Reply
+from .deferred import DeferredService, Reply, answered
 from .diagnostics import Health
 from .em_service import EmService
 from .following import Following
@@ -226,7 +226,8 @@ class MapperNode(ManagedNode):
             return
         self.mapping = True
         for work in self._when_ready:
-            work()
+            # one that fails does not keep the others waiting
+            self.inbox.put(work)
         self._when_ready.clear()
 
     def _when(self, handler: Callable[[Reply], None], reply: Reply) -> None:
@@ -234,7 +235,7 @@ class MapperNode(ManagedNode):
         if self.mapping:
             handler(reply)
         else:
-            self._when_ready.append(lambda: handler(reply))
+            self._when_ready.append(lambda: answered(handler, reply, self.get_logger().error))
 
     def _thin_aside(self, thin: Callable[[], Any], done: Callable[[Any], None]) -> None:
         def work() -> None:

@@ -144,8 +144,8 @@ class RefiningMapper:
         follower = self._follower = Follower(correction, found.calibration, self._parameters, found.noise)
         if self._cancelled:
             raise Cancelled('the work was cancelled')
-        odometry, readings = now()
         try:
+            odometry, readings = now()
             follower.follow(readings, odometry)
         except Cancelled:
             raise

@@ -7,12 +7,14 @@ import queue
 import sys
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Iterator
 from typing import Any
 
 import pytest
 
 from forward_grid_mapper.core.common.errors import InputError, MapperError
+from forward_grid_mapper.node import background
 from forward_grid_mapper.node.background import AT_ONCE, NICE, Inbox, Worker
 
 logged: list[str] = []
@@ -134,6 +136,35 @@ def test_what_is_done_does_not_wait_any_more(worker: Worker) -> None:
         time.sleep(0.001)
 
 
+def test_whoever_asks_is_answered_even_where_there_is_no_memory_for_the_reason(
+    worker: Worker, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Full(list[str]):
+        def append(self, text: str) -> None:
+            raise MemoryError
+
+    with monkeypatch.context() as patch:
+        patch.setattr(background, 'list', Full, raising=False)
+        with pytest.raises(MapperError, match='not enough memory'):
+            worker.ask(raising(KeyError('odd')))
+    assert worker.ask(lambda: 5) == 5
+
+
+def test_a_piece_that_is_taken_up_counts_at_every_moment() -> None:
+    worker, counted = Worker('digger', logged.append), list[int]()
+
+    class Counting(deque[Any]):
+        def popleft(self) -> Any:
+            task = super().popleft()
+            counted.append(worker.waiting)
+            return task
+
+    worker._tasks = Counting()
+    worker.ask(lambda: None)
+    worker.close(10.0)
+    assert counted == [1]
+
+
 def test_whoever_asks_a_worker_that_has_ended_is_told(worker: Worker) -> None:
     worker.close(10.0)
     with pytest.raises(MapperError, match='digger has ended'):
@@ -186,9 +217,9 @@ def test_results_come_back_in_order_and_a_few_at_a_time() -> None:
     for thread in threads:
         thread.start()
     for thread in threads:
-        thread.join()
+        thread.join(60.0)
     assert executor.run() == -(-300 // AT_ONCE)
-    found = [done.get() for _ in range(300)]
+    found = [done.get(timeout=60.0) for _ in range(300)]
     for n in range(3):
         assert [k for m, k in found if m == n] == list(range(100))
 

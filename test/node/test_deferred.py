@@ -9,6 +9,7 @@ import pytest
 
 pytest.importorskip('rclpy', reason='services are those of rclpy')
 
+from nav_msgs.srv import GetMap
 from rclpy.qos import ReliabilityPolicy
 from std_srvs.srv import SetBool, Trigger
 
@@ -20,6 +21,10 @@ class Serving:
 
     def __init__(self) -> None:
         self.sent: list[tuple[Any, Any]] = []
+        self.logged: list[str] = []
+
+    def get_logger(self) -> Any:
+        return SimpleNamespace(error=self.logged.append)
 
     def create_service(self, kind: Any, name: str, callback: Any, qos_profile: Any) -> Any:
         assert qos_profile.depth >= 2000 and qos_profile.reliability == ReliabilityPolicy.RELIABLE
@@ -78,3 +83,30 @@ def test_the_handler_has_the_request() -> None:
     node.call('one', SetBool.Request(data=True))
     assert seen == [True] and isinstance(node.sent[0][0], SetBool.Response) and node.sent[0][0].success
     assert CALLS.depth > 10, 'what ROS keeps by itself'
+
+
+def test_a_handler_that_fails_keeps_nobody_waiting() -> None:
+    def fail(reply: Reply) -> None:
+        raise KeyError('odd')
+
+    def fail_late(reply: Reply) -> None:
+        reply.send(True, 'done')
+        raise MemoryError
+
+    node = Serving()
+    DeferredService(node, Trigger, 'fails', fail)
+    node.call('one')
+    ((response, header),) = node.sent
+    assert (response.success, response.message, header) == (False, "it failed: KeyError('odd')", 'one')
+    assert "KeyError('odd')" in node.logged[0] and 'Traceback' in node.logged[0]
+    # a response without words is the empty one
+    node = Serving()
+    DeferredService(node, GetMap, 'get', fail)
+    node.call('two')
+    assert node.sent == [(GetMap.Response(), 'two')]
+    # who was answered already is not answered again
+    node = Serving()
+    DeferredService(node, Trigger, 'late', fail_late)
+    node.call('three')
+    assert [response.message for response, _ in node.sent] == ['done']
+    assert 'there is not enough memory' in node.logged[0]

@@ -171,6 +171,27 @@ def test_no_second_run_begins_while_the_first_one_lives(monkeypatch: pytest.Monk
     caller.conclude()
 
 
+def test_who_cannot_be_told_of_the_maps_is_told_that_it_failed(caller: Caller) -> None:
+    told: list[tuple[str, Outcome]] = []
+
+    def odd(outcome: Outcome) -> None:
+        told.append(('odd', outcome))
+        if outcome.maps is not None:
+            raise KeyError('odd')
+
+    def deaf(outcome: Outcome) -> None:
+        raise MemoryError
+
+    assert caller.begin(odd)
+    assert caller.worker.current is not None
+    caller.worker.current.waiting += [deaf, lambda outcome: told.append(('last', outcome))]
+    caller.conclude()
+    assert [name for name, _ in told] == ['odd', 'odd', 'last']
+    assert told[1][1].maps is None and "KeyError('odd')" in told[1][1].message
+    assert told[2][1].maps is not None
+    assert len(caller.logged) == 2
+
+
 def test_closing_cancels_and_waits_for_the_end(monkeypatch: pytest.MonkeyPatch, caller: Caller) -> None:
     slow = Slow(monkeypatch)
     assert caller.begin(lambda outcome: None)

@@ -224,3 +224,38 @@ def test_two_maps_cannot_have_one_topic(node: Publishing) -> None:
         MapPublishers(node, 0.1, lambda: 'map', at_once)
     node.topics = {'ml_map': '/map'}
     MapPublishers(node, 0.1, lambda: 'map', at_once)
+
+
+def test_where_no_thread_can_start_the_next_map_tries_again(
+    node: Publishing, maps: MapPublishers, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(thread: threading.Thread) -> None:
+        raise RuntimeError("can't start new thread")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(threading.Thread, 'start', fail)
+        maps.publish('live_map', 0, GRID, CELLS)
+    assert node.sent == []
+    maps.publish('live_map', 0, Grid(0.1, 0, 0, 3, 1), np.zeros((1, 3), np.float32))
+    maps.worker.ask(lambda: None)
+    assert [message.info.height for _, message in node.sent] == [1]
+
+
+def test_a_map_that_comes_while_another_one_fails_is_published(node: Publishing, maps: MapPublishers) -> None:
+    newer = Grid(0.1, 0, 0, 3, 1), np.zeros((1, 3), np.float32)
+
+    def fail(*arguments: Any) -> None:
+        # once: the newer one comes while this one is made
+        patch.undo()
+        maps.publish('live_map', 0, *newer)
+        raise MemoryError
+
+    patch = pytest.MonkeyPatch()
+    patch.setattr(maps, '_message', fail)
+    maps.publish('live_map', 0, GRID, CELLS)
+    maps.worker.ask(lambda: None)
+    maps.worker.ask(lambda: None)
+    assert [message.info.height for _, message in node.sent] == [1]
+    maps.publish('live_map', 0, GRID, CELLS)
+    maps.worker.ask(lambda: None)
+    assert [message.info.height for _, message in node.sent] == [1, GRID.height]

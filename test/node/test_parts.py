@@ -145,6 +145,40 @@ def test_em_maps_what_comes_while_its_kernels_are_compiled(
     assert node.em.explained == 50
 
 
+def test_em_that_cannot_have_what_came_meanwhile_says_so(
+    inside: Callable[..., Inside], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    robot = inside().start()
+    node = robot.node
+    robot.drive(0, 20)
+    monkeypatch.setattr(node.kernels, 'has', lambda name: False)
+    taken, take = iter([True]), node.em._take
+
+    def once() -> Any:
+        if next(taken, False):
+            return take()
+        raise MemoryError
+
+    monkeypatch.setattr(node.em, '_take', once)
+    success, message = robot.call(node.em.run_em)
+    assert not success and 'does not fit the memory' in message
+
+
+def test_a_call_that_fails_after_the_start_does_not_hold_up_the_others(inside: Callable[..., Inside]) -> None:
+    robot = inside()
+    robot.node.start()
+    told: list[Any] = []
+
+    def fail(reply: Any) -> None:
+        raise KeyError('odd')
+
+    reply = SimpleNamespace(fail=told.append, send=lambda *fields: told.append(fields[0]))
+    for handler in (fail, robot.node.reset):
+        robot.node._when(handler, reply)
+    robot.until(lambda: len(told) == 2)
+    assert told == ["it failed: KeyError('odd')", True]
+
+
 def test_commands_do_not_wait_for_the_online_map(
     inside: Callable[..., Inside], monkeypatch: pytest.MonkeyPatch
 ) -> None:

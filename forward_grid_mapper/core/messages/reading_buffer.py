@@ -220,6 +220,15 @@ class ReadingBuffer:
             return
         if thinned.version != self._version:
             return
+        try:
+            self._go_on_with(thinned)
+        except MemoryError:
+            self._thinning, self._failed_at = False, self._size
+            raise
+        # so much may have come meanwhile that it is time again
+        self._thin()
+
+    def _go_on_with(self, thinned: _Thinned) -> None:
         for look in self.before_thinning:
             look()
         columns, tail = thinned.columns, slice(thinned.size, self._size)
@@ -231,8 +240,6 @@ class ReadingBuffer:
         with self._lock:
             self._columns, self._size = columns, size
         self._begin_anew()
-        # so much may have come meanwhile that it is time again
-        self._thin()
 
 
 def bounded(readings: Readings, bound: int) -> Readings:

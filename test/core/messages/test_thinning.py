@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 import threading
+from collections.abc import Callable
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -108,6 +110,27 @@ def test_every_reading_is_looked_at_before_it_is_thinned() -> None:
     assert sorted(row for part in seen for row in rows(part)) == rows(readings)
 
 
+def test_what_cannot_be_thinned_for_want_of_memory_is_thinned_later() -> None:
+    readings = made(np.random.default_rng(3), 1000)
+    buffer, waiting = ReadingBuffer(64), list[Callable[[], None]]()
+    buffer.aside = lambda thin, done: waiting.append(lambda: done(thin()))
+    full = [True]
+
+    def look() -> None:
+        if full:
+            full.clear()
+            raise MemoryError
+
+    buffer.before_thinning.append(look)
+    buffer.extend(readings.select(slice(0, 100)))
+    with pytest.raises(MemoryError):
+        waiting.pop()()
+    assert buffer.held == 100 and not waiting
+    buffer.extend(readings.select(slice(100, 200)))
+    waiting.pop()()
+    assert buffer.held <= 64 and len(buffer) == 200
+
+
 def test_snapshots_from_another_thread_hold_together() -> None:
     buffer = ReadingBuffer(500)
     done = threading.Event()
@@ -128,7 +151,7 @@ def test_snapshots_from_another_thread_hold_together() -> None:
             'sonar', x=k % 50, y=0.0, yaw=0.0, z=k % 97 + 1.0, z_max=200.0, half_angle=0.1, sigma=0.0, stamp=k
         )
     done.set()
-    thread.join()
+    thread.join(60.0)
     assert not wrong
     buffer.clear()
     assert (len(buffer), buffer.held, len(buffer.snapshot(7))) == (0, 0, 0)

@@ -1,0 +1,106 @@
+"""Compilation in the background: in order, waited for by who needs it, and whatever fails, everybody goes on."""
+
+from __future__ import annotations
+
+import gc
+import importlib
+import threading
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+
+from forward_grid_mapper.core import warm_up
+from forward_grid_mapper.core.common.errors import Cancelled
+from forward_grid_mapper.node.kernels import Kernels
+
+
+class Compiling:
+    """Steps that wait until the test lets them go on."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.done: list[str] = []
+        self.said: list[str] = []
+        self.ready: list[str] = []
+        self.failing = ''
+        self.go_on = {name: threading.Event() for name in warm_up.STEPS}
+        monkeypatch.setattr(warm_up, 'STEPS', {name: self._step(name) for name in warm_up.STEPS})
+
+    def _step(self, name: str) -> Callable[[], None]:
+        def compile_it() -> None:
+            assert self.go_on[name].wait(60.0)
+            if name == self.failing:
+                raise MemoryError
+            self.done.append(name)
+
+        return compile_it
+
+    def begin(self, online: bool = True, refine: bool = True) -> Kernels:
+        kernels = Kernels(self.said.append, self.said.append, online, refine)
+        kernels.begin(lambda: self.ready.append(kernels.stage))
+        return kernels
+
+
+@pytest.fixture
+def compiling(monkeypatch: pytest.MonkeyPatch) -> Iterator[Compiling]:
+    made = Compiling(monkeypatch)
+    yield made
+    for event in made.go_on.values():
+        event.set()
+    gc.enable()
+    gc.unfreeze()
+
+
+def test_the_live_map_has_its_kernels_first(compiling: Compiling) -> None:
+    kernels = compiling.begin()
+    assert not kernels.has('live map') and kernels.stage == 'live map' and not gc.isenabled()
+    compiling.go_on['live map'].set()
+    kernels.wait('live map')
+    assert not kernels.has('EM')
+    stopped = iter([False, True])
+    with pytest.raises(Cancelled):
+        kernels.wait('EM', lambda: next(stopped))
+    for event in compiling.go_on.values():
+        event.set()
+    kernels.wait('EM')
+    kernels.worker.ask(lambda: None)
+    assert compiling.ready == ['live map'] and compiling.done == list(warm_up.STEPS)
+    assert (kernels.stage, kernels.working, gc.isenabled()) == ('', False, True)
+
+
+def test_what_is_not_wanted_is_left_out_and_not_waited_for(compiling: Compiling) -> None:
+    for event in compiling.go_on.values():
+        event.set()
+    kernels = compiling.begin(online=False, refine=False)
+    kernels.wait('online map')
+    kernels.wait('trajectory')
+    kernels.worker.ask(lambda: None)
+    assert compiling.done == [name for name in warm_up.STEPS if name not in ('online map', 'trajectory')]
+
+
+@pytest.mark.parametrize('failing', ['live map', 'EM'])
+def test_a_step_that_fails_keeps_nobody_waiting(compiling: Compiling, failing: str) -> None:
+    compiling.failing = failing
+    for event in compiling.go_on.values():
+        event.set()
+    kernels = compiling.begin()
+    for name in warm_up.STEPS:
+        kernels.wait(name)
+    kernels.worker.ask(lambda: None)
+    assert len(compiling.ready) == 1
+    assert any('there is not enough memory' in text for text in compiling.said)
+    assert kernels.worker.trouble and not kernels.working and gc.isenabled()
+
+
+def test_pictures_that_cannot_be_drawn_do_not_leave_the_collector_off(
+    compiling: Compiling, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*arguments: Any) -> None:
+        raise AttributeError('matplotlib was built for another numpy')
+
+    monkeypatch.setattr(importlib, 'import_module', fail)
+    for event in compiling.go_on.values():
+        event.set()
+    kernels = compiling.begin()
+    kernels.worker.ask(lambda: None)
+    assert gc.isenabled() and not kernels.working and kernels.worker.trouble == ''
