@@ -10,6 +10,7 @@ from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
+from patience import line_of
 
 from forward_grid_mapper.commands import domain
 from forward_grid_mapper.commands.domain import own_domain
@@ -48,7 +49,7 @@ def test_the_port_of_a_participant_is_that_of_the_middleware(tmp_path: Path) -> 
         with subprocess.Popen(
             [sys.executable, str(script)], env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
         ) as process:
-            assert process.stdout is not None and process.stdout.readline() == 'made\n'
+            assert line_of(process) == 'made\n'
             port = 7400 + domain.PORTS * found + domain.FIRST_PARTICIPANT
             with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken, pytest.raises(OSError, match='in use'):
                 taken.bind(('', port))

@@ -22,6 +22,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from journal_samples import FRAMES, Previous, database, made, numbers, opened, rows, until, written
+from patience import PATIENCE, line_of
 
 from forward_grid_mapper.core.common.errors import BagError, OutputError
 from forward_grid_mapper.files import journal as journal_module
@@ -355,13 +356,11 @@ def test_a_limit_on_the_size_of_files_is_a_full_disk(tmp_path: Path) -> None:
         text=True,
         env={**os.environ, 'PYTHONUNBUFFERED': '1'},
     )
-    assert process.stdout is not None
-    assert 'cannot be written: disk I/O error; mapping goes on' in process.stdout.readline()
+    assert 'cannot be written: disk I/O error; mapping goes on' in line_of(process)
     time.sleep(0.5)
     assert process.poll() is None
     process.kill()
-    assert 'Traceback' not in process.stdout.read()
-    process.wait()
+    assert 'Traceback' not in process.communicate(timeout=PATIENCE)[0]
     found, contents = numbers(tmp_path / 'j' / 'drive_0001.journal')
     assert found == list(range(len(found)))
     assert len(found) > 100
@@ -483,7 +482,7 @@ def killed_again_and_again(folder: Path, times: int, seed: int) -> float:
         time.sleep(rng.uniform(0.0, 2.0))
         died = time.time_ns()
         process.send_signal(signal.SIGKILL)
-        _, said = process.communicate()
+        _, said = process.communicate(timeout=PATIENCE)
         assert said == ''
         newest = drive_file(folder)
         if newest is None:

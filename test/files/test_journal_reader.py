@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 import pytest
 from journal_samples import FRAMES, Previous, database, made, numbers, opened, rows, until, written
+from patience import PATIENCE, line_of
 
 from forward_grid_mapper.core.common.errors import BagError
 from forward_grid_mapper.files.journal import drive_file
@@ -451,7 +452,7 @@ def test_reading_while_it_is_written(tmp_path: Path) -> None:
             begun.add(log_of(journal.path).read_bytes()[:32])
     finally:
         stop.set()
-        thread.join()
+        thread.join(PATIENCE)
         journal.close()
     assert len(numbers(journal.path)[0]) == count[0]
 
@@ -472,9 +473,7 @@ def test_a_file_that_is_cut_off_while_it_is_read(tmp_path: Path, format: str) ->
         made_log.close()
         log_of(path).write_bytes(content)
     reader = subprocess.Popen([*PROGRAM, str(path), 'pause'], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
-    assert reader.stdout is not None
-    assert reader.stdin is not None
-    assert reader.stdout.readline() == 'some\n'
+    assert line_of(reader) == 'some\n'
     for file in path.parent.iterdir():
         os.truncate(file, 5000)
     answer, _ = reader.communicate('\n', timeout=60)

@@ -17,6 +17,7 @@ import pytest
 pytest.importorskip('rclpy', reason='the tests of the node need rclpy')
 
 from fault_samples import OPTIONS, circle, journal_of
+from patience import PATIENCE, line_of
 from robot import NodeProcess, Robot, environment
 
 from forward_grid_mapper.simulation.drive import corridor_drive
@@ -33,7 +34,7 @@ def bystander(domain: int, *arguments: str) -> Iterator[subprocess.Popen[str]]:
         yield process
     finally:
         process.kill()
-        process.wait()
+        process.wait(PATIENCE)
 
 
 def accepted(robot: Robot) -> int:
@@ -61,11 +62,10 @@ def test_callers_that_die_or_come_all_at_once(start: Any, robot: Robot, domain: 
     assert all('runs already' in answer.message for answer in answers if not answer.success)
     robot.until(lambda: em_state(robot) == 'idle', what='the last run has ended')
     with bystander(domain, 'call', '/forward_grid_mapper/run_em') as caller:
-        assert caller.stdout is not None
-        assert caller.stdout.readline() == 'called\n'
+        assert line_of(caller) == 'called\n'
         robot.until(lambda: em_state(robot) not in ('idle', 'unknown'), what='EM runs')
         caller.kill()
-        caller.wait()
+        caller.wait(PATIENCE)
     robot.play(circle(0, 100))
     robot.until(lambda: em_state(robot) == 'idle', 60.0, 'EM ends')
     assert 'log-likelihood' in robot.diagnostics['EM']['last run']
@@ -113,8 +113,7 @@ def test_a_subscriber_that_never_reads_stops_nobody(start: Any, robot: Robot, do
     robot.meet()
     with bystander(domain, 'listen', '/forward_grid_mapper/live_map') as listener:
         robot.play(circle(0, 50))
-        assert listener.stdout is not None
-        assert listener.stdout.readline() == 'a map\n'
+        assert line_of(listener) == 'a map\n'
         listener.send_signal(signal.SIGSTOP)
         robot.listen()
         robot.until(lambda: robot.maps['live_map'], what='the latest map')
@@ -126,7 +125,7 @@ def test_a_subscriber_that_never_reads_stops_nobody(start: Any, robot: Robot, do
         assert len(robot.maps['live_map']) > begin + 3
         assert float(robot.diagnostics['readings']['longest delay of a reading (ms)']) < 1000
         listener.send_signal(signal.SIGCONT)
-        assert listener.stdout.readline() == 'a map\n'
+        assert line_of(listener) == 'a map\n'
 
 
 def test_publishers_that_go_and_come_back(start: Any, domain: int) -> None:
@@ -135,8 +134,7 @@ def test_publishers_that_go_and_come_back(start: Any, domain: int) -> None:
     try:
         for k in range(3):
             with bystander(domain, 'publish', str(100 * k), '100') as publisher:
-                assert publisher.stdout is not None
-                assert publisher.stdout.readline() == 'published\n'
+                assert line_of(publisher) == 'published\n'
                 watcher.until(lambda total=100 * (k + 1): accepted(watcher) == total, what='all are taken')
         assert watcher.diagnostics['readings']['readings rejected'] == '0'
     finally:

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from patience import PATIENCE
 
 import forward_grid_mapper
 from forward_grid_mapper.bags.reader import Bag
@@ -93,7 +94,7 @@ class Replay:
         """End it if a test has failed before its end."""
         if self.running:
             self._process.kill()
-            self._process.communicate()
+            self._process.communicate(timeout=PATIENCE)
 
 
 class Listener:

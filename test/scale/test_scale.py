@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from patience import PATIENCE
 
 from forward_grid_mapper.commands import process_bag
 from forward_grid_mapper.commands.simulate import write_bag
@@ -245,8 +246,10 @@ def started(*arguments: object, group: bool = False) -> subprocess.Popen[bytes]:
 
 
 def wait_for(condition: Callable[[], bool], process: subprocess.Popen[bytes]) -> None:
+    end = time.monotonic() + 2 * PATIENCE
     while not condition():
-        assert process.poll() is None, process.communicate()
+        assert process.poll() is None, process.communicate(timeout=PATIENCE)
+        assert time.monotonic() < end, 'it did not happen'
         time.sleep(0.02)
 
 
@@ -268,13 +271,14 @@ def test_a_killed_worker_and_a_killed_client_cost_only_what_they_were_at(
     os.kill(workers[0].pid, signal.SIGKILL)
     wait_for(lambda: count('search_0000.npz') > 1, client)
     client.kill()
-    client.communicate()
+    # its workers have the same pipes, and end when they find that it is gone
+    client.communicate(timeout=PATIENCE)
     assert not (tmp_path / 'maps').exists()
     before = {path: path.stat().st_mtime_ns for path in work.glob('tiles/*/search_*.npz')}
     client = started(*arguments)
     wait_for(lambda: count('search_*.npz') > len(before), client)
     assert before.items() <= {path: path.stat().st_mtime_ns for path in work.glob('tiles/*/search_*.npz')}.items()
-    _, error = client.communicate()
+    _, error = client.communicate(timeout=2 * PATIENCE)
     assert client.returncode == 0, error
     assert_same(tmp_path / 'maps', one_process)
     assert not work.exists(), 'what is done needs no work folder'
@@ -287,7 +291,7 @@ def test_ctrl_c_says_once_what_is_kept(drives: Path, tmp_path: Path) -> None:
     client = started(drives, '-o', tmp_path / 'maps', '--tiles', TILE, '--workers', 2, '--work', work, '-q', group=True)
     wait_for(lambda: any(work.glob('tiles/*/normals.npz')), client)
     os.killpg(client.pid, signal.SIGINT)
-    output, error = client.communicate()
+    output, error = client.communicate(timeout=PATIENCE)
     lines = [line for line in error.decode().splitlines() if 'compiling' not in line]
     assert lines == [
         f'process_bag: cancelled; no results were written, what was done is kept in {work}; the same command goes on '
