@@ -44,14 +44,19 @@ MODULES = {
     'node/background': ('node/test_background',),
     'node/deferred': ('node/test_deferred',),
     'node/em': ('node/test_em_worker',),
+    'node/em_service': ('node/test_em_service',),
+    'node/following': ('node/test_following_part',),
     'node/frames': ('node/test_frames',),
     'node/grid_message': ('node/test_map_publishers',),
     'node/heard': ('node/test_heard', '-k', 'not diagnostics'),
     'node/intake': ('node/test_intake',),
+    'node/journal_keeper': ('node/test_journal_keeper',),
     'node/losses': ('node/test_losses',),
     'node/map_publishers': ('node/test_map_publishers',),
     'node/map_updates': ('node/test_map_updates', '-k', 'not node_sends'),
+    'node/online': ('node/test_online_worker',),
     'node/ros_parameters': ('node/test_ros_parameters',),
+    'node/saver': ('node/test_saver',),
 }
 """Modules, and the tests that must notice their changes, with what else pytest is told; each takes seconds."""
 

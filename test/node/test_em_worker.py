@@ -32,7 +32,8 @@ class Caller:
         return self.worker.start(Run(Mapper(Parameters()), Parameters(), lambda: readings), done)
 
     def conclude(self) -> None:
-        self._conclusions.get(timeout=60.0)()
+        # the first one compiles kernels, on a machine that may have other work
+        self._conclusions.get(timeout=240.0)()
 
     def outcome_of(self, readings: Readings = READING) -> Outcome:
         found: list[Outcome] = []

@@ -1,0 +1,262 @@
+"""What links readings to the journal: what is new goes to disk, and what an earlier run left comes back."""
+
+from __future__ import annotations
+
+import errno
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip('rclpy', reason='the status is a message of ROS')
+
+from stand_ins import SONAR, PlainNode
+
+from forward_grid_mapper.core.common.errors import OutputError
+from forward_grid_mapper.core.common.parameters import Parameters
+from forward_grid_mapper.core.common.readings import Readings
+from forward_grid_mapper.core.messages.pose_association import PoseAssociator
+from forward_grid_mapper.files.journal_format import Contents
+from forward_grid_mapper.files.journal_reader import read
+from forward_grid_mapper.node import journal_keeper
+from forward_grid_mapper.node.journal_keeper import NOTICE, PERIOD, JournalKeeper
+
+OK, WARN = b'\x00', b'\x01'
+
+
+class Node(PlainNode):
+    def __init__(self, parameters: Parameters) -> None:
+        super().__init__()
+        self.parameters = parameters
+        self.timers: list[tuple[float, Callable[[], None], Any]] = []
+
+    def create_timer(self, period: float, callback: Callable[[], None], clock: Any) -> None:
+        self.timers.append((period, callback, clock))
+
+
+class Kept:
+    """A keeper of a journal with its associator."""
+
+    def __init__(self, folder: Path | str, **values: Any) -> None:
+        parameters = Parameters.from_flat(values)
+        self.node = Node(parameters)
+        self.associator = PoseAssociator(lambda base, frame, stamp: SONAR, parameters)
+        self.keeper = JournalKeeper(self.node, str(folder), self.associator)  # type: ignore[arg-type]
+
+    def start(self) -> Kept:
+        self.keeper.restore()
+        self.keeper.begin('the clock')
+        return self
+
+    def drive(self, first: int, count: int) -> None:
+        """Accept readings, whose stamp is their number."""
+        self.associator.map_frame, self.associator.base_frame = 'odom', 'base_link'
+        self.associator.restore(made(np.arange(first, first + count)))
+
+    def settle(self) -> None:
+        end = time.monotonic() + 60.0
+        journal = self.keeper._journal
+        while journal is not None and journal.unwritten:
+            assert time.monotonic() < end
+            time.sleep(0.002)
+
+    def status(self) -> Any:
+        (found,) = self.keeper.statuses('mapper')
+        return found
+
+    def values(self) -> dict[str, str]:
+        return {pair.key: pair.value for pair in self.status().values}
+
+
+def made(numbers: np.ndarray) -> Readings:
+    z = np.ones(len(numbers))
+    return Readings.from_columns(
+        names=('sonar',), x=0.1 * numbers, y=0.0, yaw=0.0, z=z, z_max=4.0, half_angle=0.2, stamp=numbers
+    )
+
+
+def stored(path: Path) -> tuple[list[int], Contents]:
+    contents = Contents()
+    return [int(stamp) for readings in read(path, contents) for stamp in readings.stamp], contents
+
+
+def test_without_a_folder_there_is_nothing_to_do() -> None:
+    kept = Kept('').start()
+    kept.drive(0, 3)
+    kept.keeper.take()
+    assert kept.node.timers == [] and kept.associator.buffer.before_thinning == []
+    assert kept.keeper.reset() == '' and kept.keeper.statuses('mapper') == []
+    kept.keeper.close()
+
+
+def test_what_is_new_goes_to_disk_and_comes_back(tmp_path: Path) -> None:
+    kept = Kept(tmp_path, sigma=0.07).start()
+    ((period, take, clock),) = kept.node.timers
+    assert (period, clock) == (PERIOD, 'the clock')
+    for first in (0, 5):
+        kept.drive(first, 5)
+        kept.associator.extend_path((float(first), 1.0))
+        take()
+        take()
+    kept.settle()
+    kept.drive(10, 2)
+    kept.keeper.close()
+    found, contents = stored(tmp_path / 'drive_0001.journal')
+    assert found == list(range(12)), 'what came last is written at the end'
+    assert (contents.map_frame, contents.base_frame) == ('odom', 'base_link')
+    assert contents.path == [(0.0, 1.0), (5.0, 1.0)]
+    assert contents.parameters['sigma'] == 0.07
+
+    again = Kept(tmp_path).start()
+    assert len(again.associator.buffer) == 12
+    assert (again.associator.map_frame, again.associator.base_frame) == ('odom', 'base_link')
+    assert list(again.associator.path) == [(0.0, 1.0), (5.0, 1.0)]
+    assert '12 readings of an earlier run are back, in frame odom' in again.node.warned[0]
+    assert again.values()['readings restored'] == '12'
+    again.drive(12, 3)
+    again.keeper.close()
+    assert stored(tmp_path / 'drive_0001.journal')[0] == list(range(15)), 'none is there twice'
+
+
+def test_a_new_journal_names_no_frame(tmp_path: Path) -> None:
+    kept = Kept(tmp_path).start()
+    assert '0 readings of an earlier run are back, in frame (none yet)' in kept.node.warned[0]
+    assert len(kept.node.warned) == 1
+    kept.keeper.close()
+
+
+def test_readings_that_do_not_fit_on_the_map_any_more_are_told_of(tmp_path: Path) -> None:
+    kept = Kept(tmp_path).start()
+    kept.drive(0, 5)
+    kept.drive(100_000, 5)
+    kept.keeper.close()
+    again = Kept(tmp_path, max_cells=10_000).start()
+    assert len(again.associator.buffer) < 10
+    assert 'of its readings do not fit on the map (max_cells, resolution)' in again.node.warned[1]
+    again.keeper.close()
+
+
+def test_what_would_be_thinned_is_taken_before(tmp_path: Path) -> None:
+    kept = Kept(tmp_path).start()
+    kept.drive(0, 4)
+    for look in kept.associator.buffer.before_thinning:
+        look()
+    kept.settle()
+    assert stored(tmp_path / 'drive_0001.journal')[0] == [0, 1, 2, 3]
+    kept.keeper.close()
+
+
+def test_a_reset_begins_a_new_file_and_says_where_the_old_one_is(tmp_path: Path) -> None:
+    kept = Kept(tmp_path).start()
+    assert kept.keeper.reset() == '', 'there is nothing to keep'
+    kept.drive(0, 4)
+    kept.keeper.take()
+    kept.associator.clear()
+    assert kept.keeper.reset() == '; the journal keeps them in drive_0001.journal'
+    kept.drive(20, 2)
+    kept.keeper.take()
+    kept.settle()
+    assert kept.values()['file'] == 'drive_0002.journal'
+    kept.keeper.close()
+    assert stored(tmp_path / 'drive_0001.journal')[0] == [0, 1, 2, 3]
+    assert stored(tmp_path / 'drive_0002.journal')[0] == [20, 21]
+    again = Kept(tmp_path).start()
+    assert again.values()['readings restored'] == '2'
+    again.associator.clear()
+    again.keeper.reset()
+    assert again.values()['readings restored'] == '0'
+    again.keeper.close()
+
+
+def test_a_journal_that_vanished_is_written_anew_from_memory(tmp_path: Path) -> None:
+    kept = Kept(tmp_path).start()
+    kept.drive(0, 4)
+    kept.associator.extend_path((1.0, 1.0))
+    kept.keeper.take()
+    kept.settle()
+    for path in tmp_path.glob('drive_0001*'):
+        path.unlink()
+    journal, end = kept.keeper._journal, time.monotonic() + 60.0
+    assert journal is not None
+    while not journal.gone:
+        assert time.monotonic() < end
+        time.sleep(0.01)
+    kept.drive(4, 1)
+    kept.keeper.take()
+    kept.drive(5, 2)
+    kept.keeper.take()
+    kept.settle()
+    status = kept.status()
+    assert status.level == WARN and status.message == journal.notice != ''
+    # it was dealt with: after a while only a key says so
+    journal.noticed = time.monotonic() - NOTICE - 0.1
+    assert kept.status().level == OK and kept.values()['last fault of a file'] == journal.notice
+    journal.noticed = time.monotonic() - NOTICE + 30.0
+    assert kept.status().level == WARN
+    kept.keeper.close()
+    found, contents = stored(tmp_path / 'drive_0002.journal')
+    assert found == list(range(7)) and contents.path == [(1.0, 1.0)] and contents.map_frame == 'odom'
+
+
+def test_other_parameters_are_stated_in_the_file(tmp_path: Path) -> None:
+    kept = Kept(tmp_path).start()
+    kept.drive(0, 1)
+    kept.keeper.take()
+    kept.node.parameters = Parameters.from_flat({'sigma': 0.09})
+    kept.drive(1, 1)
+    kept.keeper.close()
+    assert stored(tmp_path / 'drive_0001.journal')[1].parameters['sigma'] == 0.09
+
+
+def test_the_status_says_what_waits_and_what_is_lost(tmp_path: Path) -> None:
+    kept = Kept(tmp_path).start()
+    status = kept.status()
+    assert (status.level, status.message, status.name) == (OK, 'writing', 'mapper: journal')
+    values = kept.values()
+    assert values['folder'] == str(tmp_path) and values['file'] == 'drive_0001.journal'
+    assert (values['readings to be written'], values['readings lost']) == ('0', '0')
+    assert values['last fault of a file'] == 'none'
+    journal = kept.keeper._journal
+    assert journal is not None
+    journal.lost = 7
+    assert kept.status().level == WARN and kept.values()['readings lost'] == '7'
+    assert kept.status().message == '7 readings came while nothing could be written'
+    # what is so now goes before what was
+    journal.trouble = 'the disk is broken'
+    assert kept.status().message == 'the disk is broken'
+    journal.trouble, journal.lost = '', 0
+    kept.keeper.close()
+
+
+def failing(cause: BaseException | None) -> Callable[..., Any]:
+    def fail(folder: str, warn: Any) -> Any:
+        raise OutputError('cannot be opened') from cause
+
+    return fail
+
+
+@pytest.mark.parametrize('number', [errno.ENOSPC, errno.EDQUOT])
+def test_a_full_disk_at_the_start_does_not_keep_the_node_from_mapping(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int
+) -> None:
+    monkeypatch.setattr(journal_keeper, 'Journal', failing(OSError(number, 'full')))
+    kept = Kept(tmp_path).start()
+    kept.drive(0, 1)
+    kept.keeper.take()
+    assert kept.node.warned == ['there is no journal: cannot be opened'] and kept.node.timers == []
+    assert (kept.status().level, kept.status().message) == (WARN, 'cannot be opened')
+    assert kept.values() == {'folder': str(tmp_path), 'readings restored': '0'}
+    assert kept.keeper.reset() == ''
+    kept.keeper.close()
+
+
+@pytest.mark.parametrize('cause', [OSError(errno.EACCES, 'denied'), ValueError('odd'), None])
+def test_another_reason_ends_the_start(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cause: BaseException | None
+) -> None:
+    monkeypatch.setattr(journal_keeper, 'Journal', failing(cause))
+    with pytest.raises(OutputError, match='cannot be opened'):
+        Kept(tmp_path)

@@ -1,0 +1,215 @@
+"""The service save_maps: what is written, under which name, with which warnings; whatever fails, there is an answer."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip('rclpy', reason='the service is one of rclpy')
+
+from stand_ins import PlainNode
+
+from forward_grid_mapper.core.common.errors import OutputError
+from forward_grid_mapper.core.common.grid import Grid
+from forward_grid_mapper.node import saver
+from forward_grid_mapper.node.em import Outcome
+from forward_grid_mapper.node.live import LiveSnapshot
+from forward_grid_mapper.node.refining import Found
+from forward_grid_mapper.node.saver import Account, Saver
+
+GRID = Grid(0.1, 0, 0, 3, 2)
+LIVE = np.full(GRID.shape, 0.5, np.float32)
+ODOMETRY = np.arange(3), np.zeros((3, 3))
+
+
+def until(condition: Callable[[], bool]) -> None:
+    end = time.monotonic() + 60.0
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.001)
+
+
+class Reply:
+    """An answer that may come from another thread."""
+
+    def __init__(self) -> None:
+        self.sent: list[tuple[bool, str]] = []
+        self.came = threading.Event()
+
+    def send(self, success: bool, message: str) -> None:
+        self.sent.append((success, message))
+        self.came.set()
+
+    def answer(self) -> tuple[bool, str]:
+        assert self.came.wait(60.0)
+        (found,) = self.sent
+        return found
+
+
+class Node:
+    """What the service asks of the node; `written` is what was handed to `write_results`."""
+
+    def __init__(self, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.log = PlainNode()
+        self.written: list[tuple[Any, ...]] = []
+        self.generation, self.asked, self.accepted = 4, list[Callable[[Outcome], object]](), 10
+        self.em: Any = SimpleNamespace(maps=None, current=None, explained=10, found=None)
+        self.em.when_there_are_maps = self.asked.append
+        self.live: Any = SimpleNamespace(
+            generation=4, snapshot=lambda: LiveSnapshot(self.generation, GRID, LIVE), worker=None
+        )
+        self.folder, self.source = folder, {'node': '/mapper', 'warnings': ['from the node']}
+        self.maps: Any = SimpleNamespace(
+            readings=range(10),
+            with_live=lambda grid, probability: SimpleNamespace(readings=range(10), live=(grid, probability)),
+        )
+        self.saver = Saver(self.em, self.live, self.account, self.log)
+        monkeypatch.setattr(saver, 'write_results', self.write)
+
+    def account(self) -> Account:
+        source = {**self.source, 'warnings': [*self.source['warnings']]}
+        return Account(source, self.accepted, [(0.0, 1.0), (2.0, 3.0)], ODOMETRY, str(self.folder), 'Maps of me')
+
+    def write(self, folder: Path, *arguments: Any, **options: Any) -> dict[str, Any]:
+        folder.mkdir(parents=True)
+        for name in ('maps.npz', 'report.txt', 'b.pgm'):
+            (folder / name).touch()
+        self.written.append((folder, *arguments, options))
+        return {'warnings': arguments[1]['warnings']}
+
+    def save(self, outcome: Outcome | None = None) -> Reply:
+        """Call the service, and have EM end so."""
+        reply = Reply()
+        self.saver.save_maps(reply)  # type: ignore[arg-type]
+        self.asked.pop()(outcome or Outcome(self.maps, ''))
+        return reply
+
+
+@pytest.fixture
+def node(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Node:
+    return Node(tmp_path / 'saved', monkeypatch)
+
+
+def test_the_files_are_named_in_the_answer_in_order(node: Node) -> None:
+    success, message = node.save().answer()
+    ((folder, maps, source, path_xy, title, options),) = node.written
+    assert success and message == ', '.join(str(folder / name) for name in ('b.pgm', 'maps.npz', 'report.txt'))
+    assert folder.parent == node.folder.resolve() and folder.name.startswith('maps_2')
+    assert maps.live == (GRID, LIVE)
+    assert source['warnings'] == ['from the node'] and 'trajectory' not in source
+    assert path_xy.tolist() == [[0.0, 1.0], [2.0, 3.0]] and title == 'Maps of me' and options == {}
+    assert node.log.warned == ['save_maps: from the node']
+
+
+def test_each_call_finds_a_free_name(node: Node) -> None:
+    for _ in range(3):
+        assert node.save().answer()[0]
+    assert len({folder for folder, *_ in node.written}) == 3
+
+
+def test_a_robot_without_a_path_has_one_of_no_points(node: Node) -> None:
+    account = node.account()._replace(path=[])
+    node.saver._account = lambda: account
+    assert node.save().answer()[0]
+    assert node.written[0][3].shape == (0, 2)
+
+
+@pytest.mark.parametrize(('newer', 'told'), [(0, False), (1, True), (7, True)])
+def test_readings_that_came_after_em_are_told_of(node: Node, newer: int, told: bool) -> None:
+    node.accepted += newer
+    node.save().answer()
+    warnings = node.written[0][2]['warnings']
+    assert len(warnings) == 1 + told
+    if told:
+        assert warnings[1].startswith(f'{newer} readings came after EM: only the live map has them')
+
+
+def test_readings_that_were_thinned_are_told_of(node: Node) -> None:
+    node.em.explained = node.accepted = 25
+    node.save().answer()
+    assert 'EM maps from 10 of 25 readings' in node.written[0][2]['warnings'][1]
+
+
+def test_whether_it_waits_for_em_is_logged(node: Node) -> None:
+    node.save().answer()
+    assert not any('waits' in text for text in node.log.warned)
+    node.em.current = object()
+    node.save().answer()
+    assert 'save_maps waits for the end of EM' in node.log.warned
+    node.log.warned.clear()
+    node.em.maps = node.maps
+    node.save().answer()
+    assert not any('waits' in text for text in node.log.warned)
+
+
+def test_without_maps_the_reason_is_the_answer(node: Node) -> None:
+    assert node.save(Outcome(None, 'EM was cancelled')).answer() == (
+        False,
+        'there is no map to save: EM was cancelled',
+    )
+    assert node.written == [] and node.saver.worker.waiting == 0
+
+
+def test_maps_that_a_reset_overtakes_are_not_written(node: Node) -> None:
+    node.generation = 5
+    success, message = node.save().answer()
+    assert not success and 'forgotten by reset' in message
+    assert node.written == []
+
+
+@pytest.mark.parametrize(
+    ('error', 'message', 'trouble'),
+    [
+        (OutputError('the disk is full'), 'the disk is full', ''),
+        (MemoryError(), 'save_maps failed: there is not enough memory', 'there is not enough memory'),
+        (KeyError('odd'), "save_maps failed: KeyError('odd')", "KeyError('odd')"),
+    ],
+)
+def test_whatever_fails_is_the_answer(
+    node: Node, monkeypatch: pytest.MonkeyPatch, error: Exception, message: str, trouble: str
+) -> None:
+    def fail(*arguments: Any, **options: Any) -> None:
+        raise error
+
+    with monkeypatch.context() as patch:
+        patch.setattr(saver, 'write_results', fail)
+        assert node.save().answer() == (False, message)
+    until(lambda: not node.saver.worker.waiting)
+    assert node.saver.worker.trouble == trouble
+    assert node.save().answer()[0]
+
+
+def trajectory(moved: bool, unplaced: int = 0) -> Found:
+    correction = SimpleNamespace(odometry='odometry', path_of=lambda stamp, pose: ('path of', stamp, pose))
+    refinement = SimpleNamespace(unplaced=unplaced, jumps='odometry jumped')
+    found: Any = Found(refinement, correction if moved else None, None)  # type: ignore[arg-type]
+    return found  # type: ignore[no-any-return]
+
+
+def test_the_trajectory_is_written_with_the_maps(node: Node, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(saver, 'trajectory_data', lambda refinement: {'jumps': refinement.jumps})
+    monkeypatch.setattr(saver, 'trajectory_files', lambda refinement, odometry: {'trajectory.tum': odometry})
+    node.em.found = trajectory(moved=True)
+    node.save().answer()
+    _, _, source, path_xy, _, options = node.written[-1]
+    assert source['trajectory'] == {'jumps': 'odometry jumped'}
+    assert path_xy == ('path of', *ODOMETRY)
+    assert options['extras'] == {'trajectory.tum': 'odometry'}
+    assert options['odometry_xy'].tolist() == [[0.0, 1.0], [2.0, 3.0]]
+    assert source['warnings'] == ['from the node']
+    # where it stays, the path is odometry's; where part of it has no place, there is a warning
+    node.em.found = trajectory(moved=False, unplaced=3)
+    node.save().answer()
+    _, _, source, path_xy, _, options = node.written[-1]
+    assert source['trajectory'] and path_xy.shape == (2, 2) and options == {}
+    assert source['warnings'] == ['from the node', 'odometry jumped']
+    node.em.found = Found(None, None, None)
+    node.save().answer()
+    assert 'trajectory' not in node.written[-1][2]
