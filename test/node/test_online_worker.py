@@ -1,4 +1,4 @@
-"""The online map in the background: what is shown, how often, and what becomes of commands for one that was given up."""
+"""The online map in the background: what is shown, how often, and what becomes of commands for a map given up."""
 
 from __future__ import annotations
 

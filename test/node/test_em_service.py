@@ -1,0 +1,370 @@
+"""The service run_em and who waits with it: each caller gets one answer, and the maps of the latest run are kept."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip('rclpy', reason='the services are those of rclpy')
+
+from em_robot import BEFORE, GRID, PROGRESS, SO_FAR, EmRobot
+
+from forward_grid_mapper.core.common.parameters import Parameters
+from forward_grid_mapper.node import em_service
+
+
+@pytest.fixture
+def make(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., EmRobot]]:
+    robots: list[EmRobot] = []
+
+    def begin(**options: Any) -> EmRobot:
+        robots.append(EmRobot(monkeypatch, **options))
+        return robots[-1]
+
+    yield begin
+    for robot in robots:
+        robot.em.close(10.0)
+
+
+@pytest.fixture
+def robot(make: Callable[..., EmRobot]) -> EmRobot:
+    return make()
+
+
+@pytest.fixture
+def held(robot: EmRobot) -> EmRobot:
+    """Searches wait until the test lets them go on."""
+    robot.held = True
+    return robot
+
+
+def test_maps_are_published_and_kept_and_the_caller_is_told(robot: EmRobot) -> None:
+    robot.warnings, robot.trajectory.words = ['ranges are copies'], 'trajectory refined'
+    assert (robot.em.last_run, robot.em.explained, robot.em.maps) == ('none yet', 0, None)
+    answer = robot.run_em()
+    robot.settle()
+    ((success, message),) = answer.sent
+    assert success and message.startswith('5 readings in ') and message.endswith(' s; trajectory refined')
+    (ml, uncertainty) = robot.published
+    assert ml[:3] == ('ml_map', 3, GRID) and ml[3][0, 0] == 5
+    assert uncertainty[:3] == ('uncertainty_map', 3, GRID) and uncertainty[3].dtype == np.float32
+    em = robot.em
+    assert em.maps is not None and em.explained == 5 and em.wrong_input == ['ranges are copies']
+    assert em.last_run == '5 readings in 1.75 s; trajectory refined'
+    assert em.sensors._table == {'sonar': 'health'}
+    assert 'EM: ranges are copies' in robot.node.warned and f'EM: {em.last_run}' in robot.node.warned
+    assert robot.trajectory.adopted == [] and robot.waited == ['EM']
+    assert robot.searches[0].start is None
+
+
+def test_a_run_looks_at_what_was_accepted_when_it_began_thinned_to_the_bound(make: Callable[..., EmRobot]) -> None:
+    robot = make(count=40, max_readings=38)
+    robot.held = True
+    robot.run_em()
+    robot.accept(2)
+    robot.begun().go_on.set()
+    robot.settle()
+    assert robot.searches[0].count == 38 and robot.em.explained == 40
+
+
+def test_what_comes_while_kernels_are_compiled_is_mapped_as_well(robot: EmRobot) -> None:
+    robot.compiled.clear()
+    answer = robot.run_em()
+    robot.until(lambda: robot.waited)
+    run = robot.em.current
+    assert run is not None and run.fresh()
+    robot.accept(3)
+    assert run.fresh(), 'it will look at them'
+    robot.compiled.add('EM')
+    robot.settle()
+    assert answer.sent[0][1].startswith('8 readings') and robot.em.explained == 8
+
+
+def test_kernels_of_the_trajectory_are_waited_for_where_one_is_found(make: Callable[..., EmRobot]) -> None:
+    robot = make(refine_poses=True)
+    robot.run_em()
+    robot.settle()
+    assert robot.waited == ['EM', 'trajectory']
+
+
+def test_a_second_call_is_refused_while_one_goes_on(held: EmRobot) -> None:
+    first, second = held.run_em(), held.run_em()
+    ((success, message),) = second.sent
+    assert not success and message.startswith('EM runs already (') and message.endswith('call again when it has ended')
+    held.begun().go_on.set()
+    held.settle()
+    assert first.sent[0][0] and len(held.searches) == 1
+
+
+def test_a_run_by_itself_begins_where_there_are_readings_and_none_goes_on(make: Callable[..., EmRobot]) -> None:
+    assert not make(count=0).em.run_by_itself()
+    robot = make()
+    robot.held = True
+    assert robot.em.run_by_itself()
+    assert not robot.em.run_by_itself()
+    robot.begun().go_on.set()
+    robot.settle()
+    assert robot.em.maps is not None
+
+
+def test_a_call_joins_a_run_by_itself_that_is_fresh(held: EmRobot) -> None:
+    held.em.run_by_itself()
+    held.begun()
+    answer = held.run_em()
+    assert answer.sent == [] and held.em.current is not None and not held.em.current.by_itself
+    assert not held.run_em().sent[0][0], 'somebody has asked for it by now'
+    held.searches[0].go_on.set()
+    held.settle()
+    assert answer.sent[0][0] and len(held.searches) == 1
+
+
+@pytest.mark.parametrize('why', ['readings', 'parameters'])
+def test_a_run_by_itself_that_is_old_gives_way(held: EmRobot, why: str) -> None:
+    held.em.run_by_itself()
+    held.begun()
+    waiting = held.wait_for_maps()
+    if why == 'readings':
+        held.accept(2)
+    else:
+        held.parameters = Parameters.from_flat({'p_hit': 0.6})
+    answer = held.run_em()
+    assert held.searches[0].cancelled and answer.sent == []
+    held.until(lambda: len(held.searches) == 2)
+    assert held.em.last_run == 'the run that was begun after some way gave way to run_em'
+    assert waiting == [], 'it waits for the other run'
+    held.begun().go_on.set()
+    held.settle()
+    assert answer.sent[0][0]
+    (outcome,) = waiting
+    assert outcome.maps is held.em.maps is not None
+    assert held.em.explained == (7 if why == 'readings' else 5)
+
+
+def test_cancelling_is_answered_when_the_run_has_ended(held: EmRobot) -> None:
+    ((success, message),) = held.cancel_em().sent
+    assert (success, message) == (False, 'EM does not run: there is nothing to cancel')
+    answer = held.run_em()
+    held.begun()
+    cancelled = held.cancel_em()
+    assert cancelled.sent == []
+    waiting = held.wait_for_maps()
+    assert waiting[0].maps is None and 'EM is being cancelled' in waiting[0].message
+    held.settle()
+    assert answer.sent == [(False, 'EM was cancelled by cancel_em')]
+    ((success, message),) = cancelled.sent
+    assert success and message.startswith('EM was cancelled by cancel_em (after ')
+    assert held.em.maps is None and 'EM: EM was cancelled by cancel_em' in held.node.warned
+    assert held.published == [], 'nothing was shown meanwhile'
+
+
+def test_cancelling_too_late_says_so(held: EmRobot, monkeypatch: pytest.MonkeyPatch) -> None:
+    answer = held.run_em()
+    search = held.begun()
+    monkeypatch.setattr(search, 'cancel', search.go_on.set)
+    cancelled = held.cancel_em()
+    held.settle()
+    assert answer.sent[0][0] and held.em.maps is not None
+    assert cancelled.sent == [(False, 'EM had found its maps before it could be cancelled; they are published')]
+
+
+def test_who_goes_before_a_run_is_told_when_it_is_cancelled(held: EmRobot) -> None:
+    held.em.run_by_itself()
+    held.begun()
+    held.accept(1)
+    answer, later = held.run_em(), held.wait_for_maps()
+    assert answer.sent == [] and later == []
+    cancelled = held.cancel_em()
+    assert answer.sent == [(False, 'EM was cancelled by cancel_em')]
+    assert later[0].message == 'EM was cancelled by cancel_em'
+    held.settle()
+    assert cancelled.sent[0][0] and len(held.searches) == 1
+
+
+def test_a_reset_forgets_the_maps_and_ends_the_run(held: EmRobot) -> None:
+    held.run_em()
+    held.begun().go_on.set()
+    held.settle()
+    held.em.wrong_input = ['odd']
+    held.em.run_by_itself()
+    held.begun()
+    held.accept(1)
+    answer = held.run_em()
+    held.publishers.generation += 1
+    held.em.reset()
+    assert answer.sent == [(False, 'EM was cancelled by reset')]
+    em = held.em
+    assert (em.maps, em.found, em.wrong_input, em.last_run) == (None, None, [], 'none since the reset')
+    assert em.sensors._table == {}
+    held.settle()
+    assert em.last_run == 'EM was cancelled by reset' and em.maps is None and len(held.searches) == 2
+
+
+def test_maps_that_a_reset_overtakes_are_not_kept(held: EmRobot, monkeypatch: pytest.MonkeyPatch) -> None:
+    answer = held.run_em()
+    search = held.begun()
+    monkeypatch.setattr(search, 'cancel', search.go_on.set)
+    held.publishers.generation += 1
+    held.em.reset()
+    held.settle()
+    assert answer.sent == [(False, 'EM was cancelled by reset')] and held.em.maps is None
+    assert all(generation == 3 for _, generation, *_ in held.published), 'publishers drop what is of before'
+
+
+def test_who_asks_for_maps_has_those_that_there_are_or_waits(held: EmRobot) -> None:
+    first = held.wait_for_maps()
+    second = held.wait_for_maps()
+    held.begun().go_on.set()
+    held.settle()
+    assert len(held.searches) == 1
+    (one,), (two,) = first, second
+    assert one.maps is two.maps is held.em.maps is not None
+    (again,) = held.wait_for_maps()
+    assert again.maps is held.em.maps and len(held.searches) == 1
+
+
+def test_the_map_of_before_comes_back_where_a_run_that_was_shown_fails(make: Callable[..., EmRobot]) -> None:
+    robot = make(publish_rate=50.0)
+    robot.held, robot.error = True, MemoryError()
+    answer = robot.run_em()
+    search = robot.begun()
+    run = robot.em.current
+    assert run is not None and search.watch is not None
+    while not run.shown:
+        search.watch('search', PROGRESS)
+    search.go_on.set()
+    robot.settle()
+    assert not answer.sent[0][0] and 'memory' in answer.sent[0][1] and robot.em.last_run == answer.sent[0][1]
+    assert robot.published[0] == ('ml_map', 3, *SO_FAR)
+    assert robot.published[-1] == ('ml_map', 3, *BEFORE)
+
+
+def test_the_map_so_far_is_shown_as_often_as_publish_rate_has_it(make: Callable[..., EmRobot]) -> None:
+    robot = make(publish_rate=20.0)
+    robot.held = True
+    robot.run_em()
+    search = robot.begun()
+    search.watch('search', PROGRESS)
+    assert robot.published == [], 'it has just begun'
+    begin = time.monotonic()
+    while len(robot.published) < 4:
+        search.watch('search', PROGRESS)
+    assert 0.15 <= time.monotonic() - begin < 10.0
+    assert any('3 nats' in text or 'iteration 1' in text for text in robot.node.warned)
+    # not where there is none, nor while it is being cancelled
+    robot.so_far = None
+    end = time.monotonic() + 0.12
+    while time.monotonic() < end:
+        search.watch('search', PROGRESS)
+    assert len(robot.published) == 4
+    robot.so_far = SO_FAR
+    robot.cancel_em()
+    robot.settle()
+    assert len([1 for name, *_ in robot.published if name == 'ml_map']) == 5, 'the map of before'
+
+
+def test_a_long_stage_without_a_map_is_told_of_now_and_then(held: EmRobot, monkeypatch: pytest.MonkeyPatch) -> None:
+    held.run_em()
+    search, run = held.begun(), held.em.current
+    assert run is not None
+    held.node.warned.clear()
+    search.watch('trajectory', None)
+    assert held.node.warned == []
+    now = time.monotonic()
+    for seconds, lines in ((9.9, 0), (10.1, 1), (15.0, 1), (20.0, 1), (20.2, 2)):
+        monkeypatch.setattr(em_service.time, 'monotonic', lambda seconds=seconds: run.begin + seconds)
+        search.watch('trajectory', None)
+        assert len(held.node.warned) == lines, seconds
+    monkeypatch.setattr(em_service.time, 'monotonic', lambda: now)
+    monkeypatch.undo()
+    assert all('trajectory of 5 readings' in text for text in held.node.warned) and held.published == []
+
+
+def test_maps_along_a_trajectory_are_shown_together_with_it(robot: EmRobot) -> None:
+    robot.trajectory.on = True
+    robot.held = True
+    robot.run_em()
+    search = robot.begun()
+    search.go_on.set()
+    # the executor adopts the trajectory before the maps are published
+    robot.until(lambda: robot.trajectory.adopted)
+    robot.settle()
+    assert robot.trajectory.adopted == [(None, 5)]
+    assert [name for name, *_ in robot.published] == ['ml_map', 'uncertainty_map']
+    # what was forgotten meanwhile is not adopted
+    robot.run_em()
+    search = robot.begun()
+    search.cancel = search.go_on.set  # type: ignore[method-assign]
+    robot.publishers.generation += 1
+    robot.em.reset()
+    robot.settle()
+    assert len(robot.trajectory.adopted) == 1 and len(robot.published) == 2
+
+
+def test_a_run_gives_its_trajectory_the_drive_and_what_there_is_by_now(held: EmRobot) -> None:
+    held.run_em()
+    held.begun()
+    held.accept(4)
+    ((drive, now),) = held.trajectory.asked
+    assert len(drive().readings) == 5
+    found: list[Any] = []
+    held.em.worker.worker.put(lambda: None)
+
+    thread = threading.Thread(target=lambda: found.append(now()))
+    thread.start()
+    held.until(lambda: found)
+    thread.join(60.0)
+    assert len(found[0].readings) == 9 and found[0].odometry.pose.shape == (0, 3)
+    held.searches[0].go_on.set()
+    held.settle()
+
+
+def online_map(start: Any) -> Any:
+    calls: list[Any] = []
+    return SimpleNamespace(so_far=lambda: start, adopt=calls.append, show=lambda: calls.append('show'), calls=calls)
+
+
+def test_the_online_map_gives_the_start_and_takes_what_is_found(robot: EmRobot) -> None:
+    robot.em.online = online = online_map('the map so far')
+    robot.run_em()
+    robot.settle()
+    assert robot.searches[0].start == 'the map so far' and online.calls == [robot.em.maps]
+    # along another trajectory it is not where odometry has it
+    robot.trajectory.correction = object()
+    robot.error = MemoryError()
+    robot.run_em()
+    robot.settle()
+    assert robot.searches[1].start is None and online.calls[1:] == ['show']
+
+
+def test_contradictions_are_looked_for_after_the_answer_and_told_of(robot: EmRobot) -> None:
+    robot.warnings, robot.contradictions = ['copies'], ['stamps are late', 'mirrored']
+    robot.run_em()
+    robot.settle()
+    assert robot.checked == [(5, {'sonar': (0.1, 0.0, 0.0)})]
+    assert robot.em.wrong_input == ['copies', 'stamps are late', 'mirrored']
+    assert robot.node.warned[-2:] == ['EM: stamps are late', 'EM: mirrored']
+    # of maps that were forgotten, or came after, nothing is told
+    robot.node.warned.clear()
+    for forget in ('maps', 'generation'):
+        robot.em._check_consistency(robot.em.maps, {}, 3)  # type: ignore[arg-type]
+        if forget == 'maps':
+            kept, robot.em.maps = robot.em.maps, None
+        else:
+            robot.publishers.generation += 1
+        robot.node.turn()
+        robot.em.maps = kept
+        robot.publishers.generation = 3
+    assert robot.node.warned == [] and len(robot.em.wrong_input) == 3
+
+
+def test_closing_cancels_the_run(held: EmRobot) -> None:
+    held.run_em()
+    search = held.begun()
+    held.em.close(10.0)
+    assert search.cancelled
