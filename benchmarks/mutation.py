@@ -115,7 +115,7 @@ def changes_of(module: str, folder: Path, most: int, seed: int) -> tuple[int, li
         'PYTHONDONTWRITEBYTECODE': '1',
         # a node compiles its kernels when it starts; no change is to one of them
         'NUMBA_DISABLE_JIT': str(int(not module.startswith('node/'))),
-        'NUMBA_CACHE_DIR': str(folder / 'kernels'),
+        'NUMBA_CACHE_DIR': os.environ.get('NUMBA_CACHE_DIR', str(folder / 'kernels')),
         'PYTEST_DISABLE_PLUGIN_AUTOLOAD': '1',
     }
 

@@ -168,7 +168,7 @@ class Robot:
             readings = self.diagnostics.get('readings', {})
             return int(readings.get('readings received', -1)) >= self.sent
 
-        self.until(taken, 30.0, f'{self.sent} readings received')
+        self.until(taken, what=f'{self.sent} readings received')
 
     def call(self, service: str, kind: Any = Trigger, seconds: float = 200.0, **fields: Any) -> Any:
         return self.until(self.ask(service, kind, **fields).result, seconds, f'{service} answers')

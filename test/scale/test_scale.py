@@ -344,9 +344,11 @@ def hungry(job: Job, number: int) -> dict[str, Any]:
 
 
 @scaled
-def test_a_worker_that_takes_more_than_its_memory(tmp_path: Path) -> None:
+def test_a_worker_that_takes_more_than_its_memory(monkeypatch: pytest.MonkeyPatch) -> None:
     from forward_grid_mapper.scale import cluster
 
+    # the second try is as good as the fourth
+    monkeypatch.setitem(cluster.SETTINGS, 'distributed.scheduler.allowed-failures', 1)
     job = Job(WorkFolder('nowhere'), Parameters(), TILE, versions())
     with (
         cluster.Cluster(1, None, 500_000_000) as given,
