@@ -190,12 +190,14 @@ def test_a_new_beginning_drops_what_was_meant_for_the_map_before(node: Node, map
     node.publish()
     assert node.shown[-1].epoch == 2 and node.shown[-1].ml[0, 0] == 2
     node.worker.restart(QUICK)
+    node.worker.show()
     node.publish()
     assert len(node.shown) == shown + 1, "an empty map is nobody's"
 
 
 def test_it_goes_on_from_the_map_of_em(node: Node, maps: type[PlainMap]) -> None:
     searched = np.ones(GRID.shape, np.int8)
+    node.worker.offer(readings(3))
     go_on = node.hold()
     node.worker.show()
     node.tick()
