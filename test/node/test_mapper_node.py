@@ -186,7 +186,7 @@ def test_services_during_em_and_reset(start: Any, robot: Robot) -> None:
     robot.play(messages[most : most + 200], rate=400.0)
     assert not first.done(), 'EM must last longer than this for the test to show anything'
     robot.until(lambda: len(robot.maps['live_map']) > before, what='live maps go on')
-    robot.until(lambda: robot.maps['ml_map'], 20.0, what='the map so far')
+    robot.until(lambda: robot.maps['ml_map'], what='the map so far')
     assert not first.done()
     begin = time.monotonic()
     reset = robot.call('reset')
