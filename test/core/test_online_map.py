@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import dataclasses
 import importlib.util
 import math
@@ -314,7 +313,7 @@ def kept_of(online: OnlineMap) -> Kept:
     arrays += [s.reading_states[name][:n].copy() for name in ('multiplicity', 'occupy', 'release', 'likelihood')]
     if len(s.normals.known):
         arrays.append(s.normals.known.reshape(evidence.grid.shape)[window].copy())
-    return Kept([*arrays, online._traversed[window].copy()], copy.copy(online._kept), (online.taken, online._count))
+    return Kept([*arrays, online._traversed[window].copy()], dict(online._kept), (online.taken, online._count))
 
 
 @pytest.mark.parametrize('case', ['first', 'more', 'grown', 'refined', 'many'])
