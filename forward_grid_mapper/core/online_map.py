@@ -13,7 +13,7 @@ weight to what is known, but no memory and no time.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, MutableMapping
+from collections.abc import Iterator, MutableMapping
 from itertools import chain
 from typing import NamedTuple
 
@@ -67,7 +67,8 @@ PORTION = 2000
 PARTS = 512
 """Dictionaries that share the numbers of readings: a large one keeps the GIL for long whenever it grows or goes."""
 
-Key = tuple[float, ...]
+Key = bytes
+"""What a reading says; of these, the collector of garbage need not look at any."""
 
 
 class _Numbers(MutableMapping[Key, int]):
@@ -78,16 +79,16 @@ class _Numbers(MutableMapping[Key, int]):
         self._count = 0
 
     def __getitem__(self, key: Key) -> int:
-        return self._parts[hash(key) % PARTS][key]
+        return self._parts[hash(key) % len(self._parts)][key]
 
     def __setitem__(self, key: Key, number: int) -> None:
-        part = self._parts[hash(key) % PARTS]
+        part = self._parts[hash(key) % len(self._parts)]
         before = len(part)
         part[key] = number
         self._count += len(part) - before
 
     def __delitem__(self, key: Key) -> None:
-        del self._parts[hash(key) % PARTS][key]
+        del self._parts[hash(key) % len(self._parts)][key]
         self._count -= 1
 
     def __iter__(self) -> Iterator[Key]:
@@ -192,10 +193,9 @@ class OnlineMap:
         fresh: list[list[Key]] = []
         try:
             for begin in range(0, len(readings), PORTION):
-                keys = list(self._keys(readings.select(slice(begin, begin + PORTION))))
                 fresh.append([])
                 numbers = []
-                for key in keys:
+                for key in self._keys(readings.select(slice(begin, begin + PORTION))):
                     numbers.append(self._kept.get(key, -1))
                     if numbers[-1] < 0:
                         fresh[-1].append(key)
@@ -210,7 +210,7 @@ class OnlineMap:
                     self._kept.pop(key, None)
             raise
 
-    def _keys(self, readings: Readings) -> Iterable[Key]:
+    def _keys(self, readings: Readings) -> list[Key]:
         """Return a key for each reading, the same for those that say the same."""
         p = self._parameters
         sigma = effective_sigma(readings, p.model, p.grid.resolution)
@@ -226,7 +226,10 @@ class OnlineMap:
             readings.half_angle,
             sigma,
         )
-        return zip(*(column.tolist() for column in columns), strict=True)
+        # 0 is added since -0 has other bytes
+        rows = np.column_stack(columns).astype(np.float64) + 0.0
+        data, size = rows.tobytes(), rows.shape[1] * rows.itemsize
+        return [data[i : i + size] for i in range(0, len(data), size)]
 
     def _search(self, evidence: Evidence) -> None:
         """Search the whole map as a batch does."""
