@@ -46,6 +46,8 @@ _MOST_MARKED, _MOST_NAMED, _NAME = 12, 4, 20
 WIDE = 2.6
 # Pixels of a cell, at least: below that walls of one cell are hardly seen.
 _CELL = 2.5
+# Dots that are drawn at once.
+_AT_ONCE = 2000
 # Longest scale bar, as a part of the panel's width.
 _BAR = 0.2
 
@@ -151,7 +153,9 @@ def _draw_overlay(axes: Axes, picture: Picture) -> None:
         # together they cover a hundredth of the panel at most, so that the map stays visible beneath them
         extent, points = axes.get_window_extent(), 72.0 / axes.figure.dpi
         size = float(np.clip(0.01 * extent.width * extent.height * points**2 / len(dots), 0.8, 9.0))
-        axes.scatter(dots[:, 0], dots[:, 1], s=size, color=DOT, linewidths=0, alpha=0.85, zorder=3)
+        # drawing takes no break, and other threads have to wait
+        for x, y in (dots[k : k + _AT_ONCE].T for k in range(0, len(dots), _AT_ONCE)):
+            axes.scatter(x, y, s=size, color=DOT, linewidths=0, alpha=0.85, zorder=3)
     if not paths:
         return
     before = picture.odometry_xy

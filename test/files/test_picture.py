@@ -117,6 +117,20 @@ def test_unexplained_readings_end_on_their_axis() -> None:
     assert len(ends) == 6
 
 
+def test_the_picture_does_not_depend_on_how_many_dots_are_drawn_at_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip('matplotlib')
+    from forward_grid_mapper.files import drawing
+
+    maps = made_maps()
+    assert len(compose(maps, PATH, '', None).unexplained_xy) > 4
+    for name, count in (('all', 1000), ('few', 4)):
+        monkeypatch.setattr(drawing, '_AT_ONCE', count)
+        write_picture(tmp_path / f'{name}.png', maps, PATH, 'run')
+    assert (tmp_path / 'all.png').read_bytes() == (tmp_path / 'few.png').read_bytes()
+
+
 def test_matplotlib_is_optional(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, 'matplotlib', None)
     monkeypatch.delitem(sys.modules, 'forward_grid_mapper.files.drawing', raising=False)
