@@ -13,7 +13,8 @@ weight to what is known, but no memory and no time.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterator, MutableMapping
+from itertools import chain
 from typing import NamedTuple
 
 import numpy as np
@@ -60,6 +61,49 @@ MANY = 5000
 """New readings for which a whole search is faster."""
 
 
+PORTION = 2000
+"""Readings that are looked up between two chances of other threads to get the GIL."""
+
+PARTS = 512
+"""Dictionaries that share the numbers of readings: a large one keeps the GIL for long whenever it grows or goes."""
+
+Key = bytes
+"""What a reading says; of these, the collector of garbage need not look at any."""
+
+
+class _Numbers(MutableMapping[Key, int]):
+    """Numbers of the readings that are kept, by what they say."""
+
+    def __init__(self) -> None:
+        self._parts: list[dict[Key, int]] = [{} for _ in range(PARTS)]
+        self._count = 0
+
+    def __getitem__(self, key: Key) -> int:
+        return self._parts[hash(key) % len(self._parts)][key]
+
+    def __setitem__(self, key: Key, number: int) -> None:
+        part = self._parts[hash(key) % len(self._parts)]
+        before = len(part)
+        part[key] = number
+        self._count += len(part) - before
+
+    def __delitem__(self, key: Key) -> None:
+        del self._parts[hash(key) % len(self._parts)][key]
+        self._count -= 1
+
+    def __iter__(self) -> Iterator[Key]:
+        return chain.from_iterable(self._parts)
+
+    def __len__(self) -> int:
+        return self._count
+
+    def clear(self) -> None:
+        """Forget all, bit by bit."""
+        self._count = 0
+        for part in self._parts:
+            part.clear()
+
+
 class _Traversed(NamedTuple):
     """What new readings say about the cells that the robot traversed: some of the grid."""
 
@@ -79,7 +123,7 @@ class OnlineMap:
     def clear(self) -> None:
         """Forget everything."""
         self._evidence: Evidence | None = None
-        self._kept: dict[tuple[float, ...], int] = {}
+        self._kept = _Numbers()
         self._traversed = np.zeros((0, 0), np.bool_)
         self._since: Window | None = None
         self._count = 0
@@ -96,8 +140,7 @@ class OnlineMap:
     def dismantle(self) -> None:
         """Free the memory of a map that nobody needs any more, bit by bit: at once, it would keep the GIL for long."""
         self._evidence = None
-        while self._kept:
-            self._kept.popitem()
+        self._kept.clear()
 
     def __len__(self) -> int:
         """Return the number of readings kept."""
@@ -145,25 +188,29 @@ class OnlineMap:
 
     def _insert(self, evidence: Evidence, readings: Readings) -> None:
         """Add readings to the evidence, those that say the same as another one as its multiplicity; all or none."""
-        new: list[int] = []
-        known: list[int] = []
-        fresh: dict[tuple[float, ...], int] = {}
-        for i, key in enumerate(self._keys(readings)):
-            kept = self._kept.get(key, fresh.get(key, -1))
-            if kept < 0:
-                fresh[key] = len(self._kept) + len(fresh)
-                new.append(i)
-            else:
-                known.append(kept)
+        new: list[NDArray[np.int64]] = []
+        known: list[NDArray[np.int64]] = []
+        fresh: list[list[Key]] = []
         try:
-            self._kept.update(fresh)
-            evidence.extend(readings.select(np.array(new, np.int64)), np.array(known, np.int64))
+            for begin in range(0, len(readings), PORTION):
+                fresh.append([])
+                numbers = []
+                for key in self._keys(readings.select(slice(begin, begin + PORTION))):
+                    numbers.append(self._kept.get(key, -1))
+                    if numbers[-1] < 0:
+                        fresh[-1].append(key)
+                        self._kept[key] = len(self._kept)
+                number = np.array(numbers, np.int64)
+                new.append(begin + np.flatnonzero(number < 0))
+                known.append(number[number >= 0])
+            evidence.extend(readings.select(np.concatenate(new)), np.concatenate(known))
         except BaseException:
-            for key in fresh:
-                self._kept.pop(key, None)
+            for keys in fresh:
+                for key in keys:
+                    self._kept.pop(key, None)
             raise
 
-    def _keys(self, readings: Readings) -> Iterable[tuple[float, ...]]:
+    def _keys(self, readings: Readings) -> list[Key]:
         """Return a key for each reading, the same for those that say the same."""
         p = self._parameters
         sigma = effective_sigma(readings, p.model, p.grid.resolution)
@@ -179,7 +226,10 @@ class OnlineMap:
             readings.half_angle,
             sigma,
         )
-        return zip(*(column.tolist() for column in columns), strict=True)
+        # 0 is added since -0 has other bytes
+        rows = np.column_stack(columns).astype(np.float64) + 0.0
+        data, size = rows.tobytes(), rows.shape[1] * rows.itemsize
+        return [data[i : i + size] for i in range(0, len(data), size)]
 
     def _search(self, evidence: Evidence) -> None:
         """Search the whole map as a batch does."""

@@ -46,6 +46,8 @@ _MOST_MARKED, _MOST_NAMED, _NAME = 12, 4, 20
 WIDE = 2.6
 # Pixels of a cell, at least: below that walls of one cell are hardly seen.
 _CELL = 2.5
+# Dots, or points of a path, that are drawn at once: drawing takes no break, and other threads have to wait.
+_AT_ONCE = 2000
 # Longest scale bar, as a part of the panel's width.
 _BAR = 0.2
 
@@ -69,7 +71,7 @@ def draw(path: Path, picture: Picture) -> None:
             draw_map(axes, panel.values, panel.extent, (right - left) / (width * DPI))
         draw_scale(axes, picture.view)
         if k == picture.overlay:
-            _draw_overlay(axes, picture)
+            _draw_overlay(axes, picture, (right - left) / (width * DPI))
         _frame(axes, panel.title, picture.view, (column == 0, row == rows - 1))
     _head(figure, picture)
     _foot(figure, picture)
@@ -145,26 +147,39 @@ def _frame(axes: Axes, title: str, view: tuple[float, float, float, float], oute
         axes.set_xlabel('x in m', fontsize=9, color=INK)
 
 
-def _draw_overlay(axes: Axes, picture: Picture) -> None:
+def _draw_overlay(axes: Axes, picture: Picture, pixel: float) -> None:
     dots, paths = picture.unexplained_xy, _coloured(picture)
     if len(dots):
         # together they cover a hundredth of the panel at most, so that the map stays visible beneath them
         extent, points = axes.get_window_extent(), 72.0 / axes.figure.dpi
         size = float(np.clip(0.01 * extent.width * extent.height * points**2 / len(dots), 0.8, 9.0))
-        axes.scatter(dots[:, 0], dots[:, 1], s=size, color=DOT, linewidths=0, alpha=0.85, zorder=3)
+        for x, y in (dots[k : k + _AT_ONCE].T for k in range(0, len(dots), _AT_ONCE)):
+            axes.scatter(x, y, s=size, color=DOT, linewidths=0, alpha=0.85, zorder=3)
     if not paths:
         return
-    before = picture.odometry_xy
+    before = _thinned(picture.odometry_xy, pixel)
     if len(before):
         axes.plot(before[:, 0], before[:, 1], color=BEFORE, linewidth=1.1, linestyle=(0, (4, 2)), zorder=3.5)
-    halo = [patheffects.withStroke(linewidth=2.4, foreground='white', alpha=0.9)]
+    for path, _ in paths:
+        _draw_path(axes, _thinned(path, pixel), 3.9, color='white', linewidth=2.4, alpha=0.9)
     for path, colour in paths:
-        x, y = path.T
-        axes.plot(x, y, color=colour, linewidth=1.4, path_effects=halo, solid_joinstyle='round', zorder=4)
+        _draw_path(axes, _thinned(path, pixel), 4.0, color=colour, linewidth=1.4)
     # of many drives the marks would hide the map
     for path, colour in paths if len(paths) <= _MOST_MARKED else []:
         for marker, xy in zip(_path_markers(_heading(path)), (path[0], path[-1]), strict=True):
             axes.add_line(_marker_line(marker, xy[0], xy[1], colour))
+
+
+def _draw_path(axes: Axes, path: NDArray[np.float64], order: float, **style: Any) -> None:
+    for k in range(0, max(len(path) - 1, 1), _AT_ONCE):
+        x, y = path[k : k + _AT_ONCE + 1].T
+        axes.plot(x, y, zorder=order, solid_capstyle='round', solid_joinstyle='round', **style)
+
+
+def _thinned(path: NDArray[np.float64], pixel: float) -> NDArray[np.float64]:
+    """Return a path without points in the same quarter of a pixel as the one before; the last one stays."""
+    moved = np.any(np.diff(np.floor(4 * path / pixel), axis=0), axis=1)
+    return path[np.r_[True, moved[:-1], True]] if len(path) > 2 else path
 
 
 def _coloured(picture: Picture) -> list[tuple[NDArray[np.float64], str]]:

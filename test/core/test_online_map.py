@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import dataclasses
 import importlib.util
 import math
@@ -134,7 +133,7 @@ def test_readings_that_say_the_same_add_weight_and_nothing_else(values: dict[str
     assert consistent(online)
 
 
-def keys_of(online: OnlineMap, readings: Readings) -> list[tuple[float, ...]]:
+def keys_of(online: OnlineMap, readings: Readings) -> list[bytes]:
     """The keys under which the readings are counted, one by one."""
     out = []
     for i in range(len(readings)):
@@ -165,6 +164,33 @@ def test_what_says_the_same_is_near_in_every_way(change: dict[str, float], same:
     for values in (at, at | {name: at[name] + step for name, step in change.items()}):
         online.add(Readings.from_columns(**{k: [v] if k == 'z' else v for k, v in values.items()}))
     assert len(online) == (1 if same else 2)
+
+
+@pytest.mark.parametrize('portion', [1, 7, 1000])
+def test_readings_are_numbered_the_same_whatever_is_looked_up_at_once(
+    monkeypatch: pytest.MonkeyPatch, portion: int
+) -> None:
+    readings = some(3, 60).select(np.r_[0:40, 20:60, 0:60])
+    expected = OnlineMap(Parameters())
+    expected.add(readings)
+    monkeypatch.setattr(online_map, 'PORTION', portion)
+    monkeypatch.setattr(online_map, 'PARTS', 3)
+    online = OnlineMap(Parameters())
+    online.add(readings)
+    numbers: dict[bytes, int] = {}
+    for key in keys_of(online, readings):
+        numbers.setdefault(key, len(numbers))
+    assert dict(online._kept) == dict(expected._kept) == numbers
+    assert kept_of(online).same(kept_of(expected))
+    online.dismantle()
+    assert len(online._kept) == 0 == len(list(online._kept))
+
+
+def test_no_sign_of_zero_makes_two_of_the_same() -> None:
+    reading = dataclasses.replace(some(count=1), x=np.zeros(1), y=np.zeros(1), yaw=np.zeros(1))
+    below = dataclasses.replace(reading, x=-reading.x, y=-reading.y, yaw=-reading.yaw)
+    (one,), (other,) = (OnlineMap(Parameters())._keys(each) for each in (reading, below))
+    assert one == other
 
 
 def test_another_sensor_says_something_else() -> None:
@@ -314,7 +340,7 @@ def kept_of(online: OnlineMap) -> Kept:
     arrays += [s.reading_states[name][:n].copy() for name in ('multiplicity', 'occupy', 'release', 'likelihood')]
     if len(s.normals.known):
         arrays.append(s.normals.known.reshape(evidence.grid.shape)[window].copy())
-    return Kept([*arrays, online._traversed[window].copy()], copy.copy(online._kept), (online.taken, online._count))
+    return Kept([*arrays, online._traversed[window].copy()], dict(online._kept), (online.taken, online._count))
 
 
 @pytest.mark.parametrize('case', ['first', 'more', 'grown', 'refined', 'many'])

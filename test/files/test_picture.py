@@ -117,6 +117,36 @@ def test_unexplained_readings_end_on_their_axis() -> None:
     assert len(ends) == 6
 
 
+def test_the_picture_does_not_depend_on_how_many_dots_are_drawn_at_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip('matplotlib')
+    from forward_grid_mapper.files import drawing
+
+    maps = made_maps()
+    assert len(compose(maps, PATH, '', None).unexplained_xy) > 4
+    for name, count in (('all', 1000), ('few', 4)):
+        monkeypatch.setattr(drawing, '_AT_ONCE', count)
+        write_picture(tmp_path / f'{name}.png', maps, PATH[:4], 'run')
+    assert (tmp_path / 'all.png').read_bytes() == (tmp_path / 'few.png').read_bytes()
+
+
+def test_a_thinned_path_leaves_no_pixel_out_and_ends_where_it_did() -> None:
+    pytest.importorskip('matplotlib')
+    from forward_grid_mapper.files.drawing import _thinned
+
+    rng = np.random.default_rng(0)
+    path = np.repeat(np.cumsum(rng.normal(0.0, 0.02, (300, 2)), axis=0), 24, axis=0)
+    path[4000] = np.nan
+    kept = _thinned(path, 0.1)
+    assert 50 < len(kept) < 300
+    assert np.isnan(kept).any() and np.array_equal(kept[[0, -1]], path[[0, -1]])
+    pixels, drawn = ({tuple(cell) for cell in np.floor(p[~np.isnan(p[:, 0])] / 0.025)} for p in (path, kept))
+    assert pixels == drawn
+    for few in (path[:0], path[:1], path[:2]):
+        assert np.array_equal(_thinned(few, 0.1), few)
+
+
 def test_matplotlib_is_optional(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, 'matplotlib', None)
     monkeypatch.delitem(sys.modules, 'forward_grid_mapper.files.drawing', raising=False)

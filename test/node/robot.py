@@ -33,6 +33,9 @@ from forward_grid_mapper.core.messages.message_types import NANOSECONDS, Odometr
 LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 RELIABLE = QoSProfile(depth=100_000, reliability=ReliabilityPolicy.RELIABLE)
 MAPS = ('live_map', 'ml_map', 'uncertainty_map')
+KEPT = 1500
+"""Readings that may be on their way; of more than 2000 messages of a topic, the middleware drops some."""
+
 START_TIME = 240.0
 """Seconds; a first start compiles every kernel, on a machine that may have other work."""
 
@@ -153,22 +156,24 @@ class Robot:
         publisher = self.range_out if isinstance(message, RangeMessage) else self.odom_out
         publisher.publish(ros_message(message))
 
+    @property
+    def received(self) -> int:
+        """Readings that the node says it has received, -1 before it says anything."""
+        return int(self.diagnostics.get('readings', {}).get('readings received', -1))
+
     def play(self, messages: Sequence[RangeMessage | OdometryMessage], rate: float = 1500.0) -> None:
-        """Send messages at a steady rate, and wait until the node has taken them all."""
+        """Send messages at a steady rate, no more than the middleware keeps, and wait until the node has taken all."""
+        self.sent = getattr(self, 'sent', 0)
         begin = time.monotonic()
         for k, message in enumerate(messages):
+            if self.sent >= self.received + KEPT:
+                self.until(lambda: self.sent < self.received + KEPT, what=f'{self.sent - KEPT} readings received')
             self.send(message)
+            self.sent += isinstance(message, RangeMessage)
             ahead = k / rate - (time.monotonic() - begin)
             if ahead > 0.002:
                 time.sleep(ahead)
-        ranges = sum(isinstance(message, RangeMessage) for message in messages)
-        self.sent = getattr(self, 'sent', 0) + ranges
-
-        def taken() -> bool:
-            readings = self.diagnostics.get('readings', {})
-            return int(readings.get('readings received', -1)) >= self.sent
-
-        self.until(taken, what=f'{self.sent} readings received')
+        self.until(lambda: self.received >= self.sent, what=f'{self.sent} readings received')
 
     def call(self, service: str, kind: Any = Trigger, seconds: float = 200.0, **fields: Any) -> Any:
         return self.until(self.ask(service, kind, **fields).result, seconds, f'{service} answers')

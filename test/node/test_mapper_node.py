@@ -175,8 +175,7 @@ def test_services_during_em_and_reset(start: Any, robot: Robot) -> None:
     robot.listen()
     messages = merged(recording)
     most = len(messages) * 4 // 5
-    # slow enough for a busy machine: the middleware keeps 2000 messages for the node, and drops what is more
-    robot.play(messages[:most], rate=1000.0)
+    robot.play(messages[:most])
     first = robot.ask('run_em')
     robot.until(lambda: robot.diagnostics.get('EM', {}).get('state', 'idle') != 'idle', what='EM runs')
     second = robot.call('run_em')
@@ -204,7 +203,7 @@ def test_services_during_em_and_reset(start: Any, robot: Robot) -> None:
     assert not save.success
     # a run that is under way does not keep the node from ending
     robot.sent = 0
-    robot.play(messages[: len(messages) // 2], rate=1000.0)
+    robot.play(messages[: len(messages) // 2])
     robot.ask('run_em')
     robot.until(lambda: robot.diagnostics['EM']['state'] != 'idle', what='EM runs again')
     assert node.stop(signal.SIGTERM) == 0

@@ -267,7 +267,8 @@ def _travel(drive: _Drive) -> tuple[NDArray[np.int64], Floats]:
     """Return numbers of readings between which the robot drove `STEP`, and its direction of travel there, radians."""
     x, y, _ = drive.robot
     driven = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(x), np.diff(y)))])
-    at = np.unique(np.searchsorted(driven, np.arange(STEP, driven[-1], STEP)))
+    at = np.searchsorted(driven, np.arange(STEP, driven[-1], STEP))
+    at = at[np.diff(at, prepend=-1) > 0]
     return at[:-1], np.arctan2(np.diff(y[at]), np.diff(x[at]))
 
 
