@@ -5,6 +5,7 @@ from __future__ import annotations
 import queue
 import threading
 from collections.abc import Callable, Iterator
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from forward_grid_mapper.core.common.errors import Cancelled
 from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.common.readings import Readings
 from forward_grid_mapper.core.mapping import Mapper
+from forward_grid_mapper.core.search.search import Progress
 from forward_grid_mapper.node import em
 from forward_grid_mapper.node.em import EmWorker, Outcome, Run
 
@@ -225,3 +227,45 @@ def test_a_run_that_waits_for_kernels_can_be_cancelled() -> None:
     worker.cancel()
     conclusions.get(timeout=60.0)()
     assert outcomes[0].message == 'EM was cancelled'
+
+
+def test_a_run_says_where_it_stands(monkeypatch: pytest.MonkeyPatch) -> None:
+    run = Run(Mapper(Parameters()), Parameters(), lambda: READING)
+    monkeypatch.setattr(em.time, 'monotonic', lambda: run.begin + 12.34)
+    assert run.seconds == pytest.approx(12.34)
+    assert str(run) == 'starting of 0 readings, 12.3 s'
+    assert not (run.by_itself or run.asked or run.shown or run.cancelled) and run.fresh()
+    run.stage, run.count, run.progress = 'search', 70, Progress(3, 400, 5, 61.5)
+    assert str(run).startswith('search of 70 readings, 12.3 s, iteration 3, ')
+    assert str(run).endswith(' nats gained')
+    run.cancelled = True
+    assert str(run).endswith(' nats gained, being cancelled')
+
+
+def test_a_run_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    statistics = {'iterations': 7, 'flips': 8, 'shifts': 9, 'occupied': 10, 'converged': True}
+    maps: Any = SimpleNamespace(statistics=statistics, readings=range(5), log_likelihood=-1.25, objective=-2.5)
+    said: list[str] = []
+    monkeypatch.setattr(em, 'quality_warning', lambda maps: ''.join(said))
+    line = (
+        '5 readings, 7 iterations, log-likelihood -1.2, objective -2.5, 8 flips, 9 shifts, 10 occupied cells, '
+        '3.21 seconds'
+    )
+    assert em.summary(maps, 3.21) == line
+    statistics['converged'] = False
+    assert em.summary(maps, 3.21) == f'{line}, NOT converged: raise max_iterations'
+    said.append('it does not fit')
+    assert em.summary(maps, 3.21) == f'{line}, NOT converged: raise max_iterations; BUT it does not fit'
+
+
+@pytest.mark.parametrize(('threads', 'expected'), [(0, 6), (2, 2)])
+def test_memory_is_asked_for_as_many_threads_as_there_will_be(
+    monkeypatch: pytest.MonkeyPatch, caller: Caller, threads: int, expected: int
+) -> None:
+    asked: list[tuple[int, int]] = []
+    monkeypatch.setattr(em, 'cores', lambda: 6)
+    monkeypatch.setattr(em, 'shortage', lambda cells, count, cores: asked.append((count, cores)) or 'too much')
+    parameters, outcomes = Parameters.from_flat({'threads': threads}), list[Outcome]()
+    assert caller.worker.start(Run(Mapper(parameters), parameters, lambda: READING), outcomes.append)
+    caller.conclude()
+    assert asked == [(1, expected)] and outcomes == [Outcome(None, 'too much')]
