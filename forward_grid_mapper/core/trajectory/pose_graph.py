@@ -21,8 +21,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
-from scipy.sparse.linalg import splu
 
+from .bordered import Bordered
 from .poses import Floats, relative, wrapped
 
 ROBUST = 4.0
@@ -277,7 +277,8 @@ class _Normal:
         parts.append((np.broadcast_to(rows[:n], shape), extra, -graph.sensitivity))
         i, j, v = (np.concatenate([part[k].ravel() for part in parts]) for k in range(3))
         self.j = sparse.csr_matrix((v, (i, j)), shape=(3 * len(r), self.size))
-        self.omega = sparse.block_diag(list(self.information), format='csr')
+        blocks = np.arange(len(r) + 1)
+        self.omega = sparse.bsr_matrix((self.information, blocks[:-1], blocks), shape=(3 * len(r),) * 2).tocsr()
         self.h = self.j.T @ self.omega @ self.j
         self.gradient = self.j.T @ (self.omega @ r.ravel())
         self.pulled = [self._add(*self._yaws(), graph.yaws.part), self._add(*self._walls())]
@@ -328,9 +329,11 @@ class _Normal:
         self.prior[:3] = 0.0
 
     def step(self, damping: float) -> Floats:
-        diagonal = sparse.diags(damping * self.h.diagonal())
-        out: Floats = splu(self.h + diagonal).solve(-self.gradient)
-        return out
+        return self._factors(sparse.diags(damping * self.h.diagonal())).solve(-self.gradient)
+
+    def _factors(self, more: Any = 0.0) -> Bordered:
+        first = 3 * len(self.state.nodes)
+        return Bordered((self.h + more).tocsc(), slice(first, first + len(self.state.calibration)))
 
     def draw(self, count: int, rng: np.random.Generator) -> Floats:
         """Return deviations of all unknowns, shape (3 K + C + 2 W, count)."""
@@ -340,8 +343,7 @@ class _Normal:
         for j, root in self.pulled:
             right += j.T @ (root[:, None] * rng.standard_normal((len(root), count)))
         right += np.sqrt(self.prior)[:, None] * rng.standard_normal(right.shape)
-        out: Floats = splu(self.h).solve(np.ascontiguousarray(right))
-        return out
+        return self._factors().solve(right)
 
 
 def _where_walls_are(walls: Walls, nodes: Floats) -> Floats:
