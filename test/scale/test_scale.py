@@ -384,8 +384,9 @@ def test_a_scheduler_that_exists(monkeypatch: pytest.MonkeyPatch) -> None:
     from forward_grid_mapper.scale import cluster
 
     job = Job(WorkFolder('nowhere'), Parameters(), TILE, versions())
+    # of processes, as those that users have; one in this process has its event loop in common with the client
     with LocalCluster(
-        n_workers=2, threads_per_worker=1, processes=False, memory_limit='1GB', dashboard_address=None
+        n_workers=2, threads_per_worker=1, processes=True, memory_limit='1GB', dashboard_address=None
     ) as there:
         address = there.scheduler_address
         with cluster.Cluster(1, address, 10) as given:
