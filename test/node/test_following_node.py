@@ -78,8 +78,15 @@ def follow(robot: Inside, least: int = 1) -> Follower:
     """Turn the executor until so many windows are followed and nothing is left to do."""
     part = robot.node.trajectory.following
     assert part is not None
-    robot.until(lambda: part.follower is not None and part.follower.windows >= least)
-    robot.until(lambda: not part.worker.waiting and not part._busy)
+
+    def idle() -> bool:
+        return not part.worker.waiting and not part._busy
+
+    robot.until(lambda: part.follower is not None and idle())
+    # what it was offered last may have lacked some of what the robot has by now
+    part._seen = None
+    robot.until(lambda: (part._seen is not None or part.obstacle) and idle())
+    assert part.follower.windows >= least
     follower: Follower = part.follower
     return follower
 
