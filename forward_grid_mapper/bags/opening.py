@@ -106,6 +106,8 @@ def _open_folder(folder: Path) -> tuple[list[Source], str | None]:
             )
         inside = sorted(path.parent for path in folder.glob('*/metadata.yaml'))
         hint = f' There is one in it: {inside[0]}' if inside else ''
+        if not inside and (deeper := sorted(path.parent.parent for path in folder.glob('*/*/metadata.yaml'))):
+            hint = f' There are bags in {deeper[0]}'
         raise BagError(f'{folder} is not a bag: it has neither metadata.yaml nor a .mcap, .db3 or .bag file.{hint}')
     listed = _without_repetition(folder / name for name in metadata.files)
     sources, problems = _open_each([p for p in listed if p.exists()] or present, metadata.compression)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from ..core.common.errors import MapperError, ParameterError
@@ -17,6 +17,7 @@ from ..files.results import write_results
 from ..recordings.read_drive import read_drive
 from ..simulation.drive import Recording
 from ..simulation.score import SURFACE_DEPTH, Scores, score_map, threshold, visible_surface
+from ..simulation.world import Door
 from .console import Ticker, run
 from .desktop import show
 from .options import add_mapping_options, add_show_option, chosen_parameters
@@ -55,13 +56,18 @@ def score_all(maps: MapArchive, recording: Recording) -> dict[str, Scores]:
     return {name: score_map(cells, maps.grid, recording.world, visible) for name, cells in decided.items()}
 
 
-def score_table(scores: dict[str, Scores]) -> str:
-    """Return the scores as lines of text."""
+def score_table(scores: dict[str, Scores], doors: Sequence[Door]) -> str:
+    """Return the scores as lines of text, and the true widths of the doors."""
     lines = [f'{"":24s}{"F1":>7s}{"precision":>11s}{"recall":>8s}{"false dots":>12s}   open width of each door, m']
     for name, s in scores.items():
-        doors = ' '.join(f'{width:.1f}' for width in s.door_widths)
-        lines.append(f'{name:24s}{s.f1:7.3f}{s.precision:11.3f}{s.recall:8.3f}{s.false_dots:12d}   {doors}')
+        found = _widths(s.door_widths)
+        lines.append(f'{name:24s}{s.f1:7.3f}{s.precision:11.3f}{s.recall:8.3f}{s.false_dots:12d}   {found}')
+    lines.append(f'{"truth":62s}   {_widths(door.width for door in doors)}')
     return '\n'.join(lines)
+
+
+def _widths(doors: Iterable[float]) -> str:
+    return ' '.join(f'{width:.1f}' for width in doors)
 
 
 def through_node(folder: Path, bag: Path, recording: Recording, options: argparse.Namespace, ticker: Ticker) -> str:
@@ -127,7 +133,7 @@ def demo(options: argparse.Namespace) -> int:
             summary = through_node(folder, bag, recording, options, ticker)
         ticker.say('scoring')
         maps = read_npz(folder / 'maps' / 'maps.npz')
-        table = score_table(score_all(maps, recording))
+        table = score_table(score_all(maps, recording), recording.world.doors)
         left, right, bottom, top = recording.world.grid.extent
         tiles = [
             Tile('truth', recording.world.grid, recording.world.reference),

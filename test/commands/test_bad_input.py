@@ -74,6 +74,12 @@ def test_a_folder_that_holds_a_bag_is_told_apart_from_one(plain: Path) -> None:
     assert str(plain / 'bag') in str(told.value)
 
 
+def test_a_folder_with_a_folder_of_bags_in_it_names_that(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_tape(tmp_path / 'campus' / 'drives' / 'first', tape())
+    said = refusal(capsys, tmp_path, tmp_path / 'campus', '-o', tmp_path / 'maps')
+    assert f'There are bags in {tmp_path / "campus" / "drives"}' in said
+
+
 def test_no_such_bag(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     said = refusal(capsys, tmp_path, tmp_path / 'absent', '-o', tmp_path / 'maps')
     assert str(tmp_path / 'absent') in said and 'does not exist' in said and 'Give a bag' in said
