@@ -8,8 +8,8 @@
 
 Each run prints the absolute trajectory error (rms after rigid alignment, metres) of odometry and of what `Refiner`
 makes of it, whether that was taken, and the time of one core a metre; each group ends with a summary. Of recordings the
-map is scored as well, by ../shared/tools/score_map.py with --align. With --maps, those of simulated runs are, against
-the world: maps from exact poses, from odometry, and from what was made of it, both aligned with the exact ones.
+map is scored as well, by ../shared/tools/score_map.py with --align. With --maps, so are maps of simulated runs, from
+exact poses, from odometry, and from what was made of it; the latter two are aligned with the exact poses.
 """
 
 from __future__ import annotations
