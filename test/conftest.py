@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import sys
 from collections.abc import Iterator
@@ -32,9 +33,10 @@ def domain() -> Iterator[int]:
 
 
 def pytest_configure() -> None:
-    """Hear Ctrl-C, here and in the processes that tests start, even where the shell runs the tests in the background.
+    """Have participants of DDS find each other soon, and hear Ctrl-C, here and in the processes that tests start.
 
-    A shell without job control has background commands ignore it, which processes hand down.
+    A shell without job control has background commands ignore Ctrl-C, which processes hand down.
     """
+    os.environ.setdefault('FASTRTPS_DEFAULT_PROFILES_FILE', str(Path(__file__).parent / 'fast_discovery.xml'))
     if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import sys
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
@@ -27,12 +28,22 @@ OURS: tuple[tuple[Any, str], ...] = (
 )
 
 
+def _place() -> tuple[Any, ...]:
+    """Return the lines that led to an allocation."""
+    frame, lines = sys._getframe(2), []
+    while frame is not None:
+        lines.append((frame.f_code, frame.f_lineno))
+        frame = frame.f_back
+    return tuple(lines)
+
+
 class Allocations:
     """Counts allocations, and lets one of them fail."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.count, self.fails = 0, 0
         self._counting = False
+        self._places: dict[tuple[Any, ...], list[int]] | None = None
         for where, name in (*((np, name) for name in NUMPY), *OURS):
             monkeypatch.setattr(where, name, self._counted(getattr(where, name)))
 
@@ -40,11 +51,25 @@ class Allocations:
         def counted(*arguments: Any, **options: Any) -> Any:
             if self._counting:
                 self.count += 1
+                if self._places is not None:
+                    self._places.setdefault(_place(), []).append(self.count)
                 if self.count == self.fails:
                     raise MemoryError(f'allocation {self.count}, {getattr(function, "__name__", function)}')
             return function(*arguments, **options)
 
         return counted
+
+    def to_fail(self, work: Callable[[], object]) -> list[int]:
+        """Return the allocations of `work` that are worth failing, and at the end one more than it has.
+
+        Of those that one place makes again and again, called by the same lines, they are the first and the last.
+        """
+        self._places = {}
+        with self.failing(0):
+            work()
+        chosen = {number for numbers in self._places.values() for number in (numbers[0], numbers[-1])}
+        self._places = None
+        return [*sorted(chosen), self.count + 1]
 
     @contextmanager
     def failing(self, which: int) -> Iterator[None]:

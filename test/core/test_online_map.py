@@ -367,7 +367,8 @@ def test_a_call_that_finds_no_memory_takes_nothing_or_all(monkeypatch: pytest.Mo
     expected, wanted = whole.maps(), kept_of(whole)
     allocations = Allocations(monkeypatch)
     refused = searched_later = 0
-    for which in range(1, 10_000):
+    first = fed(parts[:at], values)
+    for which in allocations.to_fail(lambda: first.add(parts[at])):
         online = fed(parts[:at], values)
         taken = online.taken
         try:
@@ -395,8 +396,7 @@ def test_a_call_that_finds_no_memory_takes_nothing_or_all(monkeypatch: pytest.Mo
         assert consistent(online)
         assert online.taken == whole.taken
         assert kept_of(online).readings == wanted.readings
-        if done:
-            break
+    assert done
     assert refused > 15
     assert searched_later or case == 'first'
 
