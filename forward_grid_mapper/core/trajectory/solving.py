@@ -42,8 +42,8 @@ OF_MATCHES = 0.2
 around is off as the block is."""
 
 LARGEST_RESIDUAL, FIRST_OUT = 5.0 * OF_MATCHES, 0.5
-"""σ², in the mean over a loop, from which on it does not agree with the rest; and the part of the largest such mean from
-which on loops are taken out at once: what else is far off may be so because of these."""
+"""σ², in the mean over a loop, from which on it does not agree with the rest; and the part of the largest such mean
+from which on loops are taken out at once: what else is far off may be so because of these."""
 
 SETTLED = 0.1
 """Metres, in the root mean square, by which matching must have moved the nodes for it to be done again: a cell."""
