@@ -24,7 +24,7 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -106,17 +106,17 @@ def readings_of(count: int) -> Any:
 
 
 class Account:
-    """What the node says, read in a thread."""
+    """What a process says, read in threads: log lines in the same stream would get into those of the probe."""
 
     def __init__(self, process: subprocess.Popen[str]) -> None:
         self.samples: list[tuple[float, float, float]] = []
         self.lines: list[str] = []
-        self._process = process
-        threading.Thread(target=self._read, daemon=True).start()
+        for stream in (process.stdout, process.stderr):
+            if stream is not None:
+                threading.Thread(target=self._read, args=(stream,), daemon=True).start()
 
-    def _read(self) -> None:
-        assert self._process.stdout is not None
-        for line in self._process.stdout:
+    def _read(self, stream: Iterable[str]) -> None:
+        for line in stream:
             if line.startswith('probe '):
                 now, late, own = map(float, line.split()[1:])
                 self.samples.append((now, late, own))
@@ -191,7 +191,7 @@ class Load:
             if time.monotonic() > end:
                 raise TimeoutError('the node does not answer')
             if self._process.poll() is not None:
-                raise RuntimeError('the node ended')
+                raise RuntimeError(f'the node ended with {self._process.returncode}')
             if self.met():
                 self.send()
             rclpy.spin_once(self.node, timeout_sec=0.001)
@@ -236,7 +236,7 @@ def measure(options: argparse.Namespace, folder: Path) -> None:
     if options.cold:
         environment['NUMBA_CACHE_DIR'] = str(folder / 'cache')
     process = subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, bufsize=1, env=environment
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, bufsize=1, env=environment
     )
     control = subprocess.Popen([sys.executable, __file__, '--control'], stdout=subprocess.PIPE, text=True, bufsize=1)
     account, machine, begin = Account(process), Account(control), time.monotonic()

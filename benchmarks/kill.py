@@ -71,7 +71,15 @@ class Robot:
         self._reset = self.node.create_client(Trigger, 'forward_grid_mapper/reset')
         self._rate = rate
         self.stamps: list[int] = []
-        threading.Thread(target=self._run, daemon=True).start()
+        self._ended = threading.Event()
+        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Publish no more."""
+        self._ended.set()
+        self._thread.join()
+        rclpy.shutdown()
 
     def reset(self) -> None:
         """Call ~/reset, and go on."""
@@ -82,7 +90,7 @@ class Robot:
         reading.header.frame_id = 'sonar'
         pose = Odometry(child_frame_id='base_link')
         pose.header.frame_id = 'odom'
-        while True:
+        while not self._ended.is_set():
             stamp = time.time_ns()
             for header in (reading.header, pose.header):
                 header.stamp.sec, header.stamp.nanosec = divmod(stamp, SECOND)
@@ -255,7 +263,7 @@ def main() -> int:
             if missing_before:
                 print(f'    {missing_before} of {len(before)} that were in a file are in none')
         total, doubled = len(kept(folder)), twice(folder)
-    rclpy.shutdown()
+    robot.stop()
     print(f'{options.times} kills ({idle} before the first reading), {total} readings in the journal, {doubled} twice')
     print(f'lost before the last second: {lost}; the oldest reading that was lost was {worst:.2f} s old')
     print(f'nodes that printed a traceback: {tracebacks}')

@@ -2,12 +2,14 @@
 
     python benchmarks/trajectories.py                       # all simulated runs
     python benchmarks/trajectories.py --robot front --level wheels --seeds 2
+    python benchmarks/trajectories.py --maps                # and the maps that are made of them
     python benchmarks/trajectories.py --shared ../shared/data
     python benchmarks/trajectories.py --distance 250 500 1000    # how time and memory grow
 
 Each run prints the absolute trajectory error (rms after rigid alignment, metres) of odometry and of what `Refiner`
 makes of it, whether that was taken, and the time of one core a metre; each group ends with a summary. Of recordings the
-map is scored as well, by ../shared/tools/score_map.py with --align.
+map is scored as well, by ../shared/tools/score_map.py with --align. With --maps, so are maps of simulated runs, from
+exact poses, from odometry, and from what was made of it; the latter two are aligned with the exact poses.
 """
 
 from __future__ import annotations
@@ -28,13 +30,14 @@ from forward_grid_mapper.core.common.grid import UNKNOWN
 from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.common.readings import Readings
 from forward_grid_mapper.core.mapping import Mapper
-from forward_grid_mapper.core.trajectory.poses import rms_after_alignment
+from forward_grid_mapper.core.trajectory.poses import compose, rms_after_alignment
 from forward_grid_mapper.core.trajectory.refinement import Refiner
 from forward_grid_mapper.core.trajectory.windows import Odometry
 from forward_grid_mapper.core.warm_up import warm_up
 from forward_grid_mapper.recordings.read_drive import read_drive
 from forward_grid_mapper.simulation.drift import LEVELS, with_drift
 from forward_grid_mapper.simulation.drive import Recording, drive
+from forward_grid_mapper.simulation.score import SURFACE_DEPTH, score_map, visible_surface
 from forward_grid_mapper.simulation.sonar import NoiseModel, front_array, sonar_ring
 from forward_grid_mapper.simulation.world import Floorplan, World, building_tour, building_world
 
@@ -136,10 +139,36 @@ def run(name: str, readings: Readings, odometry: Odometry, true: Odometry) -> di
         'taken': outcome.accepted,
         'ms': spent,
         'readings': outcome.readings,
+        'trajectory': outcome.trajectory,
     }
 
 
-def simulated(robot: str, level: str, seeds: range, first: int) -> list[dict[str, Any]]:
+def aligned(readings: Readings, path: Odometry, true: Odometry) -> Readings:
+    """Return the readings moved rigidly, as lays the path on the true one best."""
+    estimate, truth = path.at(true.stamp), true.pose
+    a, b = estimate[:, :2] - estimate[:, :2].mean(0), truth[:, :2] - truth[:, :2].mean(0)
+    turn = math.atan2((a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum(), (a * b).sum())
+    middle = compose(np.array([0.0, 0.0, turn]), np.r_[estimate[:, :2].mean(0), 0.0])
+    frame = np.r_[truth[:, :2].mean(0) - middle[:2], turn]
+    x, y, yaw = compose(frame, np.stack([readings.x, readings.y, readings.yaw], axis=-1)).T
+    return dataclasses.replace(readings, x=x, y=y, yaw=yaw)
+
+
+def add_map_scores(row: dict[str, Any], exact: Recording, drifted: Recording) -> None:
+    """Print and note F1 of the maps from exact poses, from odometry and from what was made of it."""
+    true, visible = odometry_of(exact), visible_surface(exact.world, exact.readings, SURFACE_DEPTH)
+    placed = {
+        'exact': exact.readings,
+        'odometry': aligned(drifted.readings, odometry_of(drifted), true),
+        'refined': aligned(row['readings'], row['trajectory'], true),
+    }
+    for name, readings in placed.items():
+        maps = Mapper(Parameters()).run(readings)
+        row[name] = score_map(maps.ml, maps.grid, exact.world, visible).f1
+    print(f'{"":<34} F1 ' + ', '.join(f'{name} {row[name]:.3f}' for name in placed), flush=True)
+
+
+def simulated(robot: str, level: str, seeds: range, first: int, maps: bool) -> list[dict[str, Any]]:
     """Run the simulated worlds of one robot and level."""
     sonars, spacing, noise = ROBOTS[robot]
     rows = []
@@ -149,6 +178,8 @@ def simulated(robot: str, level: str, seeds: range, first: int) -> list[dict[str
             recording = with_drift(exact, LEVELS[level], seed) if level != 'none' else exact
             title = f'{robot}, {level}, {name}, seed {seed}'
             rows.append(run(title, recording.readings, odometry_of(recording), odometry_of(exact)))
+            if maps:
+                add_map_scores(rows[-1], exact, recording)
     return rows
 
 
@@ -203,8 +234,16 @@ def summary(title: str, rows: list[dict[str, Any]]) -> None:
     taken, worse = (sum(bool(row[key]) for row in rows) for key in ('taken', 'worse'))
     print(
         f'{title:<34} {np.median(before):7.2f} → {np.median(after):6.3f} m in the median, {after.max():.2f} m at '
-        f'worst; {taken} of {len(rows)} taken, {worse} worse; {np.median(spent):.0f} ms/m\n'
+        f'worst; {taken} of {len(rows)} taken, {worse} worse; {np.median(spent):.0f} ms/m'
     )
+    if rows and 'exact' in rows[0]:
+        exact, odometry, refined = (np.array([row[key] for row in rows]) for key in ('exact', 'odometry', 'refined'))
+        print(
+            f'{"":<34} F1 exact {np.median(exact):.3f}, odometry {np.median(odometry):.3f}, refined '
+            f'{np.median(refined):.3f}; refined below exact by {np.median(exact - refined):.3f} in the median, '
+            f'{(exact - refined).max():.3f} at worst'
+        )
+    print()
 
 
 def main() -> None:
@@ -214,6 +253,7 @@ def main() -> None:
     parser.add_argument('--level', choices=['none', *LEVELS], action='append')
     parser.add_argument('--seeds', type=int, default=5)
     parser.add_argument('--first-seed', type=int, default=0, help='0 to 9, 20 and 21 were tuned on')
+    parser.add_argument('--maps', action='store_true', help='score the maps of simulated runs, too')
     parser.add_argument('--shared', type=Path, help='folder of recordings with corrected odometry, instead')
     parser.add_argument('--distance', type=float, nargs='+', help='metres of longer and longer drives, instead')
     options = parser.parse_args()
@@ -228,7 +268,7 @@ def main() -> None:
         return
     for robot in options.robot or ROBOTS:
         for level in options.level or ('none', *LEVELS):
-            rows = simulated(robot, level, range(options.seeds), options.first_seed)
+            rows = simulated(robot, level, range(options.seeds), options.first_seed, options.maps)
             summary(f'{robot}, {level}', rows)
 
 

@@ -18,7 +18,8 @@ REASONS = {
     'too_near': 'the range is -inf, or less than a millimetre: something too near to measure, or a dead sensor',
     'below_min_range': 'the range is below min_range',
     'over_range': 'no echo, and over_range is "discard"',
-    'bad_limits': 'min_range or max_range is negative, not finite, or max_range is not above min_range',
+    'bad_limits': 'min_range or max_range is negative or not finite, or max_range is not above min_range, or below a '
+    'millimetre',
     'bad_field_of_view': 'the field of view is not between 0 and 180 degrees; parameter field_of_view overrides it',
     'empty_frame_id': 'the header has no frame_id, so the sensor is unknown',
     'long_frame_id': 'the frame_id has more than 255 characters',
@@ -88,7 +89,7 @@ def measure(message: RangeMessage, parameters: AssociationParameters) -> Measure
         return 'bad_field_of_view'
     fixed = message.min_range == message.max_range
     z_max = parameters.max_range or message.max_range
-    if not (0.0 < z_max < math.inf and 0.0 <= message.min_range and (fixed or message.min_range < z_max)):
+    if not (NEAREST <= z_max < math.inf and 0.0 <= message.min_range and (fixed or message.min_range < z_max)):
         return 'bad_limits'
     z, sigma = message.range, 0.0
     if 0.0 < message.variance < math.inf:
@@ -144,7 +145,7 @@ def measure_all(messages: Ranges, parameters: AssociationParameters) -> Measurem
     least = messages.min_range
     fixed = least == messages.max_range
     z_max = np.full(size, parameters.max_range) if parameters.max_range else messages.max_range
-    reject('bad_limits', ~((z_max > 0.0) & (z_max < math.inf) & (least >= 0.0) & (fixed | (least < z_max))))
+    reject('bad_limits', ~((z_max >= NEAREST) & (z_max < math.inf) & (least >= 0.0) & (fixed | (least < z_max))))
     z = messages.range
     stated = (messages.variance > 0.0) & (messages.variance < math.inf)
     sigma = np.sqrt(np.where(stated, messages.variance, 0.0))

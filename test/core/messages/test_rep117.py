@@ -71,6 +71,8 @@ def test_the_least_and_the_largest_range() -> None:
         {'max_range': math.inf},
         {'max_range': -1.0},
         {'max_range': 0.05},
+        {'min_range': 0.0, 'max_range': NEAREST * 0.999},
+        {'min_range': 1e-45, 'max_range': 1e-45},
         {'min_range': -0.001},
         {'min_range': -2.0, 'max_range': -1.0},
         {'min_range': math.inf, 'max_range': math.inf},
@@ -83,6 +85,10 @@ def test_limits_that_make_no_sense(changes: dict[str, float]) -> None:
 def test_a_largest_range_given_by_parameter_at_the_least_one() -> None:
     assert refused(PLAIN._replace(min_range=2.0), max_range=2.0) == 'bad_limits'
     assert said(PLAIN._replace(min_range=2.0, range=2.5), max_range=2.6).z_max == 2.6
+
+
+def test_a_largest_range_of_a_millimetre_is_one() -> None:
+    assert said(PLAIN._replace(min_range=0.0, max_range=NEAREST)).z_max == NEAREST
 
 
 @pytest.mark.parametrize('angle', [math.pi, 0.0, -0.1])
