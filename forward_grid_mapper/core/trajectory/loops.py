@@ -1,9 +1,11 @@
 """Loops: blocks matched with local maps of places that the robot came by at another time.
 
 How far a place may be off is asked from the posterior of the graph, of which deviations are drawn; there the block is
-searched, wherever it may be. A loop counts if its readings fit about as well as those matched with their own
-surroundings, and nowhere else in the searched area nearly as well. What does not agree with the rest is taken out again
-when the graph is solved.
+searched, wherever it may be. That posterior knows nothing of a wall that was taken for another one or of votes that are
+wrong together, so places are off by more; and where the right place is not searched, rooms that look alike are found
+instead. So the search goes farther than the posterior does. A loop counts if its readings fit about as well as those
+matched with their own surroundings, and nowhere else in the searched area nearly as well. What does not agree with the
+rest is taken out again when the graph is solved.
 """
 
 from __future__ import annotations
@@ -33,9 +35,12 @@ REACH = 3.0
 AROUND = 4.0
 """Metres of travel before and after a place that its map is made of."""
 
+UNSURE = np.array([2.0, 2.0, 1.0])
+"""Times that places, and yaws, are farther off than the posterior has it."""
+
 SIGMAS = 2.5
 LARGEST = np.array([2.5, 2.5, math.radians(20.0)])
-"""How far a block is searched: σ of the posterior, and metres and radians at most."""
+"""How far a block is searched: σ, and metres and radians at most."""
 
 LEAST = np.array([0.2, 0.2, math.radians(3.0)])
 
@@ -44,10 +49,10 @@ STEPS = (0.15, 0.15, math.radians(2.5))
 ASKED = 60
 """Readings that the search asks."""
 
-FIRST_ASKED, FOLLOWED = 20, 0.1
+FIRST_ASKED, FOLLOWED = 12, 0.1
 """Readings that it asks at all poses of a large search first, and the part of the poses where it asks the others."""
 
-LARGE = 500
+LARGE = 300
 """Poses of a large search."""
 
 SHARED = 4
@@ -65,7 +70,7 @@ OTHER = 0.45
 TOLD = 8.0
 """σ² by which another place must differ in what is measured at the best one: along a bare corridor none does."""
 
-CLEAR = 7.0
+CLEAR = 12.0
 """Nats by which the best pose must be better than any of another place."""
 
 CLIMBS = 3
@@ -124,7 +129,7 @@ def candidates(nodes: Floats, samples: Floats, progress: Floats, middle: int) ->
     for k in np.argsort(np.where(possible, far + wide, np.inf))[: possible.sum()]:
         node = int(places[k])
         if all(abs(progress[node] - progress[other]) > AROUND for other, _ in out):
-            out.append((node, sigma[k]))
+            out.append((node, UNSURE * sigma[k]))
             if len(out) == CANDIDATES:
                 break
     return out

@@ -23,7 +23,7 @@ from .odometry_model import (
     sensitivity,
     with_yaw,
 )
-from .passes import Progress, again, ahead
+from .passes import Found, Progress, again, ahead
 from .pose_graph import Edges, Graph, Solution, Walls, Yaws, joined, no_edges, solve
 from .poses import Floats, rms_after_alignment
 from .scans import Scans
@@ -37,11 +37,13 @@ WALL_ROUNDS = 3
 SAMPLES = 40
 """Deviations that are drawn to know how far places may be off."""
 
-LARGEST_RESIDUAL = 5.0
-"""σ², in the mean over a loop, from which on it does not agree with the rest."""
-
 OF_MATCHES = 0.2
-"""What matches with what lies around count: the map that a block is matched with is off as the block is."""
+"""What a match counts: the windows of a block are matched with one map, whose errors they share, and a map of what lies
+around is off as the block is."""
+
+LARGEST_RESIDUAL, FIRST_OUT = 5.0 * OF_MATCHES, 0.5
+"""σ², in the mean over a loop, from which on it does not agree with the rest; and the part of the largest such mean
+from which on loops are taken out at once: what else is far off may be so because of these."""
 
 SETTLED = 0.1
 """Metres, in the root mean square, by which matching must have moved the nodes for it to be done again: a cell."""
@@ -117,8 +119,7 @@ class Solver:
         for match, stage in ((ahead, 'matching'), (again, 'matching again')):
             before = solution.nodes
             found = match(self._scans, solution.nodes, self._say(stage))
-            edges = found.edges()
-            edges = edges._replace(information=OF_MATCHES * edges.information)
+            edges = _edges_of(found)
             walls = self._walls(solution.nodes, True)
             solution = solve(self._graph(edges, walls), solution.nodes, solution.calibration, SAMPLES)
             watch = self._say('places seen before')
@@ -141,14 +142,18 @@ class Solver:
     ) -> tuple[Solution, list[Loop]]:
         """Return the solution with those loops that agree with each other and with the rest."""
         while True:
-            edges = joined(matches, *(loop.found.edges() for loop in loops))
-            solution = solve(self._graph(edges, walls), start.nodes, start.calibration, SAMPLES)
-            at, agree = len(matches.first), []
-            for loop in loops:
-                end = at + len(loop.found)
-                if solution.squared[at:end].mean() <= LARGEST_RESIDUAL:
-                    agree.append(loop)
-                at = end
-            if len(agree) == len(loops):
+            parts = [_edges_of(loop.found) for loop in loops]
+            solution = solve(self._graph(joined(matches, *parts), walls), start.nodes, start.calibration, SAMPLES)
+            ends = len(matches.first) + np.cumsum([len(part.first) for part in parts], dtype=np.int64)
+            each = np.split(solution.squared, ends - [len(part.first) for part in parts])[1:]
+            off = np.array([squared.mean() for squared in each])
+            if off.max(initial=0.0) <= LARGEST_RESIDUAL:
                 return solution, loops
-            loops = agree
+            most = max(LARGEST_RESIDUAL, FIRST_OUT * float(off.max()))
+            loops = [loop for loop, mean in zip(loops, off.tolist(), strict=True) if mean <= most]
+
+
+def _edges_of(found: Found) -> Edges:
+    """Return matches as edges of the graph, for what they count."""
+    edges = found.edges()
+    return edges._replace(information=OF_MATCHES * edges.information)

@@ -1,0 +1,88 @@
+"""Places seen before: where they are looked for, and which of them are believed."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from forward_grid_mapper.core.common.parameters import Parameters
+from forward_grid_mapper.core.trajectory.heading import heading
+from forward_grid_mapper.core.trajectory.holding_out import held_out
+from forward_grid_mapper.core.trajectory.local_map import for_matching
+from forward_grid_mapper.core.trajectory.loops import LENGTH, Loop, find_loops
+from forward_grid_mapper.core.trajectory.matching import Match
+from forward_grid_mapper.core.trajectory.passes import Found, ahead
+from forward_grid_mapper.core.trajectory.pose_graph import residuals
+from forward_grid_mapper.core.trajectory.poses import Floats, relative
+from forward_grid_mapper.core.trajectory.scans import Scans
+from forward_grid_mapper.core.trajectory.solving import Solver
+from forward_grid_mapper.core.trajectory.walls import wall_votes
+from forward_grid_mapper.core.trajectory.windows import Odometry, cut
+from forward_grid_mapper.simulation.drive import drive
+from forward_grid_mapper.simulation.sonar import NOISY, sonar_ring
+from forward_grid_mapper.simulation.world import building_tour, building_world
+
+BETWEEN = 22.0
+"""Metres of progress between two visits of the same rooms."""
+
+OFF = np.array([0.55, 0.3, 0.0])
+SIGMA = 0.12
+"""By how much nodes of the second visit are off, and what is said of it: metres."""
+
+
+def quietly(stage: str) -> Callable[[float], None]:
+    return lambda part: None
+
+
+@pytest.fixture(scope='module')
+def solver() -> Solver:
+    """Return the solver of a drive whose odometry is right."""
+    recording = drive(building_world(), building_tour()[:20], 0.1, sonar_ring(16), NOISY, seed=3)
+    messages = recording.odometry
+    odometry = Odometry.of(np.array([m.stamp for m in messages]), np.array([m.pose for m in messages], float))
+    windows = cut(recording.readings, odometry)
+    scans = Scans(windows, for_matching(Parameters()), np.zeros(1, np.uint8), held_out(len(windows)))
+    said = heading(windows, *wall_votes(windows, scans.held_out))
+    assert said is not None
+    return Solver(odometry, windows, scans, said, quietly)
+
+
+def wrong_by(found: list[Loop], true: Floats) -> Floats:
+    """Return by how many metres each loop misses the right place."""
+    return np.array([np.hypot(*np.median(residuals(true, loop.found.edges())[:, :2], axis=0)) for loop in found])
+
+
+def test_a_place_is_found_where_the_graph_does_not_expect_it(solver) -> None:
+    scans, true = solver._scans, solver._windows.node
+    second = solver._windows.node_progress > BETWEEN
+    nodes = true + np.where(second[:, None], OFF, 0.0)
+    samples = np.random.default_rng(0).standard_normal((40, 1, 3)) * (SIGMA, SIGMA, math.radians(1.0))
+    samples = np.where(second[:, None], samples, 0.0)
+    usual = ahead(scans, true, lambda part: None).usual
+    found = find_loops(scans, nodes, samples, usual, lambda part: None)
+    across = [loop for loop in found if second[loop.block] != second[loop.place]]
+    assert len(across) >= 3
+    assert np.median(wrong_by(across, true)) < 0.15
+
+
+def loop(true: Floats, block: int, place: int, off: float, sigma: float = 0.02) -> Loop:
+    """Return a loop that puts a block aside of where it is."""
+    found = Found()
+    information = np.diag([sigma**-2, sigma**-2, math.radians(1.0) ** -2])
+    for k in range(block - LENGTH // 2, block + LENGTH // 2):
+        pose = relative(true[place], true[k]) + np.array([off, off, 0.0])
+        found.add(place, k, Match(pose, information, 50.0), 50)
+    return Loop(block, place, found)
+
+
+def test_a_wrong_place_does_not_take_right_ones_with_it(solver) -> None:
+    start = solver.along_walls()
+    true, block = start.nodes, len(start.nodes) - 5
+    right = [loop(true, block, place, 0.0) for place in (5, 9)]
+    wrong = loop(true, block, 13, 0.7, 0.01)
+    solution, kept = solver._with_loops(solver._walls(true, True), Found().edges(), [*right, wrong], start)
+    assert [each.place for each in kept] == [each.place for each in right]
+    assert np.hypot(*(solution.nodes - true)[:, :2].T).max() < 0.1
