@@ -3,27 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 
 import numpy as np
 import pytest
+from exact_tour import quietly, tour_with
 
-from forward_grid_mapper.core.common.parameters import Parameters
-from forward_grid_mapper.core.trajectory.heading import heading
-from forward_grid_mapper.core.trajectory.holding_out import held_out
-from forward_grid_mapper.core.trajectory.local_map import for_matching
 from forward_grid_mapper.core.trajectory.loops import LENGTH, Loop, find_loops
 from forward_grid_mapper.core.trajectory.matching import Match
 from forward_grid_mapper.core.trajectory.passes import Found, ahead
 from forward_grid_mapper.core.trajectory.pose_graph import residuals
 from forward_grid_mapper.core.trajectory.poses import Floats, relative
-from forward_grid_mapper.core.trajectory.scans import Scans
 from forward_grid_mapper.core.trajectory.solving import Solver
-from forward_grid_mapper.core.trajectory.walls import wall_votes
-from forward_grid_mapper.core.trajectory.windows import Odometry, cut
-from forward_grid_mapper.simulation.drive import drive
-from forward_grid_mapper.simulation.sonar import NOISY, sonar_ring
-from forward_grid_mapper.simulation.world import building_tour, building_world
+from forward_grid_mapper.simulation.sonar import sonar_ring
 
 BETWEEN = 22.0
 """Metres of progress between two visits of the same rooms."""
@@ -33,21 +24,10 @@ SIGMA = 0.12
 """By how much nodes of the second visit are off, and what is said of it: metres."""
 
 
-def quietly(stage: str) -> Callable[[float], None]:
-    return lambda part: None
-
-
 @pytest.fixture(scope='module')
 def solver() -> Solver:
     """Return the solver of a drive whose odometry is right."""
-    recording = drive(building_world(), building_tour()[:20], 0.1, sonar_ring(16), NOISY, seed=3)
-    messages = recording.odometry
-    odometry = Odometry.of(np.array([m.stamp for m in messages]), np.array([m.pose for m in messages], float))
-    windows = cut(recording.readings, odometry)
-    scans = Scans(windows, for_matching(Parameters()), np.zeros(1, np.uint8), held_out(len(windows)))
-    said = heading(windows, *wall_votes(windows, scans.held_out))
-    assert said is not None
-    return Solver(odometry, windows, scans, said, quietly)
+    return Solver(*tour_with(sonar_ring(16)), quietly)
 
 
 def wrong_by(found: list[Loop], true: Floats) -> Floats:

@@ -3,44 +3,28 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from exact_tour import Tour, quietly, tour_with
 
-from forward_grid_mapper.core.common.parameters import Parameters
-from forward_grid_mapper.core.trajectory.heading import Heading, heading
-from forward_grid_mapper.core.trajectory.holding_out import held_out
-from forward_grid_mapper.core.trajectory.local_map import for_matching
+from forward_grid_mapper.core.trajectory.heading import Heading
 from forward_grid_mapper.core.trajectory.poses import Floats, wrapped
 from forward_grid_mapper.core.trajectory.scans import Scans
 from forward_grid_mapper.core.trajectory.solving import OF_YAWS, Solver
-from forward_grid_mapper.core.trajectory.walls import SPAN, wall_votes
-from forward_grid_mapper.core.trajectory.windows import Odometry, Windows, cut
-from forward_grid_mapper.simulation.drive import drive
-from forward_grid_mapper.simulation.sonar import NOISY, front_array
-from forward_grid_mapper.simulation.world import building_tour, building_world
+from forward_grid_mapper.core.trajectory.walls import SPAN
+from forward_grid_mapper.core.trajectory.windows import Odometry, Windows
+from forward_grid_mapper.simulation.sonar import front_array
 
 STRETCH = (10.0, 22.0)
 """Metres of progress along which walls say something else."""
 
 
 @pytest.fixture(scope='module')
-def exact() -> tuple[Odometry, Windows, Scans, Heading]:
+def exact() -> Tour:
     """Return a drive whose odometry is right, and what walls say of it."""
-    recording = drive(building_world(), building_tour()[:20], 0.1, front_array(), NOISY, seed=3)
-    messages = recording.odometry
-    odometry = Odometry.of(np.array([m.stamp for m in messages]), np.array([m.pose for m in messages], float))
-    windows = cut(recording.readings, odometry)
-    scans = Scans(windows, for_matching(Parameters()), np.zeros(1, np.uint8), held_out(len(windows)))
-    found = heading(windows, *wall_votes(windows, scans.held_out))
-    assert found is not None
-    return odometry, windows, scans, found
-
-
-def quietly(stage: str) -> Callable[[float], None]:
-    return lambda part: None
+    return tour_with(front_array())
 
 
 def solver_of(exact: tuple[Odometry, Windows, Scans, Heading], said: Heading) -> Solver:

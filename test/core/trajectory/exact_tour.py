@@ -1,0 +1,44 @@
+"""A drive whose odometry is right, and what walls say of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from forward_grid_mapper.core.common.parameters import Parameters
+from forward_grid_mapper.core.trajectory.heading import Heading, heading
+from forward_grid_mapper.core.trajectory.holding_out import held_out
+from forward_grid_mapper.core.trajectory.local_map import for_matching
+from forward_grid_mapper.core.trajectory.scans import Scans
+from forward_grid_mapper.core.trajectory.walls import wall_votes
+from forward_grid_mapper.core.trajectory.windows import Odometry, Windows, cut
+from forward_grid_mapper.simulation.drive import drive
+from forward_grid_mapper.simulation.sonar import NOISY, SonarArray
+from forward_grid_mapper.simulation.world import building_tour, building_world
+
+
+class Tour(NamedTuple):
+    """What a `Solver` takes."""
+
+    odometry: Odometry
+    windows: Windows
+    scans: Scans
+    heading: Heading
+
+
+def tour_with(sonars: SonarArray) -> Tour:
+    """Return the beginning of the tour through the building."""
+    recording = drive(building_world(), building_tour()[:20], 0.1, sonars, NOISY, seed=3)
+    messages = recording.odometry
+    odometry = Odometry.of(np.array([m.stamp for m in messages]), np.array([m.pose for m in messages], float))
+    windows = cut(recording.readings, odometry)
+    scans = Scans(windows, for_matching(Parameters()), np.zeros(1, np.uint8), held_out(len(windows)))
+    found = heading(windows, *wall_votes(windows, scans.held_out))
+    assert found is not None
+    return Tour(odometry, windows, scans, found)
+
+
+def quietly(stage: str) -> Callable[[float], None]:
+    return lambda part: None
