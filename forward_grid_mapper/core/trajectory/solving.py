@@ -10,8 +10,10 @@ import math
 from collections.abc import Callable
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .heading import Heading
+from .holding_out import LEAST_SIGMAS, foreseen, gain
 from .loops import Loop, find_loops
 from .odometry_model import (
     CALIBRATION,
@@ -23,9 +25,10 @@ from .odometry_model import (
     sensitivity,
     with_yaw,
 )
-from .passes import Found, Progress, again, ahead
+from .passes import BLOCK, Found, Progress, again, ahead
 from .pose_graph import Edges, Graph, Solution, Walls, Yaws, joined, no_edges, solve
 from .poses import Floats, rms_after_alignment
+from .relocating import MORE, displaced, loops_of, recognised, revisits, unsupported, windows_of
 from .scans import Scans
 from .wall_distances import Distances
 from .walls import EVERY, SPAN
@@ -82,6 +85,7 @@ class Solver:
     ) -> None:
         self._odometry, self._windows, self._scans, self._heading = odometry, windows, scans, heading
         self._say = say
+        self._in_place: set[int] = set()
         drifts = heading.drifts
         self.first_calibration = np.array([0.0, 0.0, drifts.bias, drifts.turn_scale])
         self._change = sensitivity(odometry, windows)
@@ -109,7 +113,7 @@ class Solver:
         nodes, calibration = self.simple(np.zeros(len(CALIBRATION))), np.zeros(len(CALIBRATION))
         for k in range(WALL_ROUNDS):
             walls = self._walls(nodes, k == WALL_ROUNDS - 1)
-            solution = solve(self._graph(no_edges(), walls), nodes, calibration, SAMPLES)
+            solution = solve(self._graph(no_edges(), walls), nodes, calibration)
             nodes, calibration = solution.nodes, solution.calibration
         return solution
 
@@ -126,10 +130,47 @@ class Solver:
             loops = find_loops(self._scans, solution.nodes, solution.samples, found.usual, watch)
             walls = self._walls(solution.nodes, True)
             solution, loops = self._with_loops(walls, edges, loops, solution)
+            solution, loops = self._relocated(edges, loops, solution, found.usual)
             # maps from nodes that hardly moved are the same again
             if rms_after_alignment(before, solution.nodes) < SETTLED:
                 break
         return solution, loops
+
+    def _relocated(
+        self, matches: Edges, loops: list[Loop], solution: Solution, usual: float
+    ) -> tuple[Solution, list[Loop]]:
+        """Return the solution with stretches that fit where they are no more put where they belong."""
+        begin = 0
+        while True:
+            blocks = unsupported(revisits(self._scans, solution.nodes), recognised(loops), begin)
+            if blocks is None:
+                return solution, loops
+            begin = int(blocks[len(blocks) // 2])
+            if int(blocks[0]) not in self._in_place:
+                self._say('places seen before')
+                self._in_place.add(int(blocks[0]))
+                solution, loops = self._elsewhere(blocks, matches, loops, solution, usual)
+
+    def _elsewhere(
+        self, blocks: NDArray[np.int64], matches: Edges, loops: list[Loop], solution: Solution, usual: float
+    ) -> tuple[Solution, list[Loop]]:
+        """Return the solution with some blocks in another place, if their readings are foreseen better there."""
+        scans, nodes = self._scans, solution.nodes
+        stretch = windows_of(blocks, len(nodes))
+        moved = displaced(scans, nodes, stretch)
+        if moved is None:
+            return solution, loops
+        found, first = loops_of(scans, moved, stretch, usual), int(stretch[0])
+        if len(found) < len(recognised(loops).intersection(blocks.tolist())) + MORE:
+            return solution, loops
+        # those with which the rest was led astray lead all that comes after it
+        across = [min(loop.block, loop.place) < first <= max(loop.block, loop.place) for loop in loops]
+        rest = [loop for loop, out in zip(loops, across, strict=True) if not out]
+        tried, kept = self._with_loops(self._walls(nodes, True), matches, [*rest, *found], solution)
+        parts = [stretch[k : k + BLOCK] for k in range(0, len(stretch), BLOCK)]
+        if gain(foreseen(scans, nodes, parts), foreseen(scans, tried.nodes, parts)).sigmas < LEAST_SIGMAS:
+            return solution, loops
+        return tried, kept
 
     def _walls(self, nodes: Floats, strict: bool) -> Walls:
         return Distances(self._windows, self._scans.held_out, nodes).walls(strict)
@@ -143,7 +184,7 @@ class Solver:
         """Return the solution with those loops that agree with each other and with the rest."""
         while True:
             parts = [_edges_of(loop.found) for loop in loops]
-            solution = solve(self._graph(joined(matches, *parts), walls), start.nodes, start.calibration, SAMPLES)
+            solution = solve(self._graph(joined(matches, *parts), walls), start.nodes, start.calibration)
             ends = len(matches.first) + np.cumsum([len(part.first) for part in parts], dtype=np.int64)
             each = np.split(solution.squared, ends - [len(part.first) for part in parts])[1:]
             off = np.array([squared.mean() for squared in each])
