@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from exact_tour import quietly, tour_with
 
-from forward_grid_mapper.core.trajectory.loops import LENGTH, Loop, find_loops
+from forward_grid_mapper.core.trajectory import loops
+from forward_grid_mapper.core.trajectory.loops import LENGTH, OTHER, Loop, Places, find_loop, find_loops
 from forward_grid_mapper.core.trajectory.matching import Match
 from forward_grid_mapper.core.trajectory.passes import Found, ahead
 from forward_grid_mapper.core.trajectory.pose_graph import residuals
@@ -66,3 +67,39 @@ def test_a_wrong_place_does_not_take_right_ones_with_it(solver) -> None:
     solution, kept = solver._with_loops(solver._walls(true, True), Found().edges(), [*right, wrong], start)
     assert [each.place for each in kept] == [each.place for each in right]
     assert np.hypot(*(solution.nodes - true)[:, :2].T).max() < 0.1
+
+
+@pytest.mark.parametrize(('below', 'taken'), [(8.0, False), (16.0, True)])
+def test_a_place_counts_only_if_the_block_fits_nowhere_else_nearly_as_well(solver, monkeypatch, below, taken) -> None:
+    scans, true = solver._scans, solver._windows.node
+    block = np.arange(len(true) - LENGTH, len(true))
+    middle = block[LENGTH // 2]
+    before = np.flatnonzero(solver._windows.node_progress < BETWEEN)
+    place = int(before[np.hypot(*(true[before] - true[middle])[:, :2].T).argmin()])
+    around = Places(scans, true)[place]
+    fit, measure = [0.0], loops.measure
+
+    def measured(joint, on, pose, *most):
+        found = measure(joint, on, pose, *most)
+        fit.append(found.score)
+        return found
+
+    def alike(elsewhere):
+        def values(joint, on, poses, prior):
+            off = relative(relative(true[place], true[middle]), poses)
+            far = np.hypot(off[:, 0], off[:, 1]) > OTHER + 0.3
+            out = np.where(far, elsewhere(), -1e3)
+            out[np.abs(off).max(1).argmin()] = 1e3
+            return out
+
+        return values
+
+    def found() -> Loop | None:
+        return find_loop(scans, block, true, place, np.full(3, 0.5), around, 0.1)
+
+    monkeypatch.setattr(loops, 'measure', measured)
+    monkeypatch.setattr(loops, 'searched', alike(lambda: -1e3))
+    assert found() is not None
+    score = fit[1 + loops.CLIMBS]
+    monkeypatch.setattr(loops, 'searched', alike(lambda: score - below))
+    assert (found() is not None) == taken
