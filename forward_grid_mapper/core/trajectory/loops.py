@@ -11,6 +11,7 @@ rest is taken out again when the graph is solved.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -97,6 +98,10 @@ class Loop:
     found: Found
 
 
+Looked = dict[tuple[int, int], Loop | None]
+"""What came of looking for blocks at places, by the nodes in their middle: None where a block was not found."""
+
+
 class Places:
     """Local maps of places, made when they are asked for, from the nodes as they are."""
 
@@ -112,8 +117,10 @@ class Places:
         return self._maps[node]
 
 
-def candidates(nodes: Floats, samples: Floats, progress: Floats, middle: int) -> list[tuple[int, Floats]]:
-    """Return places where a block may have been before or after, and σ of its pose there, shape (3,)."""
+def candidates(
+    nodes: Floats, samples: Floats, progress: Floats, middle: int, known: Sequence[int] = ()
+) -> list[tuple[int, Floats]]:
+    """Return places where a block may have been before or after, other than known ones, and σ of its pose there."""
     places = np.arange(0, len(nodes), SHARED)
     there = nodes[places] + samples[:, places]
     drawn = relative(there, (nodes[middle] + samples[:, middle])[:, None])
@@ -128,10 +135,11 @@ def candidates(nodes: Floats, samples: Floats, progress: Floats, middle: int) ->
     out: list[tuple[int, Floats]] = []
     for k in np.argsort(np.where(possible, far + wide, np.inf))[: possible.sum()]:
         node = int(places[k])
-        if all(abs(progress[node] - progress[other]) > AROUND for other, _ in out):
+        taken = [*known, *(other for other, _ in out)]
+        if len(taken) >= CANDIDATES:
+            break
+        if all(abs(progress[node] - progress[other]) > AROUND for other in taken):
             out.append((node, UNSURE * sigma[k]))
-            if len(out) == CANDIDATES:
-                break
     return out
 
 
@@ -180,20 +188,41 @@ def find_loop(
     return Loop(int(middle), place, found)
 
 
-def find_loops(scans: Scans, nodes: Floats, samples: Floats, usual: float, watch: Progress) -> list[Loop]:
-    """Return the loops of a drive, given its nodes, deviations of them, and the usual score of a reading."""
-    places, out = Places(scans, nodes), []
-    progress = scans.windows.node_progress
+def find_loops(
+    scans: Scans, nodes: Floats, samples: Floats, usual: float, watch: Progress, known: Looked | None = None
+) -> Looked:
+    """Return what came of looking for each block of a drive where it may have been.
+
+    Parameters
+    ----------
+    scans : Scans
+    nodes : float64, shape (K, 3)
+    samples : float64, shape (S, K, 3)
+        Deviations of the nodes.
+    usual : float
+        The usual score of a reading, nats.
+    watch : callable
+    known : dict, optional
+        What is known already, and not looked for again.
+    """
+    known = known or {}
+    places, out, progress = Places(scans, nodes), Looked(), scans.windows.node_progress
     for k in range(0, len(nodes) - LENGTH // 2, LENGTH):
         watch(k / len(nodes))
         block = np.arange(k, min(k + LENGTH, len(nodes)))
         if scans.count[block].sum() < FEWEST_ON_MAP:
             continue
-        for place, sigma in candidates(nodes, samples, progress, block[len(block) // 2]):
-            around = places[place]
-            if around is None:
-                continue
-            loop = find_loop(scans, block, nodes, place, sigma, around, usual)
-            if loop is not None:
-                out.append(loop)
+        middle = int(block[len(block) // 2])
+        found = {key: loop for key, loop in known.items() if key[0] == middle and loop is not None}
+        out.update(found)
+        for place, sigma in candidates(nodes, samples, progress, middle, [place for _, place in found]):
+            if (middle, place) in known:
+                out[middle, place] = None
+            elif (around := places[place]) is not None:
+                out[middle, place] = find_loop(scans, block, nodes, place, sigma, around, usual)
     return out
+
+
+def loops_of(looked: Looked) -> list[Loop]:
+    """Return the loops that were found."""
+    return [loop for loop in looked.values() if loop is not None]

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from .matching import Match, measure
 from .pose_graph import Edges, no_edges
-from .poses import Floats, relative
+from .poses import Floats, relative, rms_after_alignment
 from .scans import Scans
 
 BLOCK = 4
@@ -64,6 +64,24 @@ class Found:
             return no_edges()
         place, window, pose, information = zip(*self._rows, strict=True)
         return Edges(np.array(place), np.array(window), np.array(pose), np.array(information))
+
+
+def bent(progress: Floats, before: Floats, after: Floats, at: NDArray[np.int64]) -> Floats:
+    """Return by how much the nodes around some have moved relative to each other, shape (len(at),), metres.
+
+    It is the root mean square after the best alignment of the nodes that a map of both sides is made of: a map that
+    was only carried along as a whole is the same again.
+
+    Parameters
+    ----------
+    progress : float64, shape (K,)
+        Metres, of all nodes.
+    before, after : float64, shape (K, 3)
+    at : int64
+        Nodes.
+    """
+    near = [np.abs(progress - progress[k]) < AROUND for k in at]
+    return np.array([rms_after_alignment(before[each], after[each]) for each in near])
 
 
 def ahead(scans: Scans, nodes: Floats, watch: Progress) -> Found:

@@ -145,7 +145,7 @@ def _searched(joint: Scan, around: LocalMap) -> Floats:
     return best
 
 
-def loops_of(scans: Scans, nodes: Floats, stretch: NDArray[np.int64], usual: float) -> list[Loop]:
+def loops_at(scans: Scans, nodes: Floats, stretch: NDArray[np.int64], usual: float) -> list[Loop]:
     """Return the loops of the blocks of a stretch with what was before it, where the nodes are."""
     progress, places, out = scans.windows.node_progress, Places(scans, nodes), []
     before = np.arange(0, len(nodes), SHARED)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from .heading import Heading
 from .holding_out import LEAST_SIGMAS, foreseen, gain
-from .loops import Loop, find_loops
+from .loops import Looked, Loop, find_loops, loops_of
 from .odometry_model import (
     CALIBRATION,
     CALIBRATION_SIGMA,
@@ -25,10 +25,10 @@ from .odometry_model import (
     sensitivity,
     with_yaw,
 )
-from .passes import BLOCK, Found, Progress, again, ahead
+from .passes import BLOCK, Found, Progress, again, ahead, bent
 from .pose_graph import Edges, Graph, Solution, Walls, Yaws, joined, no_edges, solve
 from .poses import Floats, rms_after_alignment
-from .relocating import MORE, displaced, loops_of, recognised, revisits, unsupported, windows_of
+from .relocating import MORE, displaced, loops_at, recognised, revisits, unsupported, windows_of
 from .scans import Scans
 from .wall_distances import Distances
 from .walls import EVERY, SPAN
@@ -49,7 +49,8 @@ LARGEST_RESIDUAL, FIRST_OUT = 5.0 * OF_MATCHES, 0.5
 from which on loops are taken out at once: what else is far off may be so because of these."""
 
 SETTLED = 0.1
-"""Metres, in the root mean square, by which matching must have moved the nodes for it to be done again: a cell."""
+"""Metres, in the root mean square, by which matching must have moved the nodes for it to be done again, and the nodes
+around a block or a place, relative to each other, for the block to be looked for there again: a cell."""
 
 UNSEEN, LEAST_YAW = 2.0, math.radians(1.0)
 """Times that the yaw drifts more than walls say, and radians a √metre at least: an echo votes with all others of three
@@ -119,21 +120,24 @@ class Solver:
 
     def with_matches(self, solution: Solution) -> tuple[Solution, list[Loop]]:
         """Return what matches with local maps say as well, and the loops among them."""
-        loops: list[Loop] = []
+        known, loops = Looked(), list[Loop]()
         for match, stage in ((ahead, 'matching'), (again, 'matching again')):
             before = solution.nodes
             found = match(self._scans, solution.nodes, self._say(stage))
             edges = _edges_of(found)
             walls = self._walls(solution.nodes, True)
-            solution = solve(self._graph(edges, walls), solution.nodes, solution.calibration, SAMPLES)
-            watch = self._say('places seen before')
-            loops = find_loops(self._scans, solution.nodes, solution.samples, found.usual, watch)
-            walls = self._walls(solution.nodes, True)
-            solution, loops = self._with_loops(walls, edges, loops, solution)
-            solution, loops = self._relocated(edges, loops, solution, found.usual)
+            both = joined(edges, *(_edges_of(loop.found) for loop in loops_of(known)))
+            solution = solve(self._graph(both, walls), solution.nodes, solution.calibration, SAMPLES)
+            watch, searched = self._say('places seen before'), solution.nodes
+            looked = find_loops(self._scans, searched, solution.samples, found.usual, watch, known)
+            walls = self._walls(searched, True)
+            first, loops = self._with_loops(walls, edges, loops_of(looked), solution)
+            solution, loops = self._relocated(edges, loops, first, found.usual)
             # maps from nodes that hardly moved are the same again
             if rms_after_alignment(before, solution.nodes) < SETTLED:
                 break
+            # blocks that were carried to another place are to be looked for anew
+            known = self._unchanged(looked, searched, solution.nodes) if solution is first else Looked()
         return solution, loops
 
     def _relocated(
@@ -160,7 +164,7 @@ class Solver:
         moved = displaced(scans, nodes, stretch)
         if moved is None:
             return solution, loops
-        found, first = loops_of(scans, moved, stretch, usual), int(stretch[0])
+        found, first = loops_at(scans, moved, stretch, usual), int(stretch[0])
         if len(found) < len(recognised(loops).intersection(blocks.tolist())) + MORE:
             return solution, loops
         # those with which the rest was led astray lead all that comes after it
@@ -171,6 +175,13 @@ class Solver:
         if gain(foreseen(scans, nodes, parts), foreseen(scans, tried.nodes, parts)).sigmas < LEAST_SIGMAS:
             return solution, loops
         return tried, kept
+
+    def _unchanged(self, looked: Looked, before: Floats, after: Floats) -> Looked:
+        """Return what would come out the same: where neither the map of the place nor the block was bent."""
+        at = np.unique(np.array([*looked], np.int64))
+        by = bent(self._windows.node_progress, before, after, at)
+        same = set(at[by < SETTLED].tolist())
+        return {key: loop for key, loop in looked.items() if same.issuperset(key)}
 
     def _walls(self, nodes: Floats, strict: bool) -> Walls:
         return Distances(self._windows, self._scans.held_out, nodes).walls(strict)

@@ -8,14 +8,20 @@ import numpy as np
 import pytest
 from exact_tour import quietly, tour_with
 
+from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.trajectory import loops
-from forward_grid_mapper.core.trajectory.loops import LENGTH, OTHER, Loop, Places, find_loop, find_loops
+from forward_grid_mapper.core.trajectory.local_map import for_matching
+from forward_grid_mapper.core.trajectory.loops import LENGTH, Loop, Places, find_loop, find_loops, loops_of
 from forward_grid_mapper.core.trajectory.matching import Match
 from forward_grid_mapper.core.trajectory.passes import Found, ahead
 from forward_grid_mapper.core.trajectory.pose_graph import residuals
-from forward_grid_mapper.core.trajectory.poses import Floats, relative
+from forward_grid_mapper.core.trajectory.poses import Floats, compose, relative
+from forward_grid_mapper.core.trajectory.scans import Scans
 from forward_grid_mapper.core.trajectory.solving import Solver
-from forward_grid_mapper.simulation.sonar import sonar_ring
+from forward_grid_mapper.core.trajectory.windows import Odometry, cut
+from forward_grid_mapper.simulation.drive import drive
+from forward_grid_mapper.simulation.sonar import NOISY, sonar_ring
+from forward_grid_mapper.simulation.world import Floorplan
 
 BETWEEN = 22.0
 """Metres of progress between two visits of the same rooms."""
@@ -43,7 +49,7 @@ def test_a_place_is_found_where_the_graph_does_not_expect_it(solver) -> None:
     samples = np.random.default_rng(0).standard_normal((40, 1, 3)) * (SIGMA, SIGMA, math.radians(1.0))
     samples = np.where(second[:, None], samples, 0.0)
     usual = ahead(scans, true, lambda part: None).usual
-    found = find_loops(scans, nodes, samples, usual, lambda part: None)
+    found = loops_of(find_loops(scans, nodes, samples, usual, lambda part: None))
     across = [loop for loop in found if second[loop.block] != second[loop.place]]
     assert len(across) >= 3
     assert np.median(wrong_by(across, true)) < 0.15
@@ -69,37 +75,77 @@ def test_a_wrong_place_does_not_take_right_ones_with_it(solver) -> None:
     assert np.hypot(*(solution.nodes - true)[:, :2].T).max() < 0.1
 
 
-@pytest.mark.parametrize(('below', 'taken'), [(8.0, False), (16.0, True)])
-def test_a_place_counts_only_if_the_block_fits_nowhere_else_nearly_as_well(solver, monkeypatch, below, taken) -> None:
+def gallery(bays: list[int]) -> Scans:
+    """Return a drive to and fro along a corridor with bays on both sides, 0.6 m wide, from these columns on."""
+    plan = Floorplan('gallery', 210, 60)
+    for wall, back in ((20, 12), (40, 48)):
+        plan.wall('x', wall, (5, 200), tuple((bay, bay + 5) for bay in bays))
+        for bay in bays:
+            plan.wall('x', back, (bay - 1, bay + 6))
+            for side in (bay - 1, bay + 6):
+                plan.wall('y', side, (min(wall, back), max(wall, back)))
+    for end in (5, 200):
+        plan.wall('y', end, (20, 40))
+    way = np.array([(2.0, 3.05), (18.0, 3.05), (2.0, 3.05)])
+    recording = drive(plan.world((20, 30)), way, 0.1, sonar_ring(16), NOISY, seed=3)
+    messages = recording.odometry
+    odometry = Odometry.of(np.array([m.stamp for m in messages]), np.array([m.pose for m in messages], float))
+    windows = cut(recording.readings, odometry)
+    return Scans(windows, for_matching(Parameters()), np.zeros(1, np.uint8), np.zeros(len(windows), np.bool_))
+
+
+def found_on_the_way_back(scans: Scans) -> list[Loop | None]:
+    """Return what comes of looking for blocks far from the ends of the corridor, unsure by a metre along it."""
+    nodes = scans.windows.node
+    usual = ahead(scans, nodes, lambda part: None).usual
+    there = scans.windows.node_progress < 16.0
+    out, places = [], Places(scans, nodes)
+    for middle in np.flatnonzero(~there & (nodes[:, 0] > 7.0) & (nodes[:, 0] < 13.0))[::6]:
+        place = int(np.abs(nodes[there, 0] - nodes[middle, 0]).argmin())
+        block, around = np.arange(middle - LENGTH // 2, middle + LENGTH // 2), places[place]
+        assert around is not None
+        out.append(find_loop(scans, block, nodes, place, np.array([1.0, 0.2, math.radians(2.0)]), around, usual))
+    assert len(out) >= 2
+    return out
+
+
+def test_a_place_that_fits_about_as_well_elsewhere_is_not_taken() -> None:
+    assert not any(found_on_the_way_back(gallery(list(range(10, 190, 12)))))
+
+
+def test_the_same_place_is_taken_where_bays_are_at_distances_of_their_own() -> None:
+    scans = gallery([15, 27, 46, 60, 78, 90, 111, 124, 144, 157, 178])
+    found = found_on_the_way_back(scans)
+    right = [each for each in found if each is not None]
+    assert len(right) == len(found)
+    assert wrong_by(right, scans.windows.node).max() < 0.1
+
+
+def test_what_is_known_is_not_looked_for_again(solver, monkeypatch) -> None:
     scans, true = solver._scans, solver._windows.node
-    block = np.arange(len(true) - LENGTH, len(true))
-    middle = block[LENGTH // 2]
-    before = np.flatnonzero(solver._windows.node_progress < BETWEEN)
-    place = int(before[np.hypot(*(true[before] - true[middle])[:, :2].T).argmin()])
-    around = Places(scans, true)[place]
-    fit, measure = [0.0], loops.measure
+    samples = np.random.default_rng(0).standard_normal((40, len(true), 3)) * (0.1, 0.1, 0.01)
+    usual = ahead(scans, true, lambda part: None).usual
+    known = find_loops(scans, true, samples, usual, lambda part: None)
+    assert loops_of(known)
+    # the second half is bent, the first one is carried along
+    first = solver._windows.node_progress < BETWEEN
+    turned = compose(np.array([3.0, 1.0, 0.4]), true)
+    x = np.where(first, 0.0, solver._windows.node_progress - BETWEEN)
+    after = turned + np.stack([0.0 * x, 0.5 * np.sin(x), 0.0 * x], axis=1)
+    kept = solver._unchanged(known, true, after)
+    progress = solver._windows.node_progress
+    stays, moves = np.flatnonzero(progress < BETWEEN - 4.0), np.flatnonzero(progress > BETWEEN + 1.0)
+    assert all((key in kept) for key in known if set(key) <= set(stays.tolist()))
+    assert not any(set(key) & set(moves.tolist()) for key in kept)
+    asked: list[tuple[int, int]] = []
 
-    def measured(joint, on, pose, *most):
-        found = measure(joint, on, pose, *most)
-        fit.append(found.score)
-        return found
+    def search(scans, block, nodes, place, *rest) -> None:
+        asked.append((int(block[len(block) // 2]), place))
 
-    def alike(elsewhere):
-        def values(joint, on, poses, prior):
-            off = relative(relative(true[place], true[middle]), poses)
-            far = np.hypot(off[:, 0], off[:, 1]) > OTHER + 0.3
-            out = np.where(far, elsewhere(), -1e3)
-            out[np.abs(off).max(1).argmin()] = 1e3
-            return out
-
-        return values
-
-    def found() -> Loop | None:
-        return find_loop(scans, block, true, place, np.full(3, 0.5), around, 0.1)
-
-    monkeypatch.setattr(loops, 'measure', measured)
-    monkeypatch.setattr(loops, 'searched', alike(lambda: -1e3))
-    assert found() is not None
-    score = fit[1 + loops.CLIMBS]
-    monkeypatch.setattr(loops, 'searched', alike(lambda: score - below))
-    assert (found() is not None) == taken
+    monkeypatch.setattr(loops, 'find_loop', search)
+    again = find_loops(scans, true, samples, usual, lambda part: None, kept)
+    assert asked and not set(asked) & set(kept)
+    assert {key: again[key] for key in kept if kept[key]} == {key: loop for key, loop in kept.items() if loop}
+    asked.clear()
+    assert find_loops(scans, true, samples, usual, lambda part: None, known) == known
+    assert not asked
