@@ -25,7 +25,7 @@ from ..messages.message_types import NANOSECONDS
 from ..runtime.cancelling import check
 from .correction import Correction
 from .heading import yaws_of_votes
-from .holding_out import gain
+from .holding_out import LEAST_SIGMAS, gain
 from .jumps import jumps, since_jump
 from .likelihood import scores
 from .local_map import at_poses, for_matching, local_map
@@ -34,7 +34,7 @@ from .odometry_model import CALIBRATION, Noise, calibrated, covariances, motions
 from .passes import BEHIND, BLOCK
 from .pose_graph import Edges, Graph, Yaws, joined, no_edges, solve
 from .poses import Floats, axes_at, compose, interpolated, relative
-from .refinement import LEAST_SIGMAS, MOST_WORSE, SHORTEST
+from .refinement import MOST_WORSE, SHORTEST
 from .scans import FEWEST_ON_MAP, Scans
 from .solving import LEAST_YAW, UNSEEN
 from .wall_distances import Distances

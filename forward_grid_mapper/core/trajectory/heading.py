@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -67,6 +67,9 @@ LEAST_GAIN = 0.12
 
 FEWEST_VOTES = 4
 
+DOUBTFUL, PAUSE = 0.02, 5
+"""Probability of having lost a right angle from where on a place is doubtful, and votes between two such places."""
+
 TINY = 1e-300
 
 
@@ -99,6 +102,8 @@ class Heading:
         Least probability, over the drive, that no right angle was lost.
     over_odometry : float
         Nats by which all votes are likelier than if odometry had no error of yaw.
+    doubts : tuple of (int, float)
+        Nodes where a right angle may have been lost, and the probability of it.
     """
 
     at: NDArray[np.int64]
@@ -109,6 +114,12 @@ class Heading:
     gain: float
     certainty: float
     over_odometry: float
+    doubts: tuple[tuple[int, float], ...] = ()
+
+    def turned(self, node: int, angle: float) -> Heading:
+        """Return the same with what comes from a node on turned by `angle`, radians."""
+        more = np.where(self.at >= node, angle, 0.0)
+        return replace(self, correction=self.correction + more, measured=self.measured + more)
 
 
 class _Chain:
@@ -201,6 +212,25 @@ def _followed(chain: _Chain, belief: Floats) -> tuple[Floats, Floats]:
     return np.unwrap(middle + (inside * off).sum(1) / mass), mass
 
 
+def doubts(at: NDArray[np.int64], certain: Floats) -> tuple[tuple[int, float], ...]:
+    """Return the nodes at which the probability of having lost no right angle falls, and by how much.
+
+    Parameters
+    ----------
+    at : int64, shape (B,)
+    certain : float64, shape (B,)
+        That probability from the begin of the drive to each node.
+    """
+    falls = -np.diff(np.minimum.accumulate(certain), prepend=certain[0])
+    falling = np.flatnonzero(falls > DOUBTFUL / 10)
+    out = []
+    for part in np.split(falling, np.flatnonzero(np.diff(falling) > PAUSE) + 1):
+        sums = np.cumsum(falls[part])
+        if len(part) and sums[-1] >= DOUBTFUL:
+            out.append((int(at[part[np.searchsorted(sums, sums[-1] / 2)]]), float(sums[-1])))
+    return tuple(out)
+
+
 def yaws_of_votes(votes: Floats, yaw: Floats, correction: Floats) -> tuple[Floats, Floats]:
     """Return the correction that the votes of each place say by themselves near `correction`, and its information."""
     off = np.arange(-NEAR, NEAR + 1)
@@ -258,4 +288,5 @@ def heading(windows: Windows, at: NDArray[np.int64], votes: Floats, noises: Sequ
         total / len(at),
         float(certain.min()),
         total - chain.without_drift(),
+        doubts(at, certain),
     )

@@ -24,6 +24,9 @@ EVERY = 8
 NEAR = 4.0
 """Metres between nodes of windows that belong on one map."""
 
+LEAST_SIGMAS = 2.3
+"""Standard errors by which readings must be foreseen better: by chance it is so in one of 100."""
+
 FEWEST = 5
 """Readings of a block that are compared."""
 

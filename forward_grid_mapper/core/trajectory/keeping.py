@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from ..common.parameters import Parameters
 from ..common.readings import Readings
 from .correction import Correction
-from .holding_out import Gain, foreseen, gain, held_out, held_out_blocks
+from .holding_out import LEAST_SIGMAS, Gain, foreseen, gain, held_out, held_out_blocks
 from .local_map import for_matching
-from .refinement import HELD_OUT, LEAST_SIGMAS, Refinement, differences, replaced, without_times
+from .refinement import HELD_OUT, Refinement, differences, replaced, without_times
 from .scans import Scans
 from .windows import Odometry, cut
 

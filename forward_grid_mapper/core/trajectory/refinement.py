@@ -22,7 +22,8 @@ from ..common.parameters import Parameters
 from ..common.readings import Readings
 from ..runtime.cancelling import check
 from .heading import NOISES, Heading, heading
-from .holding_out import Gain, blocks_of, foreseen, gain, held_out, held_out_blocks
+from .holding_out import LEAST_SIGMAS, Gain, blocks_of, foreseen, gain, held_out, held_out_blocks
+from .hypotheses import solved
 from .jumps import MOST_JUMPS, UNKNOWN, Begin, Part, begins_of, jumps, parts_at, without_outliers, words
 from .local_map import at_poses, for_matching
 from .odometry_model import CALIBRATION
@@ -49,9 +50,6 @@ SPAN = 6.0
 
 JUDGED_ON, HELD_OUT = 60, 40
 """Blocks, and held-out windows, that trajectories are compared on at the most."""
-
-LEAST_SIGMAS = 2.3
-"""Standard errors by which readings must be foreseen better than with odometry: by chance it is so in one of 100."""
 
 LEAST_WITNESS, LEAST_SIGMAS_WITH_WALLS = 10.0, -1.0
 """Nats that the votes of walls must say against odometry's yaw, beyond what sensors say by where they look, to be a
@@ -193,13 +191,11 @@ class Refiner:
         walls, witness = self._heading(windows, scans)
         if walls is None:
             return Refinement(False, NO_WALLS, readings, odometry, {})
-        if walls.certainty < LEAST_CERTAINTY:
-            reason = (
-                f'the heading was lost somewhere: that it is not off by a right angle is only {walls.certainty:.0%} '
-                f'certain'
-            )
-            return Refinement(False, reason, readings, odometry, {}, lost=True)
-        solver = Solver(odometry, windows, scans, walls, self._say)
+
+        def solver_of(heading: Heading) -> Solver:
+            return Solver(odometry, windows, scans, heading, self._say)
+
+        solver = solver_of(walls)
         along = solver.along_walls()
         calibration = solver.calibration_of(along)
         simple = solver.simple(calibration)
@@ -208,21 +204,29 @@ class Refiner:
         named = dict(zip(CALIBRATION, calibration.tolist(), strict=True))
         least = LEAST_SIGMAS_WITH_WALLS if witness > LEAST_WITNESS else LEAST_SIGMAS
         if better.sigmas < least:
+            if walls.certainty < LEAST_CERTAINTY:
+                return Refinement(False, lost_words(walls.certainty), readings, odometry, {}, lost=True)
             reason = f'{said}: not enough to tell that odometry is off'
             return Refinement(False, reason, readings, odometry, named, gain=better.mean)
         if better.sigmas < LEAST_SIGMAS:
             said = f'that walls stand at right angles is likelier by {witness:.0f} nats than with odometry; {said}'
-        solution, loops = solver.with_matches(along)
-        nodes = self._choose(scans, simple, along.nodes, solution.nodes)
-        if nodes is solution.nodes:
-            named = dict(zip(CALIBRATION, solver.calibration_of(solution).tolist(), strict=True))
+        found = solved(scans, walls, solver, along, solver_of)
+        if found.certainty < LEAST_CERTAINTY:
+            return Refinement(False, lost_words(found.certainty), readings, odometry, {}, lost=True)
+        if found.solver is not solver:
+            solver, simple = found.solver, found.solver.simple(found.solver.calibration_of(found.along))
+        nodes = self._choose(scans, simple, found.along.nodes, found.solution.nodes)
+        if nodes is found.solution.nodes:
+            named = dict(zip(CALIBRATION, solver.calibration_of(found.solution).tolist(), strict=True))
         trajectory = refined(odometry, windows, nodes)
         moved, turned = differences(odometry, trajectory)
         if moved < least_moved:
             reason = f'odometry is off by {moved:.2f} m, which is no more than sonar can tell'
             return Refinement(False, reason, readings, odometry, named, gain=better.mean)
         placed, noise = replaced(readings, odometry, trajectory), walls.drifts.noise
-        return Refinement(True, said, placed, trajectory, named, moved, turned, len(loops), better.mean, noise=noise)
+        return Refinement(
+            True, said, placed, trajectory, named, moved, turned, len(found.loops), better.mean, noise=noise
+        )
 
     def _say(self, stage: str) -> Callable[[float], None]:
         def progress(part: float) -> None:
@@ -295,6 +299,11 @@ def unfit(readings: Readings, odometry: Odometry) -> str:
     if len(np.unique(readings.sensor)) < LEAST_SENSORS:
         return 'there is one sensor only, which cannot tell a turn from a step aside'
     return ''
+
+
+def lost_words(certainty: float) -> str:
+    """Return why a drive stays whose heading is this certain."""
+    return f'the heading was lost somewhere: that it is not off by a right angle is only {certainty:.0%} certain'
 
 
 def refined(odometry: Odometry, windows: Windows, nodes: Floats) -> Odometry:

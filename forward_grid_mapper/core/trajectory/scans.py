@@ -63,7 +63,9 @@ class Scans:
             parts.append(table)
         return Scan(np.concatenate(parts) if parts else self.scan[0].readings[:0], self.scan[0].weight)
 
-    def map(self, members: NDArray[np.int64], origin: Floats, nodes: Floats) -> LocalMap | None:
+    def map(
+        self, members: NDArray[np.int64], origin: Floats, nodes: Floats, most: int = MOST_ON_MAP
+    ) -> LocalMap | None:
         """Return the map of some windows in the frame `origin`; None where they have hardly any readings.
 
         Parameters
@@ -73,14 +75,16 @@ class Scans:
         origin : float64, shape (3,)
         nodes : float64, shape (n, 3)
             Of the first n windows, all of `members` among them.
+        most : int
+            Readings that it is made from at most.
         """
         w, known = self.windows, len(nodes)
         if self.count[members].sum() < FEWEST_ON_MAP:
             return None
         which = np.concatenate([np.arange(w.first[k], w.first[k + 1]) for k in members if not self.held_out[k]])
-        if len(which) > MOST_ON_MAP:
+        if len(which) > most:
             # sensors take turns, so every so-manieth reading may be of a few of them only
-            which = np.sort(np.random.default_rng(len(which)).choice(which, MOST_ON_MAP, replace=False))
+            which = np.sort(np.random.default_rng(len(which)).choice(which, most, replace=False))
         robot = corrected(w.progress[which], w.robot[which], w.node_progress[:known], w.node[:known], nodes)
         placed = relative(origin, compose(robot, w.mount[which]))
         return local_map(at_poses(w.readings.select(which), placed), self._parameters, self._stop)

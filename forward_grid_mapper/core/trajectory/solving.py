@@ -10,8 +10,10 @@ import math
 from collections.abc import Callable
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .heading import Heading
+from .holding_out import LEAST_SIGMAS, foreseen, gain
 from .loops import Looked, Loop, find_loops, loops_of
 from .odometry_model import (
     CALIBRATION,
@@ -23,9 +25,10 @@ from .odometry_model import (
     sensitivity,
     with_yaw,
 )
-from .passes import Found, Progress, again, ahead, bent
+from .passes import BLOCK, Found, Progress, again, ahead, bent
 from .pose_graph import Edges, Graph, Solution, Walls, Yaws, joined, no_edges, solve
 from .poses import Floats, rms_after_alignment
+from .relocating import MORE, displaced, loops_at, recognised, revisits, unsupported, windows_of
 from .scans import Scans
 from .wall_distances import Distances
 from .walls import EVERY, SPAN
@@ -83,6 +86,7 @@ class Solver:
     ) -> None:
         self._odometry, self._windows, self._scans, self._heading = odometry, windows, scans, heading
         self._say = say
+        self._in_place: set[int] = set()
         drifts = heading.drifts
         self.first_calibration = np.array([0.0, 0.0, drifts.bias, drifts.turn_scale])
         self._change = sensitivity(odometry, windows)
@@ -110,7 +114,7 @@ class Solver:
         nodes, calibration = self.simple(np.zeros(len(CALIBRATION))), np.zeros(len(CALIBRATION))
         for k in range(WALL_ROUNDS):
             walls = self._walls(nodes, k == WALL_ROUNDS - 1)
-            solution = solve(self._graph(no_edges(), walls), nodes, calibration, SAMPLES)
+            solution = solve(self._graph(no_edges(), walls), nodes, calibration)
             nodes, calibration = solution.nodes, solution.calibration
         return solution
 
@@ -127,12 +131,50 @@ class Solver:
             watch, searched = self._say('places seen before'), solution.nodes
             looked = find_loops(self._scans, searched, solution.samples, found.usual, watch, known)
             walls = self._walls(searched, True)
-            solution, loops = self._with_loops(walls, edges, loops_of(looked), solution)
+            first, loops = self._with_loops(walls, edges, loops_of(looked), solution)
+            solution, loops = self._relocated(edges, loops, first, found.usual)
             # maps from nodes that hardly moved are the same again
             if rms_after_alignment(before, solution.nodes) < SETTLED:
                 break
-            known = self._unchanged(looked, searched, solution.nodes)
+            # blocks that were carried to another place are to be looked for anew
+            known = self._unchanged(looked, searched, solution.nodes) if solution is first else Looked()
         return solution, loops
+
+    def _relocated(
+        self, matches: Edges, loops: list[Loop], solution: Solution, usual: float
+    ) -> tuple[Solution, list[Loop]]:
+        """Return the solution with stretches that fit where they are no more put where they belong."""
+        begin = 0
+        while True:
+            blocks = unsupported(revisits(self._scans, solution.nodes), recognised(loops), begin)
+            if blocks is None:
+                return solution, loops
+            begin = int(blocks[len(blocks) // 2])
+            if int(blocks[0]) not in self._in_place:
+                self._say('places seen before')
+                self._in_place.add(int(blocks[0]))
+                solution, loops = self._elsewhere(blocks, matches, loops, solution, usual)
+
+    def _elsewhere(
+        self, blocks: NDArray[np.int64], matches: Edges, loops: list[Loop], solution: Solution, usual: float
+    ) -> tuple[Solution, list[Loop]]:
+        """Return the solution with some blocks in another place, if their readings are foreseen better there."""
+        scans, nodes = self._scans, solution.nodes
+        stretch = windows_of(blocks, len(nodes))
+        moved = displaced(scans, nodes, stretch)
+        if moved is None:
+            return solution, loops
+        found, first = loops_at(scans, moved, stretch, usual), int(stretch[0])
+        if len(found) < len(recognised(loops).intersection(blocks.tolist())) + MORE:
+            return solution, loops
+        # those with which the rest was led astray lead all that comes after it
+        across = [min(loop.block, loop.place) < first <= max(loop.block, loop.place) for loop in loops]
+        rest = [loop for loop, out in zip(loops, across, strict=True) if not out]
+        tried, kept = self._with_loops(self._walls(nodes, True), matches, [*rest, *found], solution)
+        parts = [stretch[k : k + BLOCK] for k in range(0, len(stretch), BLOCK)]
+        if gain(foreseen(scans, nodes, parts), foreseen(scans, tried.nodes, parts)).sigmas < LEAST_SIGMAS:
+            return solution, loops
+        return tried, kept
 
     def _unchanged(self, looked: Looked, before: Floats, after: Floats) -> Looked:
         """Return what would come out the same: where neither the map of the place nor the block was bent."""
@@ -153,7 +195,7 @@ class Solver:
         """Return the solution with those loops that agree with each other and with the rest."""
         while True:
             parts = [_edges_of(loop.found) for loop in loops]
-            solution = solve(self._graph(joined(matches, *parts), walls), start.nodes, start.calibration, SAMPLES)
+            solution = solve(self._graph(joined(matches, *parts), walls), start.nodes, start.calibration)
             ends = len(matches.first) + np.cumsum([len(part.first) for part in parts], dtype=np.int64)
             each = np.split(solution.squared, ends - [len(part.first) for part in parts])[1:]
             off = np.array([squared.mean() for squared in each])

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.trajectory.heading import Heading, heading
@@ -28,9 +29,9 @@ class Tour(NamedTuple):
     heading: Heading
 
 
-def tour_with(sonars: SonarArray) -> Tour:
-    """Return the beginning of the tour through the building."""
-    recording = drive(building_world(), building_tour()[:20], 0.1, sonars, NOISY, seed=3)
+def tour_with(sonars: SonarArray, way: NDArray[np.float64] | None = None) -> Tour:
+    """Return the beginning of the tour through the building, or another way."""
+    recording = drive(building_world(), building_tour()[:20] if way is None else way, 0.1, sonars, NOISY, seed=3)
     messages = recording.odometry
     odometry = Odometry.of(np.array([m.stamp for m in messages]), np.array([m.pose for m in messages], float))
     windows = cut(recording.readings, odometry)

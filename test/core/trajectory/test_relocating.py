@@ -1,0 +1,166 @@
+"""Stretches that were put in a wrong place, and places where a right angle may have been lost."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from exact_tour import Tour, quietly, tour_with
+
+from forward_grid_mapper.core.trajectory.heading import DOUBTFUL, Heading, doubts
+from forward_grid_mapper.core.trajectory.hypotheses import solved
+from forward_grid_mapper.core.trajectory.loops import LENGTH, Loop
+from forward_grid_mapper.core.trajectory.passes import Found, ahead
+from forward_grid_mapper.core.trajectory.pose_graph import Solution
+from forward_grid_mapper.core.trajectory.poses import Floats, compose, relative
+from forward_grid_mapper.core.trajectory.relocating import (
+    CONFIRMING,
+    FEW,
+    RUN,
+    confirmed,
+    displaced,
+    recognised,
+    revisits,
+    unsupported,
+    windows_of,
+)
+from forward_grid_mapper.core.trajectory.solving import Solver
+from forward_grid_mapper.simulation.sonar import sonar_ring
+from forward_grid_mapper.simulation.world import building_tour
+
+OFF = np.array([3.2, -1.4, math.radians(3.0)])
+"""By how much the way back is off."""
+
+
+@pytest.fixture(scope='module')
+def there_and_back() -> Tour:
+    """Return a drive through some rooms and back."""
+    way = building_tour()[:12]
+    return tour_with(sonar_ring(16), np.concatenate([way, way[-2::-1]]))
+
+
+def turning(tour: Tour) -> int:
+    """Return the node where the robot turns back."""
+    return len(tour.windows) // 2
+
+
+def astray(tour: Tour) -> Floats:
+    """Return the nodes with the way back off."""
+    nodes, first = tour.windows.node.copy(), turning(tour)
+    nodes[first:] = compose(compose(nodes[first], OFF), relative(nodes[first], nodes[first:]))
+    return nodes
+
+
+def found_at(tour: Tour, blocks: list[int], place: int) -> list[Loop]:
+    """Return loops of some blocks, by their numbers, with a place."""
+    return [Loop(block * LENGTH + LENGTH // 2, place, Found()) for block in blocks]
+
+
+def test_a_stretch_is_found_farther_off_than_single_blocks_are_looked_for(there_and_back) -> None:
+    scans, true = there_and_back.scans, there_and_back.windows.node
+    blocks = revisits(scans, true)
+    stretch = windows_of(blocks[blocks * LENGTH > turning(there_and_back)][:RUN], len(true))
+    moved = displaced(scans, astray(there_and_back), stretch)
+    assert moved is not None
+    assert np.hypot(*(moved - true)[stretch, :2].T).max() < 0.35
+    rest = np.setdiff1d(np.arange(len(true)), stretch)
+    np.testing.assert_array_equal(moved[rest], astray(there_and_back)[rest])
+    assert displaced(scans, true, stretch) is None
+
+
+def solution_at(nodes: Floats) -> Solution:
+    return Solution(nodes, np.zeros(4), np.zeros(0), np.zeros(len(nodes) - 1), np.zeros((1, len(nodes), 3)))
+
+
+def test_what_was_led_astray_is_put_where_it_belongs(there_and_back) -> None:
+    true, first = there_and_back.windows.node, turning(there_and_back)
+    solver = Solver(*there_and_back, quietly)
+    found = ahead(there_and_back.scans, true, lambda part: None)
+    wrong = solution_at(astray(there_and_back))
+    solution, loops = solver._relocated(found.edges(), [], wrong, found.usual)
+    off = relative(solution.nodes[0], solution.nodes) - relative(true[0], true)
+    assert np.hypot(off[:, 0], off[:, 1]).max() < 0.3
+    assert all(loop.block >= first > loop.place for loop in loops)
+    assert len(loops) > FEW
+
+
+def test_what_is_in_its_place_stays(there_and_back) -> None:
+    solver, true = Solver(*there_and_back, quietly), there_and_back.windows.node
+    start = solution_at(true)
+    solution, loops = solver._relocated(Found().edges(), [], start, 1.0)
+    assert solution is start
+    assert loops == []
+
+
+def test_only_stretches_that_are_hardly_recognised_are_searched() -> None:
+    blocks = np.arange(10, 30)
+    assert unsupported(blocks, set(range(10, 30)), 0) is None
+    lost = set(range(10, 20)) | {24}
+    stretch = unsupported(blocks, lost, 0)
+    assert stretch is not None
+    assert len(stretch) == RUN
+    assert len(lost.intersection(stretch.tolist())) <= 1
+    assert stretch[0] >= 19
+    # blocks that lie far apart are no stretch
+    assert unsupported(np.arange(10, 100, 5), set(), 0) is None
+    assert unsupported(blocks[: RUN - 1], set(), 0) is None
+    assert unsupported(blocks, set(), int(blocks[-1])) is None
+
+
+def test_the_way_past_a_place_is_known_if_what_was_before_is_recognised(there_and_back) -> None:
+    scans, nodes, middle = there_and_back.scans, there_and_back.windows.node, turning(there_and_back)
+    after = [block for block in revisits(scans, nodes).tolist() if block * LENGTH > middle]
+    assert len(after) >= 2 * CONFIRMING
+    assert confirmed(scans, nodes, found_at(there_and_back, after, 4), middle)
+    assert not confirmed(scans, nodes, found_at(there_and_back, after[: len(after) // 2], 4), middle)
+    assert not confirmed(scans, nodes, found_at(there_and_back, after, middle), middle)
+    assert not confirmed(scans, nodes, [], middle)
+    assert recognised(found_at(there_and_back, after, 4)) == set(after)
+
+
+def test_a_doubt_lies_in_the_middle_of_where_certainty_falls() -> None:
+    at = np.arange(0, 60, 3)
+    certain = np.ones(20)
+    certain[6:] -= 0.1
+    certain[7:] -= 0.2
+    certain[8:] -= 0.1
+    certain[17:] -= 0.05
+    assert [(node, round(p, 6)) for node, p in doubts(at, certain)] == [(21, 0.4), (51, 0.05)]
+    assert doubts(at, np.ones(20)) == ()
+    assert doubts(at, np.linspace(1.0, 1.0 - DOUBTFUL / 2, 20)) == ()
+
+
+@pytest.mark.parametrize('lost', [0, 1])
+def test_a_right_angle_that_was_lost_is_found_again(there_and_back, lost) -> None:
+    odometry, windows, scans, heading = there_and_back
+    node, true = turning(there_and_back) - 6, windows.node
+
+    def solver_of(other: Heading) -> Solver:
+        return Solver(odometry, windows, scans, other, quietly)
+
+    doubtful = replace(heading.turned(node, lost * math.pi / 2), certainty=0.6, doubts=((node, 0.4),))
+    solver = solver_of(doubtful)
+    found = solved(scans, doubtful, solver, solver.along_walls(), solver_of)
+    assert found.certainty > 0.9
+    off = relative(found.solution.nodes[0], found.solution.nodes) - relative(true[0], true)
+    assert np.hypot(off[:, 0], off[:, 1]).max() < 0.3
+    assert (found.solver is solver) == (lost == 0)
+
+
+def test_without_a_revisit_a_doubt_stays(there_and_back) -> None:
+    odometry, windows, scans, heading = there_and_back
+    solvers: list[Solver] = []
+
+    def solver_of(other: Heading) -> Solver:
+        solvers.append(Solver(odometry, windows, scans, other, quietly))
+        return solvers[-1]
+
+    last = len(windows) - 2
+    doubtful = replace(heading, certainty=0.6, doubts=((last, 0.25), (last - 1, 0.15)))
+    first = solver_of(doubtful)
+    found = solved(scans, doubtful, first, first.along_walls(), solver_of)
+    assert found.certainty == pytest.approx(0.6)
+    # two doubts would take many solutions
+    assert solvers == [first]
