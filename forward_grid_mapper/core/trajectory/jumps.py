@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 
 from ..common.parameters import Parameters
 from ..common.readings import Readings, of_drives
-from .holding_out import Gain, gain
+from .holding_out import LEAST_SIGMAS, Gain, gain
 from .poses import Floats, compose, inverse, relative, wrapped
-from .registration import LEAST_SIGMAS, SILENT, OnMap, moved_to, readings_moved
+from .registration import SILENT, OnMap, moved_to, readings_moved
 from .windows import Odometry
 
 LONGEST_STEP = 1.0

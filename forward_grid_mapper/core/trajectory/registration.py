@@ -18,7 +18,7 @@ from ..common.parameters import Parameters
 from ..common.readings import Readings
 from ..messages.reading_buffer import bounded
 from ..sensor.density import hit_probability
-from .holding_out import Gain, gain
+from .holding_out import LEAST_SIGMAS, Gain, gain
 from .likelihood import Scan, make_scan, scores
 from .local_map import UNKNOWN, LocalMap, at_poses, for_matching, local_map
 from .matching import grid_around
@@ -46,9 +46,6 @@ FEWEST = 5
 
 SILENT = 1e-6
 """Nats a reading of a block that says nothing, since all of it is new."""
-
-LEAST_SIGMAS = 2.3
-"""Standard errors by which readings must be foreseen better, as for trajectories."""
 
 
 class Registration(NamedTuple):

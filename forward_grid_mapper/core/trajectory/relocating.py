@@ -62,12 +62,19 @@ def recognised(loops: Sequence[Loop]) -> set[int]:
     return {max(loop.block, loop.place) // LENGTH for loop in loops}
 
 
-def revisits(scans: Scans, nodes: Floats) -> NDArray[np.int64]:
-    """Return the numbers of blocks that lie where the robot was before."""
+def revisits(scans: Scans, nodes: Floats, passed: int | None = None) -> NDArray[np.int64]:
+    """Return the numbers of blocks that lie where the robot was before.
+
+    With `passed`, of blocks behind this node that lie where the robot was before it.
+    """
     progress, out = scans.windows.node_progress, []
     for first in range(0, len(nodes) - LENGTH // 2, LENGTH):
         middle = min(first + LENGTH // 2, len(nodes) - 1)
-        before = nodes[progress < progress[middle] - APART, :2]
+        if passed is not None and middle < passed:
+            continue
+        # progress grows, so what was before is the first nodes
+        until = int(np.searchsorted(progress, progress[middle] - APART))
+        before = nodes[: until if passed is None else min(until, passed), :2]
         if len(before) and np.hypot(*(before - nodes[middle, :2]).T).min() < NEAR:
             out.append(first // LENGTH)
     return np.array(out, np.int64)
@@ -95,15 +102,10 @@ def unsupported(blocks: NDArray[np.int64], seen: set[int], begin: int) -> NDArra
 
 def confirmed(scans: Scans, nodes: Floats, loops: Sequence[Loop], node: int) -> bool:
     """Return whether places seen before a node were recognised after it: then the way past it is known."""
-    progress, could, did = scans.windows.node_progress, 0, 0
-    first = nodes[:node, :2]
-    after = {max(x.block, x.place) // LENGTH for x in loops if max(x.block, x.place) >= node > min(x.block, x.place)}
-    for block in revisits(scans, nodes).tolist():
-        middle = min(block * LENGTH + LENGTH // 2, len(nodes) - 1)
-        before = first[progress[:node] < progress[middle] - APART]
-        if middle >= node and len(before) and np.hypot(*(before - nodes[middle, :2]).T).min() < NEAR:
-            could, did = could + 1, did + (block in after)
-    return did >= CONFIRMING and 2 * did > could
+    across = [loop for loop in loops if max(loop.block, loop.place) >= node > min(loop.block, loop.place)]
+    blocks = revisits(scans, nodes, node).tolist()
+    did = len(recognised(across).intersection(blocks))
+    return did >= CONFIRMING and 2 * did > len(blocks)
 
 
 def windows_of(blocks: NDArray[np.int64], count: int) -> NDArray[np.int64]:

@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 from exact_tour import Tour, quietly, tour_with
 
+from forward_grid_mapper.core.trajectory import solving
 from forward_grid_mapper.core.trajectory.heading import DOUBTFUL, Heading, doubts
 from forward_grid_mapper.core.trajectory.hypotheses import solved
 from forward_grid_mapper.core.trajectory.loops import LENGTH, Loop
+from forward_grid_mapper.core.trajectory.matching import Match
 from forward_grid_mapper.core.trajectory.passes import Found, ahead
 from forward_grid_mapper.core.trajectory.pose_graph import Solution
 from forward_grid_mapper.core.trajectory.poses import Floats, compose, relative
@@ -84,6 +86,33 @@ def test_what_was_led_astray_is_put_where_it_belongs(there_and_back) -> None:
     assert np.hypot(off[:, 0], off[:, 1]).max() < 0.3
     assert all(loop.block >= first > loop.place for loop in loops)
     assert len(loops) > FEW
+
+
+def test_another_place_is_taken_only_if_readings_are_foreseen_better(there_and_back, monkeypatch) -> None:
+    true, first = there_and_back.windows.node, turning(there_and_back)
+
+    def aside(scans, nodes, stretch) -> Floats:
+        out = nodes.copy()
+        out[stretch] += (0.0, 1.5, 0.0)
+        return out
+
+    def loops_there(scans, nodes, stretch, usual) -> list[Loop]:
+        out = []
+        for block in stretch.reshape(-1, LENGTH):
+            found = Found()
+            for k in block:
+                found.add(0, int(k), Match(relative(nodes[0], nodes[k]), np.diag([1e4, 1e4, 1e3]), 50.0), 50)
+            out.append(Loop(int(block[LENGTH // 2]), 0, found))
+        return out
+
+    monkeypatch.setattr(solving, 'displaced', aside)
+    monkeypatch.setattr(solving, 'loops_at', loops_there)
+    solver, start = Solver(*there_and_back, quietly), solution_at(true)
+    blocks = revisits(there_and_back.scans, true)
+    blocks = blocks[blocks * LENGTH > first][:RUN]
+    solution, loops = solver._elsewhere(blocks, Found().edges(), [], start, 1.0)
+    assert solution is start
+    assert loops == []
 
 
 def test_what_is_in_its_place_stays(there_and_back) -> None:
