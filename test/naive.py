@@ -8,7 +8,16 @@ import math
 
 import numpy as np
 
-from forward_grid_mapper.core.common.constants import LED_ON, MOST_AGAINST_EXTENSION, STRAIGHT_RUN
+from forward_grid_mapper.core.common.constants import (
+    CONTRAST,
+    FEW_ECHOES,
+    FEW_READINGS,
+    GAIN,
+    LEAST_RATE,
+    LED_ON,
+    MOST_AGAINST_EXTENSION,
+    STRAIGHT_RUN,
+)
 from forward_grid_mapper.core.common.grid import Grid
 from forward_grid_mapper.core.common.parameters import ModelParameters
 from forward_grid_mapper.core.common.readings import Readings
@@ -349,6 +358,54 @@ def normals(readings: Readings, grid: Grid, model: ModelParameters) -> tuple[np.
                 w = math.exp(-0.5 * ((d - readings.z[t]) / sigma) ** 2)
                 sums[:, row, column] += w * math.cos(2 * bearing), w * math.sin(2 * bearing), w
     return sums[0], sums[1], sums[2]
+
+
+def met(
+    readings: Readings, grid: Grid, model: ModelParameters, normals: SurfaceNormals, parts: tuple[float, ...]
+) -> np.ndarray:
+    """Echoes of each cell whose normal is known, and passes, by how far off it it is met: that of `incidence`.
+
+    Shape (2, zones, cells).
+    """
+    limits = [part * model.max_incidence_angle for part in (*parts, 1.0)]
+    out = np.zeros((2, len(limits), grid.size))
+    xs, ys = grid.centers()
+    for t in range(len(readings)):
+        z, sigma = readings.z[t] + surface(grid, model), sigma_of(readings, t, grid, model)
+        for c in cells_of(readings, t, grid, model):
+            if not normals.known[c]:
+                continue
+            row, column = divmod(c, grid.width)
+            dx, dy = xs[column] - readings.x[t], ys[row] - readings.y[t]
+            d = math.hypot(dx, dy)
+            off = math.acos(min(abs(dx * normals.x[c] + dy * normals.y[c]) / d, 1.0))
+            zone = sum(off > limit for limit in limits)
+            if zone == len(limits):
+                continue
+            if d <= z - THROUGH * sigma:
+                out[1, zone, c] += strength(readings, t, grid, c)
+            elif d < z + THROUGH * sigma and readings.z[t] < readings.z_max[t]:
+                out[0, zone, c] += math.exp(-0.5 * ((d - z) / sigma) ** 2)
+    return out
+
+
+def incidence_limit(echoes: np.ndarray, passes: np.ndarray) -> int:
+    """The zone with which a surface ends, by its echoes and passes in each zone: that of `incidence`."""
+
+    def rate(e: float, p: float) -> float:
+        return (e + FEW_ECHOES) / (e + p + FEW_READINGS)
+
+    def log_likelihood(e: float, p: float) -> float:
+        return e * math.log(rate(e, p)) + p * math.log(1 - rate(e, p))
+
+    best, zone = GAIN, len(echoes) - 1
+    for k in range(1, len(echoes)):
+        within = sum(echoes[:k]), sum(passes[:k])
+        beyond = sum(echoes[k:]), sum(passes[k:])
+        gained = log_likelihood(*within) + log_likelihood(*beyond) - log_likelihood(sum(echoes), sum(passes))
+        if gained > best and rate(*within) >= max(LEAST_RATE, CONTRAST * rate(*beyond)):
+            best, zone = gained, k - 1
+    return zone
 
 
 def passed(

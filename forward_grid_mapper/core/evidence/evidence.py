@@ -18,12 +18,13 @@ from ..runtime.memory import THREAD_MEMORY
 from ..runtime.threads import parts, run_each
 from ..sensor.cone_table import CONE, Cones, Floats, cone_table
 from ..sensor.density import hit_probability
+from ..sensor.incidence import count, edges_of, narrowed, no_counts, slots_of
 from ..sensor.surface_normals import SurfaceNormals, gather, no_normals, normals_of, on_larger_grid, renewed, touched
 from .fixed_point import QUANTUM
 from .indexing import BAND, FREE, LARGEST, UNSTORED, UNUSED, WORDS, insert_readings, reading_state_table
 from .neighbourhood import set_patterns
 from .pairs import WORD, WORDS_PER_BAND_PAIR, Lattice, empty_pairs, workspace_for
-from .renewal import box_of, find_changed, renew
+from .renewal import box_of, find_changed, near, renew
 from .state import READING_STATE, Maps, Model, State
 from .tile_index import more_chunks, no_tiles
 from .updates import add_multiplicity, evaluate_all, forget
@@ -343,10 +344,14 @@ class Evidence:
         if self._sums is None or self._since is None:
             return None
         s, shape = self.state, self.grid.shape
-        normals = renewed(s.normals, self._sums, self.grid, self._since)
+        window = self._since
+        for _ in range(2):
+            # what changed is seen in the normals around it, and these in the incidence angles around them
+            window = touched(window, self.grid)
+        normals = self._renewed(s, self._sums, window)
         differ = np.zeros(shape, np.uint8)
         sees = np.zeros(self._size, np.uint8)
-        find_changed(s, normals, touched(self._since, self.grid), differ, sees)
+        find_changed(s, normals, window, differ, sees)
         readings = np.flatnonzero(sees)
         window = box_of(s.cones[readings], self.grid)
         # nothing fails from here on: where there is no memory for pairs they are not stored
@@ -442,16 +447,45 @@ class Evidence:
             self._sums[:] = 0
 
     def _first_normals(self, end: int) -> None:
-        """Learn from the first readings which way surfaces face."""
+        """Learn from the first readings which way surfaces face, and up to which incidence they return echoes."""
         self._indexed = 0
+        normals = self._unit_normals(end)
+        whole = 0, self.grid.height, 0, self.grid.width
+        slots = slots_of(normals, whole)
+        counts, edges = no_counts(slots), edges_of(self.model.max_incidence_angle)
+        weights = np.ascontiguousarray(self.state.reading_states['multiplicity'][:end])
+
+        def work(s: State, first: int, last: int, into: NDArray[np.int64]) -> None:
+            count(s.cones, weights, normals, slots, whole, edges, (first, last), into, s.stop)
+
+        self.summed(0, end, work, counts)
+        self.state = self.state._replace(normals=narrowed(normals, counts, slots, self.grid, whole))
+
+    def _unit_normals(self, end: int) -> SurfaceNormals:
         sums = np.zeros((3, self.grid.size), np.int64) if self._sums is None else self._sums
 
         def work(s: State, first: int, last: int, into: NDArray[np.int64]) -> None:
             gather(s.cones, self.grid.shape, (first, last), into, s.stop)
 
         self.summed(0, end, work, sums)
-        normals = normals_of(sums, self.grid, self.model.max_incidence_angle)
-        self.state = self.state._replace(normals=normals)
+        return normals_of(sums, self.grid, self.model.max_incidence_angle)
+
+    def _renewed(self, s: State, sums: NDArray[np.int64], window: Window) -> SurfaceNormals:
+        """Return the normals as they are with other sums and readings, which change them in a window alone."""
+        around = touched(window, self.grid)
+        normals = renewed(s.normals, sums, self.grid, around)
+        slots = slots_of(normals, around)
+        counts, edges = no_counts(slots), edges_of(self.model.max_incidence_angle)
+        readings = np.flatnonzero(near(s.cones[: self._size], around))
+        cones, weights = s.cones[readings], s.reading_states['multiplicity'][readings]
+        count(cones, weights, normals, slots, around, edges, (0, len(cones)), counts, NEVER)
+        narrowed(normals, counts, slots, self.grid, window)
+        # around the window nothing changed
+        outside = np.ones(self.grid.shape, np.bool_)
+        outside[window[0] : window[1], window[2] : window[3]] = False
+        for new, old in ((normals.x, s.normals.x), (normals.y, s.normals.y)):
+            np.copyto(new.reshape(self.grid.shape), old.reshape(self.grid.shape), where=outside)
+        return normals
 
     def _keep_bearings(self, cones: NDArray[np.void]) -> None:
         """Add what readings say about surface normals, in a way that cannot fail: on one thread, heedless of `stop`."""

@@ -43,6 +43,15 @@ def box_of(cones: NDArray[np.void], grid: Grid) -> Window | None:
     return window if window[0] < window[1] and window[2] < window[3] else None
 
 
+def near(cones: NDArray[np.void], window: Window) -> NDArray[np.bool_]:
+    """Return which cones may reach into a window, shape (N,)."""
+    bottom, top, left, right = window
+    far = cones['reach'] + 1.0
+    beside = np.maximum(left - cones['x'], cones['x'] - right) < far
+    out: NDArray[np.bool_] = beside & (np.maximum(bottom - cones['y'], cones['y'] - top) < far)
+    return out
+
+
 @kernel
 def _mark_cells(old: SurfaceNormals, new: SurfaceNormals, window: Window, width: int, differ: Any) -> None:
     """Mark the cells of a window whose normals differ in `differ`, uint8, shape (height, width)."""

@@ -10,7 +10,8 @@ around the cell:
 
     C = Σ w cos 2φ      S = Σ w sin 2φ      M = Σ w      w = exp(−(d − z)² / 2σ²)      normal = atan2(S, C) / 2
 
-It counts as known where M and √(C² + S²) / M are large enough.
+It counts as known where M and √(C² + S²) / M are large enough. How far off it the surface returns echoes is another
+question (`incidence`).
 """
 
 from __future__ import annotations
@@ -41,7 +42,9 @@ class SurfaceNormals(NamedTuple):
     ----------
     known : uint8, shape (cells,)
     x, y : float32, shape (cells,)
-        Unit vector along the normal, either way; 0 where it is not known.
+        Along the normal, either way; 0 where it is not known. Of length one where the surface returns echoes up to the
+        incidence angle of the model, shorter where it does so up to less: (x, y) times a unit vector is the cosine off
+        the normal times cos(angle of the model) / cos(own angle), and is held against `cos2_limit` (`incidence`).
     before : int32, shape (height, width + 1)
         Number of known cells in each row before a column.
     cos2_limit : float
@@ -135,7 +138,7 @@ def _half_width(resolution: float) -> tuple[int, float]:
     return whole, half - whole + 1.0
 
 
-def _box(values: NDArray[np.int64], resolution: float, window: Window) -> NDArray[np.float64]:
+def box_sums(values: NDArray[np.int64], resolution: float, window: Window) -> NDArray[np.float64]:
     """Return the sums over the square of `NEIGHBOURHOOD` around each cell of a window, in cells of `WEIGHT_CELL`.
 
     Nothing is added from beyond the edges of the grid. The order of summation does not depend on the window.
@@ -167,7 +170,7 @@ def _estimate(normals: SurfaceNormals, sums: NDArray[np.int64], grid: Grid, wind
     for first in range(bottom, top, step):
         part = first, min(first + step, top), left, right
         cells = slice(*part[:2]), slice(*part[2:])
-        cosine, sine, mass = (_box(values.reshape(shape), grid.resolution, part) for values in sums)
+        cosine, sine, mass = (box_sums(values.reshape(shape), grid.resolution, part) for values in sums)
         clear = (mass >= LEAST_WEIGHT) & (np.hypot(cosine, sine) >= LEAST_AGREEMENT * mass)
         angle = np.arctan2(sine, cosine) / 2
         known[cells], x[cells], y[cells] = (
@@ -208,17 +211,17 @@ def renewed(normals: SurfaceNormals, sums: NDArray[np.int64], grid: Grid, window
     sums : int64, shape (3, cells)
     grid : Grid
     window
-        Where the sums changed: first row, last one plus one, and columns likewise.
+        Of the cells to estimate: first row, last one plus one, and columns likewise.
     """
     new = normals._replace(
         known=normals.known.copy(), x=normals.x.copy(), y=normals.y.copy(), before=normals.before.copy()
     )
-    _estimate(new, sums, grid, touched(window, grid))
+    _estimate(new, sums, grid, window)
     return new
 
 
 def touched(window: Window, grid: Grid) -> Window:
-    """Return the window of the cells whose normals depend on the sums in `window`."""
+    """Return the window of the cells whose squares of `NEIGHBOURHOOD` reach into `window`."""
     bottom, top, left, right = window
     n, _ = _half_width(grid.resolution)
     return max(bottom - n, 0), min(top + n, grid.height), max(left - n, 0), min(right + n, grid.width)

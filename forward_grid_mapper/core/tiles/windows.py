@@ -20,6 +20,7 @@ from ..runtime.memory import memory_for_pairs
 from ..search.search import Progress, Search
 from ..sensor.cone_table import cone_table
 from ..sensor.forward_model import ForwardModel
+from ..sensor.incidence import count, edges_of, narrowed, no_counts, slots_of
 from ..sensor.surface_normals import SurfaceNormals, gather, known_normals, no_normals, normals_of
 from .tiling import Tile
 
@@ -40,7 +41,7 @@ class Given(NamedTuple):
     occupied : uint8, shape `box.shape`
         The map.
     normals : float32, shape (2, *box.shape)
-        Unit vectors along the surface normals, 0 where none is known.
+        Along the surface normals, as of `SurfaceNormals`, 0 where none is known.
     ml : int8, shape `box.shape`
         The map that is handed out; only for `judged`.
     """
@@ -60,7 +61,7 @@ class Given(NamedTuple):
 
 
 def normals_from(xy: NDArray[np.float32], parameters: Parameters) -> SurfaceNormals:
-    """Return normals from their unit vectors, float32, shape (2, height, width), 0 where none is known."""
+    """Return normals from x and y as of `SurfaceNormals`, float32, shape (2, height, width), 0 where none is known."""
     angle = parameters.model.max_incidence_angle
     if angle >= NO_INCIDENCE_LIMIT:
         return no_normals()
@@ -99,7 +100,8 @@ class Judged(NamedTuple):
 
 
 def found_normals(given: Given, parameters: Parameters) -> NDArray[np.float32]:
-    """Return the surface normals of the core, float32, shape (2, *core.shape), 0 where none is known."""
+    """Return the surface normals of the core, float32, shape (2, *core.shape), 0 where none is known; also how far off
+    them the surfaces return echoes."""
     box, angle = given.box, parameters.model.max_incidence_angle
     if angle >= NO_INCIDENCE_LIMIT:
         return np.zeros((2, *given.tile.core.shape), np.float32)
@@ -107,6 +109,11 @@ def found_normals(given: Given, parameters: Parameters) -> NDArray[np.float32]:
     cones = cone_table(given.readings, box, parameters.model)
     gather(cones, box.shape, (0, len(cones)), sums, NEVER)
     normals = normals_of(sums, box, angle)
+    whole, weights = (0, box.height, 0, box.width), np.ones(len(cones), np.int32)
+    slots = slots_of(normals, whole)
+    counts = no_counts(slots)
+    count(cones, weights, normals, slots, whole, edges_of(angle), (0, len(cones)), counts, NEVER)
+    narrowed(normals, counts, slots, box, whole)
     return np.stack([given.core(normals.x), given.core(normals.y)])
 
 

@@ -131,7 +131,7 @@ def _log_ratio(reading: Any, weight: float, around: LocalMap, pose: tuple[float,
                 if here > best and d < through and around.cos2_limit > 0.0:
                     nx, ny = around.normal_x[row, column], around.normal_y[row, column]
                     along = u * nx + v * ny
-                    if nx * nx + ny * ny > 0.5 and along * along < around.cos2_limit:
+                    if (nx != 0.0 or ny != 0.0) and along * along < around.cos2_limit:
                         here = 0.0
                 if here > best:
                     off_x, off_y = column + 0.5 - x, row + 0.5 - y

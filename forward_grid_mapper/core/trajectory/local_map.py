@@ -49,7 +49,7 @@ class LocalMap(NamedTuple):
     hit : float32, shape (height, width)
         Probability that a cell returns the echo of a reading that reaches it.
     normal_x, normal_y : float32, shape (height, width)
-        Unit vector along the normal of the surface; 0 where it is not known.
+        Along the normal of the surface, as of `SurfaceNormals`; 0 where it is not known.
     cos2_limit : float
         As in `surface_normals.SurfaceNormals`.
     unknown : float

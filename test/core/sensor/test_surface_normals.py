@@ -20,7 +20,7 @@ from forward_grid_mapper.core.evidence.updates import find_observing, flip
 from forward_grid_mapper.core.runtime import threads
 from forward_grid_mapper.core.sensor.surface_normals import (
     QUANTUM,
-    _box,
+    box_sums,
     exceeds_incidence_angle,
     gather,
     no_normals,
@@ -69,7 +69,7 @@ def test_normals_are_those_of_the_twin(readings: Readings) -> None:
         assert np.abs(told.reshape(GRID.shape) * QUANTUM - exact).max() < 1e-3
     halves = sums_of(evidence, (0, 37)) + sums_of(evidence, (37, len(readings)))
     assert np.array_equal(halves, sums)
-    normals = evidence.state.normals
+    normals = normals_of(sums, GRID, model.max_incidence_angle)
     cosine, sine, mass = (naive.box_sum(values) for values in expected)
     for row, column in np.ndindex(GRID.shape):
         c = row * GRID.width + column
@@ -86,7 +86,8 @@ def test_normals_are_those_of_the_twin(readings: Readings) -> None:
 
 
 def test_the_normal_of_a_wall_is_across_it() -> None:
-    normals = made(along_wall()).state.normals
+    evidence = made(along_wall())
+    normals = normals_of(sums_of(evidence, (0, len(evidence))), GRID, MODEL.max_incidence_angle)
     row = round(3.0 / 0.1) - GRID.row
     wall = normals.known.reshape(GRID.shape)[row, 5:20]
     assert wall.sum() > 10
@@ -110,11 +111,11 @@ def test_sums_are_over_a_square_in_metres_of_which_the_edge_may_be_parts_of_cell
             if 0 <= y < 9 and 0 <= x < 12:
                 expected[row, column] += weights[i] * weights[j] * values[y, x]
     scale = QUANTUM * (resolution / WEIGHT_CELL) ** 2
-    whole = _box(values, resolution, (0, 9, 0, 12))
+    whole = box_sums(values, resolution, (0, 9, 0, 12))
     assert whole == pytest.approx(expected * scale, abs=1e-12)
     # to the bit, so that what is renewed is what would be estimated at once
     for bottom, top, left, right in ((0, 1, 0, 1), (2, 9, 0, 5), (8, 9, 11, 12), (1, 4, 3, 12)):
-        part_of_it = _box(values, resolution, (bottom, top, left, right))
+        part_of_it = box_sums(values, resolution, (bottom, top, left, right))
         assert np.array_equal(part_of_it, whole[bottom:top, left:right])
 
 

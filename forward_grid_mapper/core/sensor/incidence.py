@@ -1,0 +1,206 @@
+"""Up to which incidence each surface returns echoes: rough walls do from nearly anywhere, smooth ones and glass hardly.
+
+A surface that is heard from near its normal and missed beyond 20° is no gap: it is smooth. With one incidence angle for
+all surfaces, what went past it at 30° would speak against it. So of each cell whose normal is known, those readings
+that meet it within `PARTS` of the incidence angle of the model, and those that meet it beyond, are counted apart: echoes
+by how well their range agrees, with the weight w of `surface_normals`, and passes, readings that end beyond it, by the
+strength of their beam there. They are summed over the square of `NEIGHBOURHOOD` around the cell.
+
+Let a surface return the part r of the readings within a limit, and r' of those beyond. With e echoes and p passes
+
+    log L(r) = e log r + p log (1 − r)        r = e / (e + p)
+
+and the limit is the part whose two rates are likelier by `GAIN` than one rate for all, and by the most. It counts only
+where at least `LEAST_RATE` of the readings within are echoes, and `CONTRAST` times as large a part as of those beyond:
+of readings through an open door, few within are echoes, so all that passed it counts against a wall there.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..common.constants import (
+    CONTRAST,
+    FEW_ECHOES,
+    FEW_READINGS,
+    GAIN,
+    LEAST_RATE,
+    NEIGHBOURHOOD,
+    PARTS,
+    THROUGH,
+    WEIGHT_CELL,
+)
+from ..common.grid import Grid, Window
+from ..runtime.jit import kernel
+from .cone import rows_of, runs_of, strength
+from .cone_table import Cones, cone_of
+from .surface_normals import QUANTUM, SurfaceNormals, box_sums, touched
+
+ZONES = len(PARTS) + 1
+"""Zones of incidence that readings are counted in."""
+
+BLOCK = 2**14
+"""Cells that are judged at once, which bounds the memory that it takes."""
+
+
+def slots_of(normals: SurfaceNormals, window: Window) -> NDArray[np.int32]:
+    """Return numbers for the cells of a window whose normals are known, -1 for all other cells, shape (cells,)."""
+    bottom, top, left, right = window
+    height, width = len(normals.before), normals.before.shape[1] - 1
+    out = np.full((height, width), -1, np.int32)
+    known = normals.known.reshape(height, width)[bottom:top, left:right] > 0
+    out[bottom:top, left:right][known] = np.arange(known.sum(), dtype=np.int32)
+    return out.ravel()
+
+
+def no_counts(slots: NDArray[np.int32]) -> NDArray[np.int64]:
+    """Return counts for these cells before any reading: echoes and passes of each zone, shape (2 · ZONES, known)."""
+    return np.zeros((2 * ZONES, int(slots.max(initial=-1)) + 1), np.int64)
+
+
+def edges_of(angle: float) -> NDArray[np.float64]:
+    """Return the squared cosines at which the zones end, shape (ZONES,)."""
+    out: NDArray[np.float64] = np.cos(np.array([*PARTS, 1.0]) * angle) ** 2
+    return out
+
+
+@kernel
+def count(
+    cones: Cones,
+    weights: Any,
+    normals: SurfaceNormals,
+    slots: Any,
+    window: tuple[int, int, int, int],
+    edges: Any,
+    part: tuple[int, int],
+    counts: Any,
+    stop: Any,
+) -> None:
+    """Add echoes and passes of the readings `part[0]` to `part[1]` to `counts`, in units of QUANTUM.
+
+    Parameters
+    ----------
+    cones : records of `CONE`, shape (N,)
+    weights : int32, shape (N,)
+        How many readings each stands for.
+    normals : SurfaceNormals
+        Of length one in the window.
+    slots : int32, shape (cells,)
+        `slots_of` the window.
+    window : first row, last one plus one, and columns likewise
+    edges : float64, shape (ZONES,)
+    part : int, int
+    counts : int64, shape (2 · ZONES, known)
+        Echoes in the first rows, passes in the others.
+    stop : uint8, shape (1,)
+    """
+    width = normals.before.shape[1] - 1
+    for t in range(part[0], part[1]):
+        if stop[0]:
+            break
+        reading = cones[t]
+        cone = cone_of(reading)
+        unit = weights[t] / QUANTUM
+        sine2 = reading.sine * reading.sine
+        bottom, top = rows_of(cone, window[1])
+        for row in range(max(bottom, window[0]), top):
+            v = row + 0.5 - cone.y
+            runs = runs_of(cone, row, width)
+            for begin, end in ((runs.first, runs.last), (runs.first2, runs.last2)):
+                first, last = max(begin, window[2]), min(end, window[3] - 1)
+                if first > last or normals.before[row, last + 1] == normals.before[row, first]:
+                    continue
+                for column in range(first, last + 1):
+                    c = row * width + column
+                    if slots[c] < 0:
+                        continue
+                    u = column + 0.5 - cone.x
+                    square = u * u + v * v
+                    along = u * normals.x[c] + v * normals.y[c]
+                    zone = 0
+                    while zone < len(edges) and along * along < edges[zone] * square:
+                        zone += 1
+                    if zone == len(edges) or square == 0.0:
+                        continue
+                    error = (math.sqrt(square) - reading.z) / reading.sigma
+                    if error <= -THROUGH:
+                        share = strength(reading.axis_x, reading.axis_y, sine2, u, v)
+                        counts[zone + len(edges), slots[c]] += int(unit * share)
+                    elif error < THROUGH and reading.z < reading.z_max:
+                        counts[zone, slots[c]] += int(unit * math.exp(-0.5 * error * error))
+
+
+def _log_likelihood(echoes: NDArray[np.float64], passes: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return log L of the rate that is likeliest."""
+    rate = rate_of(echoes, passes)
+    out: NDArray[np.float64] = echoes * np.log(rate) + passes * np.log(1.0 - rate)
+    return out
+
+
+def rate_of(echoes: NDArray[np.float64], passes: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the part of the readings that are echoes, a half where there are none."""
+    out: NDArray[np.float64] = (echoes + FEW_ECHOES) / (echoes + passes + FEW_READINGS)
+    return out
+
+
+def limits(counts: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Return the zone with which the surface of each cell ends, shape (...,).
+
+    Parameters
+    ----------
+    counts : float64, shape (2 · ZONES, ...)
+        Echoes and passes of each zone.
+    """
+    echoes, passes = (np.cumsum(half, axis=0) for half in (counts[:ZONES], counts[ZONES:]))
+    one_rate = _log_likelihood(echoes[-1], passes[-1])
+    best, zone = np.full(one_rate.shape, GAIN), np.full(one_rate.shape, ZONES - 1)
+    for k in range(ZONES - 1):
+        within, beyond = (echoes[k], passes[k]), (echoes[-1] - echoes[k], passes[-1] - passes[k])
+        gained = _log_likelihood(*within) + _log_likelihood(*beyond) - one_rate
+        rate = rate_of(*within)
+        better = (gained > best) & (rate >= LEAST_RATE) & (rate >= CONTRAST * rate_of(*beyond))
+        best, zone = np.where(better, gained, best), np.where(better, k, zone)
+    return zone
+
+
+def narrowed(
+    normals: SurfaceNormals, counts: NDArray[np.int64], slots: NDArray[np.int32], grid: Grid, window: Window
+) -> SurfaceNormals:
+    """Return the normals with lengths that state each surface's own incidence angle, in a window.
+
+    Parameters
+    ----------
+    normals : SurfaceNormals
+        Of length one in the window; they are changed.
+    counts, slots
+        Of all cells that are `touched` by the window.
+    grid : Grid
+    window : first row, last one plus one, and columns likewise
+    """
+    edges = edges_of(math.acos(math.sqrt(normals.cos2_limit)))
+    lengths = np.sqrt(normals.cos2_limit / edges)
+    lengths[-1] = 1.0
+    bottom, top, left, right = window
+    known, x, y, numbers = (array.reshape(grid.shape) for array in (normals.known, normals.x, normals.y, slots))
+    step = max(BLOCK // max(right - left, 1), 1)
+    for first in range(bottom, top, step):
+        part = first, min(first + step, top), left, right
+        low, high, begin, end = touched(part, grid)
+        cells = slice(*part[:2]), slice(*part[2:])
+        here = known[cells] > 0
+        if not here.any():
+            continue
+        inside = numbers[low:high, begin:end]
+        pooled = []
+        for row in counts:
+            spread = np.where(inside >= 0, row[inside], 0)
+            box = part[0] - low, part[1] - low, left - begin, right - begin
+            pooled.append(box_sums(spread, grid.resolution, box)[here])
+        length = lengths[limits(np.stack(pooled) * (WEIGHT_CELL / NEIGHBOURHOOD))]
+        x[cells][here] *= length
+        y[cells][here] *= length
+    return normals
