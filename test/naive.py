@@ -361,13 +361,12 @@ def normals(readings: Readings, grid: Grid, model: ModelParameters) -> tuple[np.
 
 
 def met(
-    readings: Readings, grid: Grid, model: ModelParameters, normals: SurfaceNormals, parts: tuple[float, ...]
+    readings: Readings, grid: Grid, model: ModelParameters, normals: SurfaceNormals, limits: tuple[float, ...]
 ) -> np.ndarray:
     """Echoes of each cell whose normal is known, and passes, by how far off it it is met: that of `incidence`.
 
     Shape (2, zones, cells).
     """
-    limits = [part * model.max_incidence_angle for part in (*parts, 1.0)]
     out = np.zeros((2, len(limits), grid.size))
     xs, ys = grid.centers()
     for t in range(len(readings)):

@@ -34,15 +34,11 @@ THROUGH = 2.0
 
 # Surfaces that return echoes up to an incidence of their own
 
-PARTS = (0.45, 0.7)
-"""Parts of `max_incidence_angle` up to which smooth surfaces return echoes, 18° and 28° as a rule. Two that are a few
-degrees more or less, or five, are about as good."""
-
 LEAST_RATE = 0.5
 """Part of the readings within the limit of a smooth surface that are its echoes. With 0.4 there are more dots, and a
 door that was seen once is narrower."""
 
-CONTRAST = 4.0
+CONTRAST = 6.0
 """Times as large as that of the readings beyond."""
 
 GAIN = 2.0

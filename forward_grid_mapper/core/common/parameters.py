@@ -134,6 +134,13 @@ class ModelParameters:
         0.1,
         1.5708,
     )
+    min_incidence_angle: float = constant(
+        0.31,
+        1.5708,
+        'Smallest incidence angle that a surface is found to have, as a smooth wall or glass: none is smaller than '
+        'max_incidence_angle if this is not.',
+        'rad',
+    )
     surface_offset: float = constant(
         0.3, 0.0, 'How far before the center of its cell the surface of an obstacle lies.', 'cells'
     )

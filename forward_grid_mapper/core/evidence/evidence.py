@@ -344,14 +344,12 @@ class Evidence:
         if self._sums is None or self._since is None:
             return None
         s, shape = self.state, self.grid.shape
-        window = self._since
-        for _ in range(2):
-            # what changed is seen in the normals around it, and these in the incidence angles around them
-            window = touched(window, self.grid)
-        normals = self._renewed(s, self._sums, window)
+        # what changed is seen in the normals around it, and these in the incidence angles around them
+        around = touched(touched(self._since, self.grid), self.grid)
+        normals = self._renewed(s, self._sums, around)
         differ = np.zeros(shape, np.uint8)
         sees = np.zeros(self._size, np.uint8)
-        find_changed(s, normals, window, differ, sees)
+        find_changed(s, normals, around, differ, sees)
         readings = np.flatnonzero(sees)
         window = box_of(s.cones[readings], self.grid)
         # nothing fails from here on: where there is no memory for pairs they are not stored
@@ -449,17 +447,20 @@ class Evidence:
     def _first_normals(self, end: int) -> None:
         """Learn from the first readings which way surfaces face, and up to which incidence they return echoes."""
         self._indexed = 0
-        normals = self._unit_normals(end)
+        normals, edges = self._unit_normals(end), edges_of(self.model)
+        self.state = self.state._replace(normals=normals)
+        if edges is None:
+            return
         whole = 0, self.grid.height, 0, self.grid.width
         slots = slots_of(normals, whole)
-        counts, edges = no_counts(slots), edges_of(self.model.max_incidence_angle)
+        counts = no_counts(slots)
         weights = np.ascontiguousarray(self.state.reading_states['multiplicity'][:end])
 
         def work(s: State, first: int, last: int, into: NDArray[np.int64]) -> None:
             count(s.cones, weights, normals, slots, whole, edges, (first, last), into, s.stop)
 
         self.summed(0, end, work, counts)
-        self.state = self.state._replace(normals=narrowed(normals, counts, slots, self.grid, whole))
+        narrowed(normals, counts, slots, edges, self.grid, whole)
 
     def _unit_normals(self, end: int) -> SurfaceNormals:
         sums = np.zeros((3, self.grid.size), np.int64) if self._sums is None else self._sums
@@ -473,13 +474,15 @@ class Evidence:
     def _renewed(self, s: State, sums: NDArray[np.int64], window: Window) -> SurfaceNormals:
         """Return the normals as they are with other sums and readings, which change them in a window alone."""
         around = touched(window, self.grid)
-        normals = renewed(s.normals, sums, self.grid, around)
+        normals, edges = renewed(s.normals, sums, self.grid, around), edges_of(self.model)
+        if edges is None:
+            return normals
         slots = slots_of(normals, around)
-        counts, edges = no_counts(slots), edges_of(self.model.max_incidence_angle)
+        counts = no_counts(slots)
         readings = np.flatnonzero(near(s.cones[: self._size], around))
         cones, weights = s.cones[readings], s.reading_states['multiplicity'][readings]
         count(cones, weights, normals, slots, around, edges, (0, len(cones)), counts, NEVER)
-        narrowed(normals, counts, slots, self.grid, window)
+        narrowed(normals, counts, slots, edges, self.grid, window)
         # around the window nothing changed
         outside = np.ones(self.grid.shape, np.bool_)
         outside[window[0] : window[1], window[2] : window[3]] = False

@@ -1,16 +1,16 @@
 """Up to which incidence each surface returns echoes: rough walls do from nearly anywhere, smooth ones and glass hardly.
 
 A surface that is heard from near its normal and missed beyond 20° is no gap: it is smooth. With one incidence angle for
-all surfaces, what went past it at 30° would speak against it. So of each cell whose normal is known, those readings
-that meet it within `PARTS` of the incidence angle of the model, and those that meet it beyond, are counted apart: echoes
-by how well their range agrees, with the weight w of `surface_normals`, and passes, readings that end beyond it, by the
-strength of their beam there. They are summed over the square of `NEIGHBOURHOOD` around the cell.
+all surfaces, what went past it at 30° would speak against it. So it may be one of three: the smallest and the largest
+of the model, and midway. For each cell whose normal is known, the readings in the three zones up to these are counted
+apart: echoes by how well their range agrees, with the weight w of `surface_normals`, and passes, readings that end
+beyond it, by the strength of their beam there. They are summed over the square of `NEIGHBOURHOOD` around the cell.
 
 Let a surface return the part r of the readings within a limit, and r' of those beyond. With e echoes and p passes
 
     log L(r) = e log r + p log (1 − r)        r = e / (e + p)
 
-and the limit is the part whose two rates are likelier by `GAIN` than one rate for all, and by the most. It counts only
+and the limit is the one whose two rates are likelier by `GAIN` than one rate for all, and by the most. It counts only
 where at least `LEAST_RATE` of the readings within are echoes, and `CONTRAST` times as large a part as of those beyond:
 of readings through an open door, few within are echoes, so all that passed it counts against a wall there.
 """
@@ -30,18 +30,18 @@ from ..common.constants import (
     GAIN,
     LEAST_RATE,
     NEIGHBOURHOOD,
-    PARTS,
     THROUGH,
     WEIGHT_CELL,
 )
 from ..common.grid import Grid, Window
+from ..common.parameters import ModelParameters
 from ..runtime.jit import kernel
 from .cone import rows_of, runs_of, strength
 from .cone_table import Cones, cone_of
 from .surface_normals import QUANTUM, SurfaceNormals, box_sums, touched
 
-ZONES = len(PARTS) + 1
-"""Zones of incidence that readings are counted in."""
+ZONES = 3
+"""Zones of incidence that readings are counted in: two that are a few degrees wider, or five, are about as good."""
 
 BLOCK = 2**14
 """Cells that are judged at once, which bounds the memory that it takes."""
@@ -62,9 +62,11 @@ def no_counts(slots: NDArray[np.int32]) -> NDArray[np.int64]:
     return np.zeros((2 * ZONES, int(slots.max(initial=-1)) + 1), np.int64)
 
 
-def edges_of(angle: float) -> NDArray[np.float64]:
-    """Return the squared cosines at which the zones end, shape (ZONES,)."""
-    out: NDArray[np.float64] = np.cos(np.array([*PARTS, 1.0]) * angle) ** 2
+def edges_of(model: ModelParameters) -> NDArray[np.float64] | None:
+    """Return the squared cosines at which the zones end, shape (ZONES,); None where all surfaces are alike."""
+    if model.min_incidence_angle >= model.max_incidence_angle:
+        return None
+    out: NDArray[np.float64] = np.cos(np.linspace(model.min_incidence_angle, model.max_incidence_angle, ZONES)) ** 2
     return out
 
 
@@ -168,7 +170,12 @@ def limits(counts: NDArray[np.float64]) -> NDArray[np.int64]:
 
 
 def narrowed(
-    normals: SurfaceNormals, counts: NDArray[np.int64], slots: NDArray[np.int32], grid: Grid, window: Window
+    normals: SurfaceNormals,
+    counts: NDArray[np.int64],
+    slots: NDArray[np.int32],
+    edges: NDArray[np.float64],
+    grid: Grid,
+    window: Window,
 ) -> SurfaceNormals:
     """Return the normals with lengths that state each surface's own incidence angle, in a window.
 
@@ -178,12 +185,11 @@ def narrowed(
         Of length one in the window; they are changed.
     counts, slots
         Of all cells that are `touched` by the window.
+    edges : float64, shape (ZONES,)
     grid : Grid
     window : first row, last one plus one, and columns likewise
     """
-    edges = edges_of(math.acos(math.sqrt(normals.cos2_limit)))
-    lengths = np.sqrt(normals.cos2_limit / edges)
-    lengths[-1] = 1.0
+    lengths = np.sqrt(edges[-1] / edges)
     bottom, top, left, right = window
     known, x, y, numbers = (array.reshape(grid.shape) for array in (normals.known, normals.x, normals.y, slots))
     step = max(BLOCK // max(right - left, 1), 1)

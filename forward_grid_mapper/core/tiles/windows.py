@@ -100,20 +100,20 @@ class Judged(NamedTuple):
 
 
 def found_normals(given: Given, parameters: Parameters) -> NDArray[np.float32]:
-    """Return the surface normals of the core, float32, shape (2, *core.shape), 0 where none is known; also how far off
-    them the surfaces return echoes."""
+    """Return x and y of the surface normals of the core, as of `SurfaceNormals`, float32, shape (2, *core.shape)."""
     box, angle = given.box, parameters.model.max_incidence_angle
     if angle >= NO_INCIDENCE_LIMIT:
         return np.zeros((2, *given.tile.core.shape), np.float32)
     sums = np.zeros((3, box.size), np.int64)
     cones = cone_table(given.readings, box, parameters.model)
     gather(cones, box.shape, (0, len(cones)), sums, NEVER)
-    normals = normals_of(sums, box, angle)
-    whole, weights = (0, box.height, 0, box.width), np.ones(len(cones), np.int32)
-    slots = slots_of(normals, whole)
-    counts = no_counts(slots)
-    count(cones, weights, normals, slots, whole, edges_of(angle), (0, len(cones)), counts, NEVER)
-    narrowed(normals, counts, slots, box, whole)
+    normals, edges = normals_of(sums, box, angle), edges_of(parameters.model)
+    if edges is not None:
+        whole, weights = (0, box.height, 0, box.width), np.ones(len(cones), np.int32)
+        slots = slots_of(normals, whole)
+        counts = no_counts(slots)
+        count(cones, weights, normals, slots, whole, edges, (0, len(cones)), counts, NEVER)
+        narrowed(normals, counts, slots, edges, box, whole)
     return np.stack([given.core(normals.x), given.core(normals.y)])
 
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from ..common.grid import Grid
 from ..common.parameters import ModelParameters, Parameters
 from ..common.readings import Readings
-from ..evidence.evidence import Evidence
+from ..evidence.evidence import NO_INCIDENCE_LIMIT, Evidence
 from ..maps.traversed import traversed_cells
 from ..search.search import Search
 from ..sensor.cone_table import grid_of
@@ -32,9 +32,10 @@ UNKNOWN = 0.06
 RESOLUTION = 0.1
 """Metres; matches are made on cells of one size, whatever size the maps are to have."""
 
-MODEL = {'p_hit': 0.7, 'p_rand': 0.4, 'p_lost': 0.42}
+MODEL = {'p_hit': 0.7, 'p_rand': 0.4, 'p_lost': 0.42, 'min_incidence_angle': NO_INCIDENCE_LIMIT}
 """The sensor model of matches, whatever that of the maps is. With it the errors that matches state are the real ones;
-that of the maps lets a reading say less, since a wall must not hang on one."""
+that of the maps lets a reading say less, since a wall must not hang on one. All surfaces have one incidence angle: with
+angles of their own, which take away what readings say, trajectories are a little worse."""
 
 
 class LocalMap(NamedTuple):

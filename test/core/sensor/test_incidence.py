@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import naive
-from forward_grid_mapper.core.common.constants import NEIGHBOURHOOD, PARTS, WEIGHT_CELL
+from forward_grid_mapper.core.common.constants import NEIGHBOURHOOD, WEIGHT_CELL
 from forward_grid_mapper.core.common.grid import Grid
 from forward_grid_mapper.core.common.parameters import ModelParameters
 from forward_grid_mapper.core.common.readings import Readings
@@ -29,7 +29,8 @@ from forward_grid_mapper.core.sensor.surface_normals import QUANTUM, SurfaceNorm
 from samples import random_readings
 
 GRID = Grid(0.1, -25, 0, 50, 40)
-MODEL = ModelParameters(sigma=0.05, p_hit=0.6, p_rand=0.1, p_lost=0.1, max_incidence_angle=0.7)
+MODEL = ModelParameters(sigma=0.05, p_hit=0.6, p_rand=0.1, p_lost=0.1, max_incidence_angle=0.7, min_incidence_angle=0.3)
+ANGLES = np.array([0.3, 0.5, 0.7])
 WHOLE = (0, GRID.height, 0, GRID.width)
 WALL = 3.0
 
@@ -58,7 +59,7 @@ def counted(
     readings: Readings, normals: SurfaceNormals, window: tuple[int, int, int, int] = WHOLE, weights: object = None
 ) -> tuple[np.ndarray, np.ndarray]:
     slots, cones = slots_of(normals, window), cone_table(readings, GRID, MODEL)
-    counts, edges = no_counts(slots), edges_of(MODEL.max_incidence_angle)
+    counts, edges = no_counts(slots), edges_of(MODEL)
     each = np.ones(len(cones), np.int32) if weights is None else weights
     count(cones, each, normals, slots, window, edges, (0, len(cones)), counts, NEVER)
     return counts, slots
@@ -84,7 +85,7 @@ ROW = round(WALL / 0.1) - GRID.row
 def test_what_is_counted_is_what_the_twin_counts(readings: Readings) -> None:
     normals = unit_normals(readings)
     counts, slots = counted(readings, normals)
-    expected = naive.met(readings, GRID, MODEL, normals, PARTS).reshape(2 * ZONES, -1)
+    expected = naive.met(readings, GRID, MODEL, normals, tuple(ANGLES)).reshape(2 * ZONES, -1)
     known = slots >= 0
     assert np.array_equal(known, normals.known > 0)
     assert known.sum() > 20
@@ -132,9 +133,8 @@ def test_limits_of_typical_surfaces() -> None:
 @pytest.mark.parametrize(('heard_up_to', 'zone'), [(0.65, 2), (0.49, 1), (0.25, 0)])
 def test_a_wall_has_the_incidence_angle_up_to_which_it_is_heard(heard_up_to: float, zone: int) -> None:
     told = limit_of(before_wall(heard_up_to, 0.95, 1200))[ROW, 15:35]
-    angles = MODEL.max_incidence_angle * np.array([*PARTS, 1.0])
     assert np.isfinite(told).sum() > 15
-    assert np.isclose(told, angles[zone], atol=1e-3).sum() > 0.8 * np.isfinite(told).sum()
+    assert np.isclose(told, ANGLES[zone], atol=1e-3).sum() > 0.8 * np.isfinite(told).sum()
 
 
 def test_a_place_through_which_readings_went_has_that_of_the_model() -> None:
@@ -147,21 +147,21 @@ def test_lengths_are_those_of_what_is_summed_around_a_cell() -> None:
     normals = unit_normals(readings)
     counts, slots = counted(readings, normals)
     dense = np.where(slots >= 0, counts[:, np.maximum(slots, 0)], 0).reshape(-1, *GRID.shape) * QUANTUM
-    made = narrowed(unit_normals(readings), counts, slots, GRID, WHOLE)
-    angles, seen = MODEL.max_incidence_angle * np.array([*PARTS, 1.0]), set()
+    made = narrowed(unit_normals(readings), counts, slots, edges_of(MODEL), GRID, WHOLE)
+    seen = set[int]()
     for c in np.flatnonzero(normals.known):
         row, column = divmod(int(c), GRID.width)
         rows, columns = slice(max(row - 1, 0), row + 2), slice(max(column - 1, 0), column + 2)
         around = dense[:, rows, columns].sum(axis=(1, 2)) * WEIGHT_CELL / NEIGHBOURHOOD
         zone = naive.incidence_limit(around[:ZONES], around[ZONES:])
-        length = math.cos(MODEL.max_incidence_angle) / math.cos(angles[zone])
+        length = math.cos(MODEL.max_incidence_angle) / math.cos(ANGLES[zone])
         assert made.x[c] == pytest.approx(normals.x[c] * length, abs=1e-6)
         assert made.y[c] == pytest.approx(normals.y[c] * length, abs=1e-6)
         seen.add(zone)
     assert seen == set(range(ZONES))
     # and of a part of the map they are what they are on the whole of it
     part = (20, 32, 10, 30)
-    again = narrowed(unit_normals(readings), counts, slots, GRID, part)
+    again = narrowed(unit_normals(readings), counts, slots, edges_of(MODEL), GRID, part)
     inside = (slice(*part[:2]), slice(*part[2:]))
     assert np.array_equal(again.x.reshape(GRID.shape)[inside], made.x.reshape(GRID.shape)[inside])
     again.x.reshape(GRID.shape)[inside] = normals.x.reshape(GRID.shape)[inside]
@@ -179,7 +179,7 @@ def test_a_smooth_wall_is_not_contradicted_by_readings_that_could_not_hear_it() 
 
     smooth = before_wall(0.25, 0.95)
     counts, slots = counted(smooth, unit_normals(smooth))
-    own = narrowed(unit_normals(smooth), counts, slots, GRID, WHOLE)
+    own = narrowed(unit_normals(smooth), counts, slots, edges_of(MODEL), GRID, WHOLE)
     assert gained_by_freeing(smooth, own) < gained_by_freeing(smooth, unit_normals(smooth))
 
 
