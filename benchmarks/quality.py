@@ -71,6 +71,7 @@ PLAIN: dict[str, Any] = {
 ABLATIONS: dict[str, dict[str, Any]] = {
     'surfaces before the centre': {'surface_offset': 0.0},
     'surface normals': {'max_incidence_angle': 1.5708},
+    'incidence angles of their own': {'min_incidence_angle': 1.5708},
     'prior for walls': NO_WALLS,
     'unknown': {'least_passed': 0.0},
     'walls that look any way (unknown)': {'least_noticed': 0.0},
