@@ -14,11 +14,11 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from .likelihood import Scan, scores
+from .likelihood import Scan
 from .local_map import LocalMap
 from .loops import APART, LENGTH, SHARED, Loop, Places, find_loop
 from .loops import REACH as LOOP_REACH
-from .matching import grid_around
+from .matching import grid_around, searched
 from .poses import Floats, compose, relative
 from .scans import FEWEST_ON_MAP, Scans
 
@@ -42,9 +42,11 @@ ON_MAP = 6000
 
 REACH = np.array([5.0, 5.0, math.radians(10.0)])
 STEPS = (0.2, 0.2, math.radians(2.5))
-ASKED, FOLLOWED = (60, 600), 600
-"""Readings that are asked at all poses of the search and at the best of them, and how many these are."""
+ASKED = 600
+STAGES = ((15, 1.0), (30, 0.3), (60, 0.1), (ASKED, 0.02))
+"""Readings that are asked by the end of each stage of the search, and at what part of the poses."""
 
+LAST = ((ASKED, 1.0),)
 FINER = ((0.1, 0.1, math.radians(1.2)), (0.05, 0.05, math.radians(0.6)))
 
 MOVED = 0.5
@@ -136,14 +138,10 @@ def displaced(scans: Scans, nodes: Floats, stretch: NDArray[np.int64]) -> Floats
 
 def _searched(joint: Scan, around: LocalMap) -> Floats:
     """Return the best pose of a stretch around where it is."""
-    mixed = joint.readings[np.random.default_rng(0).permutation(len(joint.readings))]
-    few, more = (Scan(mixed[:asked], joint.weight) for asked in ASKED)
-    poses = grid_around(np.zeros(3), REACH, STEPS)
-    poses = poses[np.argsort(-scores(few, around, poses), kind='stable')[:FOLLOWED]]
-    best: Floats = poses[int(scores(more, around, poses).argmax())]
-    for steps in FINER:
-        near = grid_around(best, 2.0 * np.array(steps), steps)
-        best = near[int(scores(more, around, near).argmax())]
+    best = np.zeros(3)
+    for reach, steps, stages in ((REACH, STEPS, STAGES), *((2.0 * np.array(steps), steps, LAST) for steps in FINER)):
+        poses = grid_around(best, reach, steps)
+        best = poses[int(searched(joint, around, poses, np.zeros(len(poses)), stages).argmax())]
     return best
 
 
