@@ -46,14 +46,15 @@ LEAST = np.array([0.2, 0.2, math.radians(3.0)])
 
 STEPS = (0.15, 0.15, math.radians(2.5))
 
-STAGES = ((6, 1.0), (12, 0.5), (24, 0.2), (60, 0.08))
-"""Readings that the search asks by the end of each stage, and at what part of the poses."""
-
 SHARED = 4
 """Windows between places, so that blocks, and each time the robot comes by, share maps."""
 
 MEASURED = 150
 """Readings that measure the best pose of the search."""
+
+STAGES = ((6, 1.0), (12, 0.5), (24, 0.2), (60, 0.08), (MEASURED, 0.02))
+"""Readings that the search asks by the end of each stage, and at what part of the poses: in the end as many at the best
+ones of other places as measure the best of all, for these are compared."""
 
 GOOD = 0.65
 """Part of the usual score of a reading that a loop must have."""
@@ -64,7 +65,7 @@ OTHER = 0.45
 TOLD = 8.0
 """σ² by which another place must differ in what is measured at the best one: along a bare corridor none does."""
 
-CLEAR = 12.0
+CLEAR = 24.0
 """Nats by which the best pose must be better than any of another place."""
 
 CANDIDATES = 2

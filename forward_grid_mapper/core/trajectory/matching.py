@@ -36,10 +36,10 @@ FARTHEST_TOP = 2.0
 ENOUGH = 32
 """Readings that measure a pose: more of a short piece of the drive tell little more, and take time."""
 
-CLIMBS, ON_TOP = 3, 0.1
+CLIMBS, ON_TOP = 3, 0.3
 """Parabolas that a pose is moved to the top of at the most, and steps within which it is there."""
 
-FEWEST_FOLLOWED = 100
+FEWEST_FOLLOWED = 30
 """Poses at which every stage of a search asks at the least."""
 
 EVENLY = (math.sqrt(5.0) - 1.0) / 2.0
