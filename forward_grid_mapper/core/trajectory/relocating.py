@@ -42,11 +42,9 @@ ON_MAP = 6000
 
 REACH = np.array([5.0, 5.0, math.radians(10.0)])
 STEPS = (0.2, 0.2, math.radians(2.5))
-ASKED = 600
-STAGES = ((15, 1.0), (30, 0.3), (60, 0.1), (ASKED, 0.02))
-"""Readings that are asked by the end of each stage of the search, and at what part of the poses."""
+STAGES, LAST = ((15, 1.0), (30, 0.3), (60, 0.1), (600, 0.02)), ((600, 1.0),)
+"""Stages of the search, and of the finer ones around what it finds, as in `matching.searched`."""
 
-LAST = ((ASKED, 1.0),)
 FINER = ((0.1, 0.1, math.radians(1.2)), (0.05, 0.05, math.radians(0.6)))
 
 MOVED = 0.5
@@ -145,8 +143,8 @@ def displaced(scans: Scans, nodes: Floats, stretch: NDArray[np.int64], usual: fl
 
 def _searched(joint: Scan, around: LocalMap) -> Floats:
     """Return the best pose of a stretch around where it is."""
-    best = np.zeros(3)
-    for reach, steps, stages in ((REACH, STEPS, STAGES), *((2.0 * np.array(steps), steps, LAST) for steps in FINER)):
+    best, finer = np.zeros(3), [(2.0 * np.array(steps), steps, LAST) for steps in FINER]
+    for reach, steps, stages in ((REACH, STEPS, STAGES), *finer):
         poses = grid_around(best, reach, steps)
         best = poses[int(searched(joint, around, poses, np.zeros(len(poses)), stages).argmax())]
     return best
