@@ -65,7 +65,7 @@ OTHER = 0.45
 TOLD = 8.0
 """σ² by which another place must differ in what is measured at the best one: along a bare corridor none does."""
 
-CLEAR = 24.0
+CLEAR = 16.0
 """Nats by which the best pose must be better than any of another place."""
 
 CANDIDATES = 2
