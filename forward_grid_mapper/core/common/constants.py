@@ -99,6 +99,20 @@ LED_ON = 0.3
 without readings having noticed it. With less, doors that one sweep looked through are shut, with more, more of what
 lies behind holes in walls is free. With `FREE_MARGIN` it is less than the margin of tiles, half of `LONGEST_GAP`."""
 
+STANDS_OFF = 0.3
+"""Metres before a cell from where on what is occupied does not stand in its way: it is of the same wall."""
+
+LEAST_FREE_WAY = 0.33
+"""Part of the echoes around a cell that must have come on a free way for it to be no mirror image. With a quarter as with
+a half F1 is within 0.001, and with more than 0.6 true walls go."""
+
+LEAST_STRENGTH = 0.25
+"""Of a beam at a cell, for it to have passed there on a free way."""
+
+IMAGE_AROUND = 0.45
+"""Metres around a cell whose echoes decide about it, less than the margin of tiles, half of `LONGEST_GAP`. With less,
+cells of true walls go where they are seen past a corner."""
+
 LEAST_EVIDENCE = 0.1
 """Nats, either way, from which on a cell counts as observed though the maximum likelihood map does not know it."""
 

@@ -7,12 +7,14 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..common.constants import EXTENSION
+from ..common.constants import EXTENSION, FREE_MARGIN
+from ..common.grid import UNKNOWN
 from ..common.parameters import SearchParameters
 from ..evidence.evidence import Evidence
 from ..search.prior import has_walls
 from .free_space import expected_passes
-from .post_processing import post_process
+from .free_ways import mirror_images, not_passed
+from .post_processing import grown, post_process
 from .uncertainty import uncertainty_map
 
 
@@ -38,5 +40,14 @@ def hand_out(evidence: Evidence, search: SearchParameters, traversed: NDArray[np
     passes = expected_passes(evidence, evidence.state.maps.occupied) if walls or search.least_passed > 0 else None
     extension = EXTENSION if walls else 0.0
     ml = post_process(evidence, extension, search.least_passed, search.least_noticed, traversed, passes)
-    told = passes if walls else None
-    return HandedOut(ml, uncertainty_map(evidence.of_occupancy(), told, ml, traversed, search))
+    if not walls:
+        return HandedOut(ml, uncertainty_map(evidence.of_occupancy(), None, ml, traversed, search))
+    images = mirror_images(evidence) & (ml == 1)
+    if search.least_passed > 0:
+        free = ml == 0
+        passed = free & ~not_passed(evidence, free & ~traversed)
+        ml[free & ~grown(passed, FREE_MARGIN, evidence)] = UNKNOWN
+    ml[images] = UNKNOWN
+    uncertainty = uncertainty_map(evidence.of_occupancy(), passes, ml, traversed, search)
+    uncertainty[images] = np.nan
+    return HandedOut(ml, uncertainty)

@@ -44,6 +44,13 @@ def _cells(length: float, evidence: Evidence) -> int:
     return max(round(length / evidence.grid.resolution), 1)
 
 
+def grown(cells: NDArray[np.bool_], length: float, evidence: Evidence) -> NDArray[np.bool_]:
+    """Return cells and what lies within a length of them, metres."""
+    for _ in range(_cells(length, evidence)):
+        cells = _grown(cells)
+    return cells
+
+
 def led_on(known: NDArray[np.bool_], passed: NDArray[np.bool_], steps: int) -> NDArray[np.bool_]:
     """Return the cells known to be free, and so many steps on through cells that readings passed."""
     for _ in range(steps):
@@ -93,7 +100,5 @@ def post_process(
         extend(evidence.state, steps, barred.astype(np.uint8).ravel(), ahead.ravel())
         ml[ahead == 1] = 1
     if least_passed > 0:
-        for _ in range(_cells(FREE_MARGIN, evidence)):
-            known = _grown(known)
-        ml[(ml == 0) & ~known] = -1
+        ml[(ml == 0) & ~grown(known, FREE_MARGIN, evidence)] = -1
     return ml
