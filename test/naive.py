@@ -14,8 +14,10 @@ from forward_grid_mapper.core.common.constants import (
     FEW_READINGS,
     GAIN,
     LEAST_RATE,
+    LEAST_STRENGTH,
     LED_ON,
     MOST_AGAINST_EXTENSION,
+    STANDS_OFF,
     STRAIGHT_RUN,
 )
 from forward_grid_mapper.core.common.grid import Grid
@@ -405,6 +407,48 @@ def incidence_limit(echoes: np.ndarray, passes: np.ndarray) -> int:
         if gained > best and rate(*within) >= max(LEAST_RATE, CONTRAST * rate(*beyond)):
             best, zone = gained, k - 1
     return zone
+
+
+def on_free_way(grid: Grid, occupied: np.ndarray, apex: tuple[float, float], c: int, before: float) -> bool:
+    """Whether no occupied cell lies on the way from a sensor to `before` metres before cell c."""
+    xs, ys = grid.centers()
+    dx, dy = xs[c % grid.width] - apex[0], ys[c // grid.width] - apex[1]
+    d = math.hypot(dx, dy)
+    steps = np.arange(0.5, max((d - before) / grid.resolution, 0.0) - 1e-9, 0.5) * grid.resolution
+    for at in steps:
+        rows, columns = grid.cells_of(np.array([apex[0] + dx / d * at]), np.array([apex[1] + dy / d * at]))
+        row, column = int(rows[0]), int(columns[0])
+        if 0 <= row < grid.height and 0 <= column < grid.width and occupied.ravel()[row * grid.width + column]:
+            return False
+    return True
+
+
+def explained_echoes(readings: Readings, grid: Grid, occupied: np.ndarray, model: ModelParameters) -> np.ndarray:
+    """Echoes that occupied cells explain, those on a free way and all, shape (2, cells): that of `free_ways`."""
+    out = np.zeros((2, grid.size))
+    for t in np.flatnonzero(readings.z < readings.z_max):
+        sigma = sigma_of(readings, t, grid, model)
+        for c, d in cells_of(readings, t, grid, model).items():
+            error = (d - readings.z[t]) / sigma
+            if occupied.ravel()[c] and abs(error) < THROUGH:
+                out[1, c] += math.exp(-0.5 * error**2)
+                if on_free_way(grid, occupied, (readings.x[t], readings.y[t]), c, STANDS_OFF):
+                    out[0, c] += math.exp(-0.5 * error**2)
+    return out
+
+
+def never_passed(
+    readings: Readings, grid: Grid, occupied: np.ndarray, model: ModelParameters, cells: np.ndarray
+) -> np.ndarray:
+    """Which of some cells no reading passed on a free way, shape `grid.shape`: that of `free_ways`."""
+    out = cells.copy()
+    for t in range(len(readings)):
+        sigma = sigma_of(readings, t, grid, model)
+        for c, d in cells_of(readings, t, grid, model).items():
+            here = d <= readings.z[t] - THROUGH * sigma and strength(readings, t, grid, c) >= LEAST_STRENGTH
+            if here and on_free_way(grid, occupied, (readings.x[t], readings.y[t]), c, grid.resolution):
+                out.ravel()[c] = False
+    return out
 
 
 def passed(

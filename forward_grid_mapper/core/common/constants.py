@@ -103,8 +103,8 @@ STANDS_OFF = 0.3
 """Metres before a cell from where on what is occupied does not stand in its way: it is of the same wall."""
 
 LEAST_FREE_WAY = 0.33
-"""Part of the echoes around a cell that must have come on a free way for it to be no mirror image. With a quarter as with
-a half F1 is within 0.001, and with more than 0.6 true walls go."""
+"""Part of the echoes around a cell that must have come on a free way for it to be no mirror image. With a quarter as
+with a half F1 is within 0.001, and with more than 0.6 true walls go."""
 
 LEAST_STRENGTH = 0.25
 """Of a beam at a cell, for it to have passed there on a free way."""

@@ -1,0 +1,138 @@
+"""What sound came to on a free way: mirror images behind walls, and free space that nothing passed."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+import naive
+from forward_grid_mapper.core.common.constants import IMAGE_AROUND, LEAST_FREE_WAY
+from forward_grid_mapper.core.common.grid import Grid
+from forward_grid_mapper.core.common.parameters import ModelParameters, Parameters
+from forward_grid_mapper.core.common.readings import Readings
+from forward_grid_mapper.core.evidence.evidence import Evidence
+from forward_grid_mapper.core.mapping import Mapper
+from forward_grid_mapper.core.maps.free_ways import UNIT, add_echoes, mirror_images, not_passed, square_sums
+from forward_grid_mapper.core.runtime import threads
+from samples import random_readings
+
+GRID = Grid(0.1, 0, 0, 30, 26)
+MODEL = ModelParameters(sigma=0.06, surface_offset=0.3)
+
+
+def made(readings: Readings, occupied: np.ndarray, **options: object) -> Evidence:
+    evidence = Evidence(GRID, MODEL, start=occupied.astype(np.uint8).reshape(GRID.shape), **options)
+    evidence.extend(readings)
+    return evidence
+
+
+def some(seed: int, filled: float = 0.08) -> tuple[Readings, np.ndarray]:
+    """Readings off the lattice, so that no way leads through a corner of cells, and a map."""
+    rng = np.random.default_rng(seed)
+    readings = random_readings(rng, GRID, 60, z_max=2.0)
+    readings.x[:] += 0.00123
+    readings.y[:] -= 0.00077
+    return readings, rng.random(GRID.size) < filled
+
+
+@pytest.mark.parametrize('seed', range(6))
+def test_echoes_and_passes_are_those_of_the_twin(seed: int) -> None:
+    readings, occupied = some(seed)
+    evidence = made(readings, occupied)
+    echoes = np.zeros((2, GRID.size), np.int64)
+    add_echoes(evidence.state, 0, len(readings), evidence.state.maps.occupied, 3.0, echoes)
+    expected = naive.explained_echoes(readings, GRID, occupied, MODEL)
+    assert np.abs(echoes * UNIT - expected).max() < 1e-4
+    assert 0 < expected[0].sum() < expected[1].sum()
+    free = ~occupied.reshape(GRID.shape)
+    told = not_passed(evidence, free)
+    assert np.array_equal(told, naive.never_passed(readings, GRID, occupied, MODEL, free))
+    assert 0 < told.sum() < free.sum()
+    twice = made(readings, occupied)
+    twice.add_multiplicity(np.arange(len(readings)))
+    doubled = np.zeros_like(echoes)
+    add_echoes(twice.state, 0, len(readings), twice.state.maps.occupied, 3.0, doubled)
+    assert np.abs(doubled - 2 * echoes).max() <= len(readings)
+
+
+def test_a_mirror_image_is_what_few_echoes_around_came_to_on_a_free_way() -> None:
+    seen = 0
+    for seed in range(6):
+        readings, occupied = some(seed, 0.12)
+        free, total = naive.explained_echoes(readings, GRID, occupied, MODEL).reshape(2, *GRID.shape)
+        told, n = mirror_images(made(readings, occupied)), round(IMAGE_AROUND / GRID.resolution)
+        for row, column in np.ndindex(GRID.shape):
+            part = slice(max(row - n, 0), row + n + 1), slice(max(column - n, 0), column + n + 1)
+            least = LEAST_FREE_WAY * total[part].sum()
+            if abs(free[part].sum() - least) > 1e-4:
+                assert told[row, column] == (free[part].sum() < least)
+        seen += told.sum()
+    assert seen > 20
+
+
+@pytest.mark.parametrize('cells', [0, 1, 4, 40])
+def test_sums_are_over_squares(cells: int) -> None:
+    values = np.random.default_rng(0).integers(0, 2**40, (9, 12))
+    told = square_sums(values, cells)
+    for row, column in np.ndindex(values.shape):
+        part = slice(max(row - cells, 0), row + cells + 1), slice(max(column - cells, 0), column + cells + 1)
+        assert told[row, column] == values[part].sum()
+
+
+def test_threads_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    readings, occupied = some(1, 0.15)
+    one = mirror_images(made(readings, occupied))
+    monkeypatch.setattr(threads, 'LEAST_PART', 20)
+    assert one.any()
+    assert np.array_equal(mirror_images(made(readings, occupied, threads=3)), one)
+
+
+def along_a_mirror() -> Readings:
+    """A robot between a smooth wall at y = 2 and a rough one at y = 0, which beams at a slant hear in the mirror."""
+    x, yaw = (values.ravel() for values in np.meshgrid(np.arange(0.5, 6.0, 0.05), np.radians(np.arange(-90, 91, 7.5))))
+    up, away = yaw > 0, np.abs(np.sin(yaw))
+    square = np.abs(np.abs(yaw) - math.pi / 2) < math.radians(20)
+    with np.errstate(divide='ignore'):
+        z = np.where(up, np.where(square, 1.0, 3.0), 1.0) / away
+    return Readings.from_columns(
+        ('',),
+        x=x,
+        y=np.full(x.shape, 1.0),
+        yaw=yaw,
+        z=np.minimum(z, 4.0),
+        z_max=4.0,
+        half_angle=math.radians(7.5),
+        sigma=0.03,
+    )
+
+
+def test_what_is_heard_in_a_smooth_wall_is_not_mapped_behind_it() -> None:
+    maps = Mapper(Parameters()).run(along_a_mirror())
+    xs, ys = maps.grid.centers()
+    along = (xs > 1.0) & (xs < 5.0)
+
+    def at(y: float) -> np.ndarray:
+        return maps.ml[np.abs(ys - y) < 0.16][:, along] == 1
+
+    assert at(2.0).any(axis=0).mean() > 0.9, 'the mirror itself'
+    assert at(0.0).any(axis=0).mean() > 0.9, 'what is mirrored'
+    behind = (ys > 2.3)[:, None] & along
+    assert (maps.searched[behind] == 1).sum() > 10, 'the search has no other cause for these echoes'
+    assert (maps.ml[behind] == -1).all()
+    assert np.isnan(maps.uncertainty[behind & (maps.searched == 1)]).all()
+
+
+def test_a_wall_behind_a_wall_that_was_seen_from_its_own_side_stays() -> None:
+    drive = along_a_mirror()
+    beyond = drive.select(drive.yaw < 0)
+    beyond.y[:] += 2.0
+    columns = ('x', 'y', 'yaw', 'z', 'z_max', 'half_angle', 'sigma')
+    both = Readings.from_columns(
+        ('',), **{name: np.concatenate([getattr(drive, name), getattr(beyond, name)]) for name in columns}
+    )
+    maps = Mapper(Parameters()).run(both)
+    xs, ys = maps.grid.centers()
+    wall = maps.ml[np.abs(ys - 2.0) < 0.16][:, (xs > 1.0) & (xs < 5.0)] == 1
+    assert wall.any(axis=0).mean() > 0.9
