@@ -13,6 +13,8 @@ from forward_grid_mapper.core.common.constants import (
     FEW_ECHOES,
     FEW_READINGS,
     GAIN,
+    IMAGE_AROUND,
+    LEAST_FREE_WAY,
     LEAST_RATE,
     LEAST_STRENGTH,
     LED_ON,
@@ -437,6 +439,18 @@ def explained_echoes(readings: Readings, grid: Grid, occupied: np.ndarray, model
     return out
 
 
+def mirror_images(
+    readings: Readings, grid: Grid, occupied: np.ndarray, model: ModelParameters, cells: np.ndarray
+) -> np.ndarray:
+    """Which of some cells are mirror images, shape `grid.shape`: that of `free_ways`."""
+    free, total = explained_echoes(readings, grid, occupied, model).reshape(2, *grid.shape)
+    out, n = np.zeros(grid.shape, bool), round(IMAGE_AROUND / grid.resolution)
+    for row, column in np.argwhere(cells):
+        part = slice(max(row - n, 0), row + n + 1), slice(max(column - n, 0), column + n + 1)
+        out[row, column] = free[part].sum() < LEAST_FREE_WAY * total[part].sum()
+    return out
+
+
 def never_passed(
     readings: Readings, grid: Grid, occupied: np.ndarray, model: ModelParameters, cells: np.ndarray
 ) -> np.ndarray:
@@ -603,4 +617,8 @@ def handed_out(
     ahead = drawn_out(occupied.reshape(grid.shape), told, seen, steps, through)
     ml[ahead == 1] = 1
     ml[(ml == 0) & (box_sum(known.astype(int)) == 0)] = -1
+    images = mirror_images(readings, grid, occupied, model, ml == 1)
+    sure = (ml == 0) & ~never_passed(readings, grid, occupied, model, (ml == 0) & ~traversed)
+    ml[(ml == 0) & (box_sum(sure.astype(int)) == 0)] = -1
+    ml[images] = -1
     return ml

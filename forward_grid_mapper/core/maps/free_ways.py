@@ -109,19 +109,27 @@ def take_out_passed(s: State, end: int, occupied: Any, cells: Any) -> None:
                     cells[c] = not on_free_way(reading, u, v, distance - 1.0, occupied, s.lattice)
 
 
-def square_sums(values: NDArray[np.int64], cells: int) -> NDArray[np.int64]:
-    """Return the sums over so many cells around each, shape (height, width); nothing is added from off the grid."""
-    for axis in (0, 1):
-        before = np.zeros_like(values.take([0], axis))
-        sums = np.concatenate([before, np.cumsum(values, axis)], axis)
-        at = np.arange(values.shape[axis])
-        upper = np.minimum(at + cells + 1, values.shape[axis])
-        values = sums.take(upper, axis) - sums.take(np.maximum(at - cells, 0), axis)
-    return values
+@kernel
+def keep_images(echoes: Any, cells: Any, around: int) -> None:
+    """Unset those `cells` (bool, shape (height, width)) that are no mirror images.
+
+    `echoes` are those of `add_echoes`, shape (2, height, width), `around` how many cells on each side count.
+    """
+    height, width = cells.shape
+    for row in range(height):
+        for column in range(width):
+            if not cells[row, column]:
+                continue
+            free, total = 0, 0
+            for i in range(max(row - around, 0), min(row + around + 1, height)):
+                for j in range(max(column - around, 0), min(column + around + 1, width)):
+                    free += echoes[0, i, j]
+                    total += echoes[1, i, j]
+            cells[row, column] = free < LEAST_FREE_WAY * total
 
 
-def mirror_images(evidence: Evidence) -> NDArray[np.bool_]:
-    """Return where what is occupied is a mirror image, shape `grid.shape`; False where no echo is explained."""
+def mirror_images(evidence: Evidence, cells: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return those of some cells, shape `grid.shape`, that are mirror images, by the map that the search found."""
     occupied, grid = evidence.state.maps.occupied, evidence.grid
     echoes = np.zeros((2, grid.size), np.int64)
 
@@ -129,10 +137,9 @@ def mirror_images(evidence: Evidence) -> NDArray[np.bool_]:
         add_echoes(s, begin, end, occupied, STANDS_OFF / grid.resolution, own)
 
     evidence.summed(0, len(evidence), work, echoes)
-    cells = round(IMAGE_AROUND / grid.resolution)
-    free, all_of_them = (square_sums(row.reshape(grid.shape), cells) for row in echoes)
-    out: NDArray[np.bool_] = free < LEAST_FREE_WAY * all_of_them
-    return out
+    images = cells.copy()
+    keep_images(echoes.reshape(2, *grid.shape), images, round(IMAGE_AROUND / grid.resolution))
+    return images
 
 
 def not_passed(evidence: Evidence, cells: NDArray[np.bool_]) -> NDArray[np.bool_]:

@@ -42,7 +42,7 @@ def hand_out(evidence: Evidence, search: SearchParameters, traversed: NDArray[np
     ml = post_process(evidence, extension, search.least_passed, search.least_noticed, traversed, passes)
     if not walls:
         return HandedOut(ml, uncertainty_map(evidence.of_occupancy(), None, ml, traversed, search))
-    images = mirror_images(evidence) & (ml == 1)
+    images = mirror_images(evidence, ml == 1)
     if search.least_passed > 0:
         free = ml == 0
         passed = free & ~not_passed(evidence, free & ~traversed)
