@@ -70,6 +70,39 @@ def test_in_portions_with_normals_renewed_all_is_as_if_at_once(seed: int, memory
         assert evidence.state.pairs.cell.nbytes <= memory
 
 
+@pytest.mark.parametrize('seed', range(6))
+def test_where_little_came_no_less_is_renewed_than_changes(seed: int) -> None:
+    wide = Grid(0.1, -60, 12, 120, 24)
+    rng = np.random.default_rng(seed)
+    first, later = along_wall(900, seed), along_wall(12, seed + 100)
+    first.x[:] = rng.uniform(-4.5, 4.5, len(first))
+    later.x[:] = rng.uniform(0.0, 0.2, len(later))
+    later.yaw[:] = math.pi / 2 + rng.uniform(-0.6, 0.6, len(later))
+    # so short that what they change lies in a small part of the map
+    for readings, far in ((first, 2.5), (later, 1.6)):
+        readings.z_max[:] = far
+        readings.z[:] = np.minimum(readings.z, far)
+    whole, evidence = Evidence(wide, MODEL, renewable=True), Evidence(wide, MODEL, renewable=True)
+    for readings in (first, later):
+        evidence.extend(readings)
+    before = evidence.state.normals
+    evidence.renew_normals()
+    whole.extend(
+        Readings.from_columns(
+            first.sensor_names,
+            **{
+                name: np.concatenate([getattr(first, name), getattr(later, name)])
+                for name in ('x', 'y', 'yaw', 'z', 'z_max', 'half_angle', 'sigma')
+            },
+        )
+    )
+    after = evidence.state.normals
+    changed = np.flatnonzero((after.x != before.x) | (after.y != before.y))
+    assert 0 < len(changed) < 0.5 * after.known.sum()
+    assert same_normals(evidence, whole)
+    assert snapshot(evidence, logs=False) == snapshot(whole, logs=False)
+
+
 def test_readings_that_are_merged_tell_of_normals_again() -> None:
     readings = along_wall(60)
     whole, merged = Evidence(GRID, MODEL), Evidence(GRID, MODEL, renewable=True)
