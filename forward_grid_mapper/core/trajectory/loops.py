@@ -17,8 +17,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from .likelihood import Scan, scores
 from .local_map import LocalMap
-from .matching import climbed, grid_around, measure, searched
+from .matching import grid_around, measure
 from .passes import FEWEST, Found, Progress
 from .poses import Floats, axes_at, compose, relative, wrapped
 from .scans import FEWEST_ON_MAP, Scans
@@ -46,15 +47,20 @@ LEAST = np.array([0.2, 0.2, math.radians(3.0)])
 
 STEPS = (0.15, 0.15, math.radians(2.5))
 
+ASKED = 60
+"""Readings that the search asks."""
+
+FIRST_ASKED, FOLLOWED = 12, 0.1
+"""Readings that it asks at all poses of a large search first, and the part of the poses where it asks the others."""
+
+LARGE = 300
+"""Poses of a large search."""
+
 SHARED = 4
 """Windows between places, so that blocks, and each time the robot comes by, share maps."""
 
 MEASURED = 150
 """Readings that measure the best pose of the search."""
-
-STAGES = ((6, 1.0), (12, 0.5), (24, 0.2), (60, 0.08), (MEASURED, 0.02))
-"""Readings that the search asks by the end of each stage, and at what part of the poses: in the end as many at the best
-ones of other places as measure the best of all, for these are compared."""
 
 GOOD = 0.65
 """Part of the usual score of a reading that a loop must have."""
@@ -65,8 +71,11 @@ OTHER = 0.45
 TOLD = 8.0
 """σ² by which another place must differ in what is measured at the best one: along a bare corridor none does."""
 
-CLEAR = 16.0
+CLEAR = 12.0
 """Nats by which the best pose must be better than any of another place."""
+
+CLIMBS = 3
+"""Parabolas that the best pose of the search is moved to the top of."""
 
 CANDIDATES = 2
 """Places that a block is looked for at, at the most."""
@@ -134,6 +143,17 @@ def candidates(
     return out
 
 
+def searched(joint: Scan, around: LocalMap, poses: Floats, prior: Floats) -> Floats:
+    """Return Σ log ratio at each pose, shape (P,); of a large search only roughly where it is low."""
+    asked = FIRST_ASKED if len(poses) > LARGE else ASKED
+    values = scores(joint, around, poses, max(len(joint.readings) // asked, 1))
+    if len(poses) > LARGE:
+        count = max(int(FOLLOWED * len(poses)), LARGE)
+        best = np.argpartition(prior - values, count - 1)[:count]
+        values[best] = scores(joint, around, poses[best], max(len(joint.readings) // ASKED, 1))
+    return values
+
+
 def find_loop(
     scans: Scans, block: NDArray[np.int64], nodes: Floats, place: int, sigma: Floats, around: LocalMap, usual: float
 ) -> Loop | None:
@@ -146,8 +166,12 @@ def find_loop(
     poses = grid_around(guess, reach, STEPS)
     off = relative(guess, poses)
     prior = 0.5 * ((off / np.maximum(sigma, LEAST / 2)) ** 2).sum(1)
-    values = searched(joint, around, poses, prior, STAGES)
-    best, final = climbed(joint, around, poses[int((values - prior).argmax())], MEASURED)
+    values = searched(joint, around, poses, prior)
+    total = values - prior
+    best = poses[int(total.argmax())]
+    for _ in range(CLIMBS):
+        best = measure(joint, around, best, MEASURED).pose
+    final = measure(joint, around, best, MEASURED)
     count = len(joint.readings)
     if final.score < GOOD * usual * count:
         return None

@@ -6,16 +6,12 @@ Near a pose the log-likelihood ratio is taken as a parabola through 27 poses aro
 
 whose top is the measured pose, with the information H. Directions in which the parabola is not curved, as along a bare
 corridor, are not measured.
-
-Far from any guess, poses of a grid are searched: a few readings are asked at all of them, and ever more where these say
-most, as most poses are plainly wrong.
 """
 
 from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -36,15 +32,6 @@ FARTHEST_TOP = 2.0
 ENOUGH = 32
 """Readings that measure a pose: more of a short piece of the drive tell little more, and take time."""
 
-CLIMBS, ON_TOP = 3, 0.3
-"""Parabolas that a pose is moved to the top of at the most, and steps within which it is there."""
-
-FEWEST_FOLLOWED = 30
-"""Poses at which every stage of a search asks at the least."""
-
-EVENLY = (math.sqrt(5.0) - 1.0) / 2.0
-"""Part of a circle after which points on it, one after the other, always lie about evenly: the golden section."""
-
 COARSE = (0.1, 0.1, math.radians(2.5))
 """Steps of a search: metres ahead and aside, radians."""
 
@@ -61,10 +48,6 @@ def _parabola() -> Floats:
 
 
 _PARABOLA = _parabola()
-
-
-Stages = Sequence[tuple[int, float]]
-"""Stages of a search: how many readings are asked by the end of each, and at what part of the poses."""
 
 
 class Match(NamedTuple):
@@ -98,43 +81,6 @@ def measure(scan: Scan, around: LocalMap, pose: Floats, most: int = ENOUGH) -> M
     # those asked tell no more than they are, though they stand for all in the score
     information: Floats = (axes * curvature) @ axes.T / np.outer(CURVED, CURVED) / stride
     return Match(pose + top * CURVED, information, float(values[13]))
-
-
-def climbed(scan: Scan, around: LocalMap, pose: Floats, most: int = ENOUGH) -> tuple[Floats, Match]:
-    """Return the top near a pose, and the match there."""
-    match = measure(scan, around, pose, most)
-    for _ in range(CLIMBS):
-        if np.abs((match.pose - pose) / CURVED).max() < ON_TOP:
-            break
-        pose, match = match.pose, measure(scan, around, match.pose, most)
-    return pose, match
-
-
-def searched(scan: Scan, around: LocalMap, poses: Floats, prior: Floats, stages: Stages) -> Floats:
-    """Return Σ log ratio at each pose, shape (P,), in nats; only roughly where it is low.
-
-    Parameters
-    ----------
-    scan : Scan
-    around : LocalMap
-    poses : float64, shape (P, 3)
-    prior : float64, shape (P,)
-        What speaks against each pose a priori, nats: it counts where the best ones are followed.
-    stages : sequence of (int, float)
-        How many readings are asked by the end of each stage, and at what part of the poses.
-    """
-    count = len(scan.readings)
-    # the first of them, however many, are spread over all of the scan
-    mixed = scan.readings[np.argsort(np.arange(count) * EVENLY % 1.0)]
-    total, values, which, asked = np.zeros(len(poses)), np.zeros(len(poses)), np.arange(len(poses)), 0
-    for until, part in stages:
-        follow = max(int(part * len(poses)), FEWEST_FOLLOWED)
-        if follow < len(which):
-            which = which[np.argpartition((prior - values)[which], follow - 1)[:follow]]
-        total[which] += scores(Scan(mixed[asked:until], scan.weight), around, poses[which])
-        values[which] = total[which] * count / min(until, count)
-        asked = until
-    return values
 
 
 def grid_around(center: Floats, reach: Floats, steps: tuple[float, float, float] = COARSE) -> Floats:

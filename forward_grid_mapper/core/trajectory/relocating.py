@@ -18,7 +18,7 @@ from .likelihood import Scan, scores
 from .local_map import LocalMap
 from .loops import APART, LENGTH, SHARED, Loop, Places, find_loop
 from .loops import REACH as LOOP_REACH
-from .matching import grid_around, searched
+from .matching import grid_around
 from .poses import Floats, compose, relative
 from .scans import FEWEST_ON_MAP, Scans
 
@@ -42,8 +42,8 @@ ON_MAP = 6000
 
 REACH = np.array([5.0, 5.0, math.radians(10.0)])
 STEPS = (0.2, 0.2, math.radians(2.5))
-STAGES, LAST = ((15, 1.0), (30, 0.3), (60, 0.1), (600, 0.02)), ((600, 1.0),)
-"""Stages of the search, and of the finer ones around what it finds, as in `matching.searched`."""
+ASKED, FOLLOWED = (60, 600), 600
+"""Readings that are asked at all poses of the search and at the best of them, and how many these are."""
 
 FINER = ((0.1, 0.1, math.radians(1.2)), (0.05, 0.05, math.radians(0.6)))
 
@@ -114,12 +114,8 @@ def windows_of(blocks: NDArray[np.int64], count: int) -> NDArray[np.int64]:
     return out[out < count]
 
 
-def displaced(scans: Scans, nodes: Floats, stretch: NDArray[np.int64], usual: float) -> Floats | None:
-    """Return the nodes with a stretch where it fits best on the map of what was before; None if that is where it is.
-
-    It is not searched where its readings score as usual, `usual` nats each: bare corridors, whose blocks fit elsewhere
-    as well, are hardly recognised where they are.
-    """
+def displaced(scans: Scans, nodes: Floats, stretch: NDArray[np.int64]) -> Floats | None:
+    """Return the nodes with a stretch where it fits best on the map of what was before; None if that is where it is."""
     progress = scans.windows.node_progress
     before = np.flatnonzero(progress < progress[stretch[0]] - APART)
     far = np.array([np.hypot(*(nodes[stretch, :2] - nodes[k, :2]).T).min() for k in before])
@@ -130,10 +126,7 @@ def displaced(scans: Scans, nodes: Floats, stretch: NDArray[np.int64], usual: fl
     if around is None:
         return None
     shape = relative(nodes[middle], nodes[stretch])
-    joint = scans.joint(stretch, shape)
-    if scores(joint, around, np.zeros((1, 3)))[0] >= usual * len(joint.readings):
-        return None
-    best = _searched(joint, around)
+    best = _searched(scans.joint(stretch, shape), around)
     if np.hypot(best[0], best[1]) < MOVED:
         return None
     out = nodes.copy()
@@ -143,10 +136,14 @@ def displaced(scans: Scans, nodes: Floats, stretch: NDArray[np.int64], usual: fl
 
 def _searched(joint: Scan, around: LocalMap) -> Floats:
     """Return the best pose of a stretch around where it is."""
-    best, finer = np.zeros(3), [(2.0 * np.array(steps), steps, LAST) for steps in FINER]
-    for reach, steps, stages in ((REACH, STEPS, STAGES), *finer):
-        poses = grid_around(best, reach, steps)
-        best = poses[int(searched(joint, around, poses, np.zeros(len(poses)), stages).argmax())]
+    mixed = joint.readings[np.random.default_rng(0).permutation(len(joint.readings))]
+    few, more = (Scan(mixed[:asked], joint.weight) for asked in ASKED)
+    poses = grid_around(np.zeros(3), REACH, STEPS)
+    poses = poses[np.argsort(-scores(few, around, poses), kind='stable')[:FOLLOWED]]
+    best: Floats = poses[int(scores(more, around, poses).argmax())]
+    for steps in FINER:
+        near = grid_around(best, 2.0 * np.array(steps), steps)
+        best = near[int(scores(more, around, near).argmax())]
     return best
 
 

@@ -10,18 +10,10 @@ import pytest
 from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.common.readings import Readings
 from forward_grid_mapper.core.sensor.density import CUT
-from forward_grid_mapper.core.trajectory import matching
-from forward_grid_mapper.core.trajectory.likelihood import RAYS, SPREAD, Scan, make_scan, scores
+from forward_grid_mapper.core.trajectory.likelihood import RAYS, SPREAD, make_scan, scores
 from forward_grid_mapper.core.trajectory.local_map import UNKNOWN, LocalMap, at_poses, local_map
-from forward_grid_mapper.core.trajectory.matching import (
-    CURVED,
-    FEWEST_FOLLOWED,
-    ON_TOP,
-    climbed,
-    grid_around,
-    measure,
-    searched,
-)
+from forward_grid_mapper.core.trajectory.loops import LARGE, searched
+from forward_grid_mapper.core.trajectory.matching import CURVED, grid_around, measure
 from forward_grid_mapper.core.trajectory.poses import compose
 from forward_grid_mapper.simulation.drive import drive
 from forward_grid_mapper.simulation.sonar import NOISY, sonar_ring
@@ -155,55 +147,16 @@ def test_a_scan_fits_where_it_was_taken(room) -> None:
     assert abs(moved[2]) < math.radians(1.5)
 
 
-def test_a_search_in_stages_finds_what_asking_all_finds(room) -> None:
+def test_a_large_search_finds_what_asking_all_finds(room) -> None:
     around, scan = room
     poses = grid_around(np.array([0.5, -0.4, 0.0]), np.array([1.2, 1.2, 0.2]))
-    prior, stages = np.zeros(len(poses)), ((6, 1.0), (12, 0.5), (24, 0.2), (len(scan.readings), 0.08))
-    found, right = searched(scan, around, poses, prior, stages), scores(scan, around, poses)
+    assert len(poses) > LARGE
+    prior = np.zeros(len(poses))
+    found, right = searched(scan, around, poses, prior), scores(scan, around, poses)
     assert found.argmax() == right.argmax()
-    assert np.isclose(found, right).sum() >= int(0.08 * len(poses)) > FEWEST_FOLLOWED
-    few = poses[:FEWEST_FOLLOWED]
-    assert searched(scan, around, few, prior[: len(few)], stages) == pytest.approx(right[: len(few)])
-    # what a priori cannot be is not followed, however well it fits
-    prior[right.argmax()] = 1e3
-    assert searched(scan, around, poses, prior, stages)[right.argmax()] != pytest.approx(right.max())
-
-
-def test_all_stages_of_a_search_state_the_same_sum(room) -> None:
-    around, scan = room
-    same = Scan(np.repeat(scan.readings[:1], 50), scan.weight)
-    poses = grid_around(np.zeros(3), np.array([0.8, 0.8, 0.2]))
-    stages = ((3, 1.0), (7, 0.3), (20, 0.1))
-    assert searched(same, around, poses, np.zeros(len(poses)), stages) == pytest.approx(scores(same, around, poses))
-
-
-def test_the_readings_of_a_stage_are_of_all_parts_of_the_scan(room, monkeypatch) -> None:
-    around, scan = room
-    readings = np.repeat(scan.readings[:1], 600)
-    readings['z'] = np.arange(600)
-    asked: list[float] = []
-
-    def note(part, around, poses) -> np.ndarray:
-        asked.extend(part.readings['z'])
-        return np.zeros(len(poses))
-
-    monkeypatch.setattr(matching, 'scores', note)
-    searched(Scan(readings, 1.0), around, np.zeros((5, 3)), np.zeros(5), ((6, 1.0), (24, 1.0), (60, 1.0)))
-    assert len(asked) == len(set(asked)) == 60
-    for count in (6, 24, 60):
-        assert np.diff([0.0, *sorted(asked[:count]), 600.0]).max() < 2.0 * 600 / count
-
-
-def test_a_climb_that_ends_early_ends_at_the_same_top(room, monkeypatch) -> None:
-    around, scan = room
-    start = np.array([0.06, -0.05, 0.01])
-    early, match = climbed(scan, around, start, len(scan.readings))
-    monkeypatch.setattr(matching, 'ON_TOP', 0.0)
-    late, _ = climbed(scan, around, start, len(scan.readings))
-    assert np.abs((early - late) / CURVED).max() < 2.0 * ON_TOP
-    assert match.score == pytest.approx(scores(scan, around, early[None])[0])
-    monkeypatch.setattr(matching, 'ON_TOP', np.inf)
-    assert (climbed(scan, around, start)[0] == start).all()
+    assert (found == right).sum() >= LARGE
+    few = poses[: LARGE // 2]
+    assert (searched(scan, around, few, prior[: len(few)]) == right[: len(few)]).all()
 
 
 def test_the_parabola_is_that_of_the_scores(room) -> None:
