@@ -274,7 +274,8 @@ class Refiner:
 
     def _seen_again(self, scans: Scans, before: Floats, after: Floats) -> Gain:
         """Return by how much what was held out is foreseen better on maps of all times that the robot came by."""
-        blocks = held_out_blocks(scans, HELD_OUT)
+        # it is the only proof, so all that was held out has a say
+        blocks = held_out_blocks(scans, len(before))
         return gain(foreseen(scans, before, blocks), foreseen(scans, after, blocks))
 
     def _choose(self, scans: Scans, first: Floats, *others: Floats) -> Floats:
