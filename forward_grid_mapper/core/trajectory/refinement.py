@@ -200,15 +200,19 @@ class Refiner:
         calibration = solver.calibration_of(along)
         simple = solver.simple(calibration)
         better = self._compare(scans, windows.node, simple)
-        said = f'readings are foreseen {better.mean:+.3f} ± {better.error:.3f} nats a reading better than with odometry'
+        said = _said(better)
         named = dict(zip(CALIBRATION, calibration.tolist(), strict=True))
         least = LEAST_SIGMAS_WITH_WALLS if witness > LEAST_WITNESS else LEAST_SIGMAS
-        if better.sigmas < least:
+        nearby = better.sigmas >= least
+        unproven = Refinement(
+            False, f'{said}: not enough to tell that odometry is off', readings, odometry, named, gain=better.mean
+        )
+        if not nearby:
             if walls.certainty < LEAST_CERTAINTY:
                 return Refinement(False, lost_words(walls.certainty), readings, odometry, {}, lost=True)
-            reason = f'{said}: not enough to tell that odometry is off'
-            return Refinement(False, reason, readings, odometry, named, gain=better.mean)
-        if better.sigmas < LEAST_SIGMAS:
+            if witness <= LEAST_WITNESS:
+                return unproven
+        elif better.sigmas < LEAST_SIGMAS:
             said = f'that walls stand at right angles is likelier by {witness:.0f} nats than with odometry; {said}'
         found = solved(scans, walls, solver, along, solver_of)
         if found.certainty < LEAST_CERTAINTY:
@@ -216,6 +220,12 @@ class Refiner:
         if found.solver is not solver:
             solver, simple = found.solver, found.solver.simple(found.solver.calibration_of(found.along))
         nodes = self._choose(scans, simple, found.along.nodes, found.solution.nodes)
+        if not nearby:
+            # wheels that are right over metres may be off by metres over a drive: places seen before tell that alone
+            better = self._seen_again(scans, windows.node, nodes) if found.loops else Gain(0.0, np.inf)
+            if better.sigmas < LEAST_SIGMAS:
+                return unproven
+            said = f'with places seen before, {_said(better)}'
         if nodes is found.solution.nodes:
             named = dict(zip(CALIBRATION, solver.calibration_of(found.solution).tolist(), strict=True))
         trajectory = refined(odometry, windows, nodes)
@@ -261,6 +271,12 @@ class Refiner:
         one = foreseen(scans, before, blocks, SPAN)
         say(0.5)
         return gain(one, foreseen(scans, after, blocks, SPAN))
+
+    def _seen_again(self, scans: Scans, before: Floats, after: Floats) -> Gain:
+        """Return by how much what was held out is foreseen better on maps of all times that the robot came by."""
+        # it is the only proof, so all that was held out has a say
+        blocks = held_out_blocks(scans, len(before))
+        return gain(foreseen(scans, before, blocks), foreseen(scans, after, blocks))
 
     def _choose(self, scans: Scans, first: Floats, *others: Floats) -> Floats:
         """Return the last nodes that do not foresee what was held out from them worse than those before."""
@@ -367,6 +383,10 @@ def with_outliers(found: Refinement, readings: Readings, odometry: Odometry, cou
         return replace(found, reason=reason, readings=readings, trajectory=odometry)
     trajectory = Odometry.of(odometry.stamp, found.trajectory.at(odometry.stamp))
     return replace(found, reason=reason, trajectory=trajectory)
+
+
+def _said(better: Gain) -> str:
+    return f'readings are foreseen {better.mean:+.3f} ± {better.error:.3f} nats a reading better than with odometry'
 
 
 def _named(watch: Watch, name: str, stage: str, part: float) -> None:

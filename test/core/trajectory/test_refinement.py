@@ -15,7 +15,7 @@ from forward_grid_mapper.core.common.readings import Readings
 from forward_grid_mapper.core.mapping import Mapper
 from forward_grid_mapper.core.trajectory import refinement
 from forward_grid_mapper.core.trajectory.heading import NOISES, Drifts, Heading
-from forward_grid_mapper.core.trajectory.holding_out import held_out
+from forward_grid_mapper.core.trajectory.holding_out import Gain, held_out
 from forward_grid_mapper.core.trajectory.poses import compose, relative, rms_after_alignment
 from forward_grid_mapper.core.trajectory.refinement import Refinement, Refiner, unfit
 from forward_grid_mapper.core.trajectory.scans import Scans
@@ -79,6 +79,22 @@ def test_what_speaks_for_it_is_named(small, monkeypatch, outcome, small_outcome)
     # no readings are foreseen so much better, so the walls have the word
     monkeypatch.setattr(refinement, 'LEAST_SIGMAS', 1e9)
     assert 'that walls stand at right angles is likelier by' in Refiner(Parameters()).run(*small).reason
+
+
+def test_places_seen_before_prove_what_nothing_nearby_does(tour, bent, monkeypatch) -> None:
+    # wheels that are right over metres foresee what is near better than the yaws of walls
+    monkeypatch.setattr(Refiner, '_compare', lambda *rest: Gain(-0.05, 0.01))
+    found, true = Refiner(Parameters()).run(*bent), odometry_of(tour).pose
+    assert found.accepted
+    assert found.reason.startswith('with places seen before, readings are foreseen +')
+    assert rms_after_alignment(found.trajectory.pose, true) < 0.2
+    # the same without such places, and without walls that say that the yaw is off
+    monkeypatch.setattr(Refiner, '_seen_again', lambda *rest: Gain(0.0, 0.01))
+    left = Refiner(Parameters()).run(*bent)
+    monkeypatch.setattr(refinement, 'LEAST_WITNESS', 1e9)
+    for outcome in (left, Refiner(Parameters()).run(*bent)):
+        assert not outcome.accepted
+        assert 'not enough to tell' in outcome.reason
 
 
 def test_readings_go_along(bent, outcome) -> None:
