@@ -158,13 +158,6 @@ def score_poses(scan: Scan, around: LocalMap, poses: Any, stride: int, out: Any)
         out[k] = total * stride
 
 
-@kernel
-def score_readings(scan: Scan, around: LocalMap, pose: tuple[float, float, float], out: Any) -> None:
-    """Write the log ratio of each reading of a scan from a pose to `out`."""
-    for t in range(len(scan.readings)):
-        out[t] = _log_ratio(scan.readings[t], scan.weight, around, pose)
-
-
 def scores(scan: Scan, around: LocalMap, poses: Floats, stride: int = 1) -> Floats:
     """Return Σ log p(z | map) − log p(z | nothing known) of a scan from each pose, shape (P, 3), in nats."""
     out = np.empty(len(poses))
