@@ -114,12 +114,8 @@ def windows_of(blocks: NDArray[np.int64], count: int) -> NDArray[np.int64]:
     return out[out < count]
 
 
-def displaced(scans: Scans, nodes: Floats, stretch: NDArray[np.int64], usual: float) -> Floats | None:
-    """Return the nodes with a stretch where it fits best on the map of what was before; None if that is where it is.
-
-    It is not searched where its readings score as usual, `usual` nats each: bare corridors, whose blocks fit elsewhere
-    as well, are hardly recognised where they are.
-    """
+def displaced(scans: Scans, nodes: Floats, stretch: NDArray[np.int64]) -> Floats | None:
+    """Return the nodes with a stretch where it fits best on the map of what was before; None if that is where it is."""
     progress = scans.windows.node_progress
     before = np.flatnonzero(progress < progress[stretch[0]] - APART)
     far = np.array([np.hypot(*(nodes[stretch, :2] - nodes[k, :2]).T).min() for k in before])
@@ -130,10 +126,7 @@ def displaced(scans: Scans, nodes: Floats, stretch: NDArray[np.int64], usual: fl
     if around is None:
         return None
     shape = relative(nodes[middle], nodes[stretch])
-    joint = scans.joint(stretch, shape)
-    if scores(joint, around, np.zeros((1, 3)))[0] >= usual * len(joint.readings):
-        return None
-    best = _searched(joint, around)
+    best = _searched(scans.joint(stretch, shape), around)
     if np.hypot(best[0], best[1]) < MOVED:
         return None
     out = nodes.copy()

@@ -161,7 +161,7 @@ class Solver:
         """Return the solution with some blocks in another place, if their readings are foreseen better there."""
         scans, nodes = self._scans, solution.nodes
         stretch = windows_of(blocks, len(nodes))
-        moved = displaced(scans, nodes, stretch, usual)
+        moved = displaced(scans, nodes, stretch)
         if moved is None:
             return solution, loops
         found, first = loops_at(scans, moved, stretch, usual), int(stretch[0])

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from exact_tour import Tour, quietly, tour_with
 
-from forward_grid_mapper.core.trajectory import relocating, solving
+from forward_grid_mapper.core.trajectory import solving
 from forward_grid_mapper.core.trajectory.heading import DOUBTFUL, Heading, doubts
 from forward_grid_mapper.core.trajectory.hypotheses import solved
 from forward_grid_mapper.core.trajectory.loops import LENGTH, Loop
@@ -64,31 +64,12 @@ def test_a_stretch_is_found_farther_off_than_single_blocks_are_looked_for(there_
     scans, true = there_and_back.scans, there_and_back.windows.node
     blocks = revisits(scans, true)
     stretch = windows_of(blocks[blocks * LENGTH > turning(there_and_back)][:RUN], len(true))
-    usual = ahead(scans, true, lambda part: None).usual
-    moved = displaced(scans, astray(there_and_back), stretch, usual)
+    moved = displaced(scans, astray(there_and_back), stretch)
     assert moved is not None
     assert np.hypot(*(moved - true)[stretch, :2].T).max() < 0.35
     rest = np.setdiff1d(np.arange(len(true)), stretch)
     np.testing.assert_array_equal(moved[rest], astray(there_and_back)[rest])
-    assert displaced(scans, true, stretch, np.inf) is None
-
-
-def test_a_stretch_that_fits_as_usual_is_not_searched(there_and_back, monkeypatch) -> None:
-    scans, true = there_and_back.scans, there_and_back.windows.node
-    blocks = revisits(scans, true)
-    stretch = windows_of(blocks[blocks * LENGTH > turning(there_and_back)][:RUN], len(true))
-    searched: list[int] = []
-
-    def search(joint, around) -> Floats:
-        searched.append(len(joint.readings))
-        return np.zeros(3)
-
-    monkeypatch.setattr(relocating, '_searched', search)
-    usual = ahead(scans, true, lambda part: None).usual
-    assert displaced(scans, true, stretch, usual) is None
-    assert not searched
-    assert displaced(scans, astray(there_and_back), stretch, usual) is None
-    assert searched
+    assert displaced(scans, true, stretch) is None
 
 
 def solution_at(nodes: Floats) -> Solution:
@@ -110,7 +91,7 @@ def test_what_was_led_astray_is_put_where_it_belongs(there_and_back) -> None:
 def test_another_place_is_taken_only_if_readings_are_foreseen_better(there_and_back, monkeypatch) -> None:
     true, first = there_and_back.windows.node, turning(there_and_back)
 
-    def aside(scans, nodes, stretch, usual) -> Floats:
+    def aside(scans, nodes, stretch) -> Floats:
         out = nodes.copy()
         out[stretch] += (0.0, 1.5, 0.0)
         return out
