@@ -43,6 +43,8 @@ def refined(robot: Inside, *, count: int = 200) -> tuple[Inside, Odometry]:
 
 
 def live_of(robot: Inside) -> tuple[Any, np.ndarray]:
+    """The live map of all readings that the node has taken."""
+    robot.node._feed()
     snapshot = robot.node.live.snapshot()
     return snapshot.grid, snapshot.probability
 
@@ -62,7 +64,6 @@ def expected_live(robot: Inside, bent: Odometry | None) -> tuple[Any, np.ndarray
 
 
 def assert_live(robot: Inside, bent: Odometry | None) -> None:
-    robot.node._feed()
     (grid, ours), (expected_grid, theirs) = live_of(robot), expected_live(robot, bent)
     assert grid == expected_grid
     assert np.array_equal(np.isnan(ours), np.isnan(theirs))

@@ -124,6 +124,7 @@ def test_after_the_clock_jumped_back_the_transform_is_that_of_readings_of_its_st
     assert robot.call(robot.node.em.run_em)[0]
     correction = robot.node.trajectory.correction
     assert correction is not None
+    robot.until(lambda: tf2_ros.sent)
     for seconds, of in ((50.0, 100.0), (103.0, 103.0), (120.0, 110.0)):
         robot.odometry(seconds, 0.5)
         robot.until(lambda seconds=seconds: seconds_of(tf2_ros.sent[-1]) == pytest.approx(seconds + 0.2))

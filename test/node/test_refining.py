@@ -110,6 +110,7 @@ def test_a_jump_of_odometry_is_warned_of_until_a_run_has_looked_at_it(
 ) -> None:
     robot, _ = refined(inside(refine_poses=True).start())
     node = robot.node
+    robot.until(lambda: node.trajectory._at is not None)
     assert robot.status('trajectory')['level'] == OK
     robot.odometry(111.0, 9.0)
     robot.odometry(111.05, 9.0)
