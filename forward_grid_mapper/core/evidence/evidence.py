@@ -18,7 +18,7 @@ from ..runtime.memory import THREAD_MEMORY
 from ..runtime.threads import parts, run_each
 from ..sensor.cone_table import CONE, Cones, Floats, cone_table
 from ..sensor.density import hit_probability
-from ..sensor.incidence import count, edges_of, narrowed, no_counts, slots_of
+from ..sensor.incidence import count, edges_of, narrowed, no_counts, slots_of, with_own_angles
 from ..sensor.surface_normals import SurfaceNormals, gather, no_normals, normals_of, on_larger_grid, renewed, touched
 from .fixed_point import QUANTUM
 from .indexing import BAND, FREE, LARGEST, UNSTORED, UNUSED, WORDS, insert_readings, reading_state_table
@@ -477,12 +477,9 @@ class Evidence:
         normals, edges = renewed(s.normals, sums, self.grid, around), edges_of(self.model)
         if edges is None:
             return normals
-        slots = slots_of(normals, around)
-        counts = no_counts(slots)
         readings = np.flatnonzero(near(s.cones[: self._size], around))
-        cones, weights = s.cones[readings], s.reading_states['multiplicity'][readings]
-        count(cones, weights, normals, slots, around, edges, (0, len(cones)), counts, NEVER)
-        narrowed(normals, counts, slots, edges, self.grid, window)
+        weights = s.reading_states['multiplicity'][readings]
+        with_own_angles(normals, s.cones[readings], weights, self.grid, window, edges)
         # around the window nothing changed
         outside = np.ones(self.grid.shape, np.bool_)
         outside[window[0] : window[1], window[2] : window[3]] = False

@@ -210,3 +210,32 @@ def narrowed(
         x[cells][here] *= length
         y[cells][here] *= length
     return normals
+
+
+def with_own_angles(
+    normals: SurfaceNormals,
+    cones: Cones,
+    weights: NDArray[np.int32],
+    grid: Grid,
+    window: Window,
+    edges: NDArray[np.float64],
+) -> SurfaceNormals:
+    """Return the normals with lengths that state each surface's own incidence angle, counted on one thread.
+
+    Parameters
+    ----------
+    normals : SurfaceNormals
+        Of length one in all that is `touched` by the window; they are changed in the window.
+    cones : records of `CONE`, shape (N,)
+        All that come into what is `touched`.
+    weights : int32, shape (N,)
+        How many readings each stands for.
+    grid : Grid
+    window : first row, last one plus one, and columns likewise
+    edges : float64, shape (ZONES,)
+    """
+    around, never = touched(window, grid), np.zeros(1, np.uint8)
+    slots = slots_of(normals, around)
+    counts = no_counts(slots)
+    count(cones, weights, normals, slots, around, edges, (0, len(cones)), counts, never)
+    return narrowed(normals, counts, slots, edges, grid, window)

@@ -20,7 +20,7 @@ from ..runtime.memory import memory_for_pairs
 from ..search.search import Progress, Search
 from ..sensor.cone_table import cone_table
 from ..sensor.forward_model import ForwardModel
-from ..sensor.incidence import count, edges_of, narrowed, no_counts, slots_of
+from ..sensor.incidence import edges_of, with_own_angles
 from ..sensor.surface_normals import SurfaceNormals, gather, known_normals, no_normals, normals_of
 from .tiling import Tile
 
@@ -110,10 +110,7 @@ def found_normals(given: Given, parameters: Parameters) -> NDArray[np.float32]:
     normals, edges = normals_of(sums, box, angle), edges_of(parameters.model)
     if edges is not None:
         whole, weights = (0, box.height, 0, box.width), np.ones(len(cones), np.int32)
-        slots = slots_of(normals, whole)
-        counts = no_counts(slots)
-        count(cones, weights, normals, slots, whole, edges, (0, len(cones)), counts, NEVER)
-        narrowed(normals, counts, slots, edges, box, whole)
+        with_own_angles(normals, cones, weights, box, whole, edges)
     return np.stack([given.core(normals.x), given.core(normals.y)])
 
 
