@@ -70,8 +70,7 @@ def test_in_portions_with_normals_renewed_all_is_as_if_at_once(seed: int, memory
         assert evidence.state.pairs.cell.nbytes <= memory
 
 
-# with the last three, what changes reaches as far as it can
-@pytest.mark.parametrize('seed', [0, 1, 2, 21, 37, 56])
+@pytest.mark.parametrize('seed', range(6))
 def test_where_little_came_no_less_is_renewed_than_changes(seed: int) -> None:
     wide = Grid(0.1, -60, 12, 120, 24)
     rng = np.random.default_rng(seed)
