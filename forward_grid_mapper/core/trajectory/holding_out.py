@@ -27,6 +27,9 @@ NEAR = 4.0
 LEAST_SIGMAS = 2.3
 """Standard errors by which readings must be foreseen better: by chance it is so in one of 100."""
 
+LATER = 10.0
+"""Metres of progress after which a place that the robot is at was seen before, rather than just now."""
+
 FEWEST = 5
 """Readings of a block that are compared."""
 
@@ -99,3 +102,17 @@ def held_out_blocks(scans: Scans, most: int) -> list[NDArray[np.int64]]:
     """Return the windows that are held out, each as a block, `most` at the most, evenly over the drive."""
     chosen = np.flatnonzero(scans.held_out)
     return [chosen[k] for k in blocks_of(len(chosen), 1, most)]
+
+
+def came_back(scans: Scans, *trajectories: Floats) -> bool:
+    """Return whether the robot came back to places, by any of these trajectories, float64, shape (K, 3).
+
+    So it is where windows that are held out lie near what was driven `LATER` or before; it takes `FEWEST_BLOCKS`.
+    """
+    chosen, progress = np.flatnonzero(scans.held_out), scans.windows.node_progress
+    apart = np.abs(progress[chosen, None] - progress) > LATER
+    again = np.zeros(len(chosen), np.bool_)
+    for nodes in trajectories:
+        between = nodes[chosen, None, :2] - nodes[:, :2]
+        again |= ((np.hypot(between[..., 0], between[..., 1]) < NEAR) & apart).any(1)
+    return bool(again.sum() >= FEWEST_BLOCKS)

@@ -22,7 +22,7 @@ from ..common.parameters import Parameters
 from ..common.readings import Readings
 from ..runtime.cancelling import check
 from .heading import NOISES, Heading, heading
-from .holding_out import LEAST_SIGMAS, Gain, blocks_of, foreseen, gain, held_out, held_out_blocks
+from .holding_out import LEAST_SIGMAS, Gain, blocks_of, came_back, foreseen, gain, held_out, held_out_blocks
 from .hypotheses import solved
 from .jumps import MOST_JUMPS, UNKNOWN, Begin, Part, begins_of, jumps, parts_at, without_outliers, words
 from .local_map import at_poses, for_matching
@@ -53,8 +53,8 @@ JUDGED_ON, HELD_OUT = 60, 40
 
 LEAST_WITNESS, LEAST_SIGMAS_WITH_WALLS = 10.0, -1.0
 """Nats that the votes of walls must say against odometry's yaw, beyond what sensors say by where they look, to be a
-witness of their own, and the standard errors that are then enough: readings must not be foreseen worse. Little drift
-hardly shows in a few metres."""
+witness of their own, and the standard errors that are then enough where the robot came to no place twice: readings must
+not be foreseen worse. Little drift hardly shows in a few metres."""
 
 MOST_WORSE = 1.0
 """Standard errors by which matching may foresee what was held out worse."""
@@ -202,30 +202,34 @@ class Refiner:
         better = self._compare(scans, windows.node, simple)
         said = _said(better)
         named = dict(zip(CALIBRATION, calibration.tolist(), strict=True))
-        least = LEAST_SIGMAS_WITH_WALLS if witness > LEAST_WITNESS else LEAST_SIGMAS
-        nearby = better.sigmas >= least
+        proven = better.sigmas >= LEAST_SIGMAS
+        witnessed = witness > LEAST_WITNESS and better.sigmas >= LEAST_SIGMAS_WITH_WALLS
         unproven = Refinement(
             False, f'{said}: not enough to tell that odometry is off', readings, odometry, named, gain=better.mean
         )
-        if not nearby:
+        if not proven and not witnessed:
             if walls.certainty < LEAST_CERTAINTY:
                 return Refinement(False, lost_words(walls.certainty), readings, odometry, {}, lost=True)
             if witness <= LEAST_WITNESS:
                 return unproven
-        elif better.sigmas < LEAST_SIGMAS:
-            said = f'that walls stand at right angles is likelier by {witness:.0f} nats than with odometry; {said}'
         found = solved(scans, walls, solver, along, solver_of)
         if found.certainty < LEAST_CERTAINTY:
             return Refinement(False, lost_words(found.certainty), readings, odometry, {}, lost=True)
         if found.solver is not solver:
             solver, simple = found.solver, found.solver.simple(found.solver.calibration_of(found.along))
         nodes = self._choose(scans, simple, found.along.nodes, found.solution.nodes)
-        if not nearby:
-            # wheels that are right over metres may be off by metres over a drive: places seen before tell that alone
-            better = self._seen_again(scans, windows.node, nodes) if found.loops else Gain(0.0, np.inf)
-            if better.sigmas < LEAST_SIGMAS:
-                return unproven
+        if not proven and came_back(scans, windows.node, nodes):
+            # places seen before tell wheels that are right over metres from those that are not, and walls that stand
+            # askew from a yaw that is off
+            better = self._seen_again(scans, windows.node, nodes)
             said = f'with places seen before, {_said(better)}'
+            if better.sigmas < LEAST_SIGMAS:
+                reason = f'{said}: not enough to tell that odometry is off'
+                return replace(unproven, reason=reason, gain=better.mean)
+        elif not proven:
+            if not witnessed:
+                return unproven
+            said = f'that walls stand at right angles is likelier by {witness:.0f} nats than with odometry; {said}'
         if nodes is found.solution.nodes:
             named = dict(zip(CALIBRATION, solver.calibration_of(found.solution).tolist(), strict=True))
         trajectory = refined(odometry, windows, nodes)

@@ -15,7 +15,7 @@ from forward_grid_mapper.core.common.readings import Readings
 from forward_grid_mapper.core.mapping import Mapper
 from forward_grid_mapper.core.trajectory import refinement
 from forward_grid_mapper.core.trajectory.heading import NOISES, Drifts, Heading
-from forward_grid_mapper.core.trajectory.holding_out import Gain, held_out
+from forward_grid_mapper.core.trajectory.holding_out import FEWEST_BLOCKS, LATER, NEAR, Gain, came_back, held_out
 from forward_grid_mapper.core.trajectory.poses import compose, relative, rms_after_alignment
 from forward_grid_mapper.core.trajectory.refinement import Refinement, Refiner, unfit
 from forward_grid_mapper.core.trajectory.scans import Scans
@@ -95,6 +95,39 @@ def test_places_seen_before_prove_what_nothing_nearby_does(tour, bent, monkeypat
     for outcome in (left, Refiner(Parameters()).run(*bent)):
         assert not outcome.accepted
         assert 'not enough to tell' in outcome.reason
+
+
+def test_walls_are_no_proof_where_places_seen_before_say_nothing(bent, monkeypatch) -> None:
+    # walls that stand askew tell a yaw that is off, and readings are foreseen about as well
+    monkeypatch.setattr(Refiner, '_compare', lambda *rest: Gain(0.001, 0.01))
+    monkeypatch.setattr(Refiner, '_seen_again', lambda *rest: Gain(0.001, 0.01))
+    left = Refiner(Parameters()).run(*bent)
+    assert not left.accepted
+    assert left.reason.startswith('with places seen before, readings are foreseen +')
+    assert 'not enough to tell' in left.reason
+    monkeypatch.setattr(refinement, 'came_back', lambda *rest: False)
+    found = Refiner(Parameters()).run(*bent)
+    assert found.accepted
+    assert found.reason.startswith('that walls stand at right angles is likelier')
+
+
+@pytest.mark.parametrize(
+    ('way', 'rounds'),
+    [([[2.0, 8.85], [29.0, 8.85]], 1), ([[10.0, 8.85], [14.0, 8.85], [10.0, 8.85]], 1), (TOUR[:10], 2)],
+)
+def test_a_robot_that_came_back_is_told_from_one_that_did_not(way, rounds) -> None:
+    points = np.concatenate([np.array(way, float)] * rounds)
+    recording = drive(building_world(), points, 0.1, front_array(), NOISY, seed=4)
+    windows = cut(recording.readings, odometry_of(recording))
+    scans = Scans(windows, Parameters(), np.zeros(1, np.uint8), held_out(len(windows)))
+    progress, again = windows.node_progress, 0
+    for k in np.flatnonzero(scans.held_out):
+        others = [j for j in range(len(windows)) if abs(progress[j] - progress[k]) > LATER]
+        again += any(math.dist(windows.node[k, :2], windows.node[j, :2]) < NEAR for j in others)
+    assert came_back(scans, windows.node) == (again >= FEWEST_BLOCKS) == (rounds == 2)
+    far = np.arange(len(windows))[:, None] * np.array([5.0, 0.0, 0.0])
+    assert not came_back(scans, far)
+    assert came_back(scans, far, windows.node) == (rounds == 2)
 
 
 def test_readings_go_along(bent, outcome) -> None:
