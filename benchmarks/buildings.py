@@ -1,11 +1,14 @@
 #!/usr/bin/env python3
 """How good maps of real places are: sonars simulated in buildings that a laser measured, and recordings of a robot.
 
-usage: buildings.py [NAME ...]
+usage: buildings.py [NAME ...] [--drawn] [--set NAME=VALUE ...]
 
 Of the drives under ../shared/data, or those named, with their right poses: the default's maximum likelihood map and its
 live map, the paper's plain maximum likelihood map, and the standard map with the best of 216 gains for that very drive,
 once for F1 and once for nav_iou, which nobody could know. Figures are those of ../shared/tools/score_map.py.
+
+--drawn takes twelve buildings drawn by chance instead (`material_worlds.py`), on which nothing was chosen, and prints
+means; --set changes the default.
 """
 
 from __future__ import annotations
@@ -19,6 +22,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import quality_worlds
+from material_worlds import building_case
+from measuring import setting
 from numpy.typing import NDArray
 from quality_scores import ROBOT_RADIUS, Standard, on_truth
 from quality_worlds import Case, recorded_cases, scoring_tool
@@ -31,6 +36,9 @@ from forward_grid_mapper.files.parameter_file import load_parameters
 
 PAPER = Path(__file__).resolve().parents[1] / 'config' / 'paper.yaml'
 NAMES = ('building_a', 'building_b', 'building_c', 'office_a', 'office_b')
+DRAWN = range(24, 36)
+"""Seeds of buildings on which nothing was chosen."""
+
 FIGURES = ('f1', 'precision', 'recall', 'nav_iou', 'leak', 'blocked', 'beyond')
 
 
@@ -43,9 +51,9 @@ class Map(NamedTuple):
     probability: NDArray[Any] | None = None
 
 
-def maps_of(case: Case, tool: ModuleType) -> Iterator[Map]:
-    """Yield each way's map."""
-    maps = Mapper(Parameters()).run(case.readings)
+def maps_of(case: Case, changes: dict[str, Any], tool: ModuleType) -> Iterator[Map]:
+    """Yield each way's map; `changes` are those of the default."""
+    maps = Mapper(Parameters().varied(changes)).run(case.readings)
     yield Map('maximum likelihood map', maps.grid, np.where(maps.ml < 0, np.nan, maps.ml), maps.uncertainty)
     yield Map('live map', maps.grid, maps.live, maps.live)
     plain = Mapper(Parameters.from_flat(load_parameters(PAPER).values)).run(case.readings)
@@ -56,27 +64,45 @@ def maps_of(case: Case, tool: ModuleType) -> Iterator[Map]:
         yield Map(title, grid, np.where(ml < 0, np.nan, ml))
 
 
+def scored(case: Case, changes: dict[str, Any], tool: ModuleType) -> dict[str, list[float]]:
+    """Return `FIGURES` and the log loss of each way's map, by its title."""
+    path, out = tool.path_cells(case.path_xy, np.array(case.origin), case.resolution, case.truth.shape), {}
+
+    def figures(grid: Grid, values: NDArray[Any]) -> dict[str, float]:
+        p = on_truth(values, grid, case, tool)
+        return dict(tool.score(p, case.truth, path, case.resolution, ROBOT_RADIUS))
+
+    for made in maps_of(case, changes, tool):
+        scores = figures(made.grid, made.values)
+        loss = np.nan if made.probability is None else figures(made.grid, made.probability)['log_loss']
+        out[made.title] = [*(scores[name] for name in FIGURES), loss]
+    return out
+
+
 def main() -> None:
     """Run the benchmark."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument('names', nargs='*', default=NAMES, metavar='NAME')
+    parser.add_argument('--set', action='append', default=[], metavar='NAME=VALUE', help='change the default')
+    parser.add_argument('--drawn', action='store_true', help='buildings drawn by chance, instead')
     tool = scoring_tool()
     if tool is None:
         sys.exit('without ../shared/tools/score_map.py there are no figures')
-    quality_worlds.RECORDINGS = tuple(parser.parse_args().names)
+    options = parser.parse_args()
+    changes = dict(setting(text) for text in options.set)
+    quality_worlds.RECORDINGS = tuple(options.names)
     print(f'{"":38s}' + ''.join(f'{name:>10s}' for name in (*FIGURES, 'log_loss')))
-    for case in recorded_cases(tool):
-        path = tool.path_cells(case.path_xy, np.array(case.origin), case.resolution, case.truth.shape)
-
-        def figures(grid: Grid, values: NDArray[Any], case: Case = case, path: NDArray[Any] = path) -> dict[str, float]:
-            p = on_truth(values, grid, case, tool)
-            return dict(tool.score(p, case.truth, path, case.resolution, ROBOT_RADIUS))
-
-        for made in maps_of(case, tool):
-            scores = figures(made.grid, made.values)
-            row = ''.join(f'{scores[name]:10.3f}' for name in FIGURES)
-            loss = '-' if made.probability is None else f'{figures(made.grid, made.probability)["log_loss"]:.3f}'
-            print(f'{case.group:14s}{made.title:24s}{row}{loss:>10s}', flush=True)
+    groups = (
+        [('drawn', [building_case(seed) for seed in DRAWN])]
+        if options.drawn
+        else ((case.group, [case]) for case in recorded_cases(tool))
+    )
+    for name, cases in groups:
+        rows = [scored(case, changes, tool) for case in cases]
+        for title in rows[0]:
+            means = np.mean([row[title] for row in rows], axis=0)
+            figures = ''.join(f'{"-" if np.isnan(value) else f"{value:.3f}":>10s}' for value in means)
+            print(f'{name:14s}{title:24s}{figures}', flush=True)
 
 
 if __name__ == '__main__':

@@ -1,4 +1,4 @@
-"""What all benchmarks need: the machine, processes of their own, memory, medians, and memory read in one stream."""
+"""What all benchmarks need: the machine, settings, own processes, memory, medians, and memory read in one stream."""
 
 from __future__ import annotations
 
@@ -16,10 +16,11 @@ from typing import Any, TypeVar
 import numba
 import numpy as np
 
-from forward_grid_mapper.core.common.parameters import Parameters
+from forward_grid_mapper.core.common.parameters import CONSTANTS, Parameters
 from forward_grid_mapper.core.common.readings import Readings
 from forward_grid_mapper.core.mapping import Mapper
 from forward_grid_mapper.core.maps.map_set import MapSet
+from forward_grid_mapper.files.parameter_file import parse_setting
 
 T = TypeVar('T')
 
@@ -55,6 +56,13 @@ def machine() -> str:
         f'load {os.getloadavg()[0]:.2f}\n'
         f'Python {platform.python_version()}, numpy {np.__version__}, numba {numba.__version__}'
     )
+
+
+def setting(text: str) -> tuple[str, Any]:
+    """Return the name and the value of `name=value`, of a parameter or of a constant of the model."""
+    name, _, value = (part.strip() for part in text.partition('='))
+    constants = {row.name: row for row in CONSTANTS}
+    return (name, type(constants[name].default)(value)) if name in constants else parse_setting(text)
 
 
 def in_own_process(work: Callable[..., T], *arguments: Any) -> T:

@@ -29,6 +29,7 @@ from typing import Any
 
 import numba
 import numpy as np
+from measuring import setting
 from quality_pictures import draw_pictures
 from quality_scores import (
     OFTEN,
@@ -46,13 +47,13 @@ from quality_scores import (
 )
 from quality_worlds import Case, drawn_cases, on_grid, recorded_cases, scoring_tool, simulated_cases
 
-from forward_grid_mapper.core.common.parameters import CONSTANTS, Parameters
+from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.evidence.evidence import Evidence
 from forward_grid_mapper.core.evidence.fixed_point import QUANTUM
 from forward_grid_mapper.core.mapping import Mapper
 from forward_grid_mapper.core.sensor.cone_table import grid_of
 from forward_grid_mapper.core.warm_up import warm_up
-from forward_grid_mapper.files.parameter_file import load_parameters, parse_setting
+from forward_grid_mapper.files.parameter_file import load_parameters
 from forward_grid_mapper.simulation.drive import corridor_drive
 from forward_grid_mapper.simulation.score import score_map
 
@@ -283,13 +284,6 @@ def print_cost(base: dict[str, Any], paper: dict[str, Any], runs: int) -> None:
     for name, spent in seconds.items():
         middle = statistics.median(spent)
         print(f'  {name:32s}{middle:7.2f} s   the default takes {ours / middle:.2f} times as long')
-
-
-def setting(text: str) -> tuple[str, Any]:
-    """Return the name and the value of `name=value`, of a parameter or of a constant of the model."""
-    name, _, value = (part.strip() for part in text.partition('='))
-    constants = {row.name: row for row in CONSTANTS}
-    return (name, type(constants[name].default)(value)) if name in constants else parse_setting(text)
 
 
 def main() -> None:

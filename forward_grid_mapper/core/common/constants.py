@@ -35,8 +35,7 @@ THROUGH = 2.0
 # Surfaces that return echoes up to an incidence of their own
 
 LEAST_RATE = 0.5
-"""Part of the readings within the limit of a smooth surface that are its echoes. With 0.4 there are more dots, and a
-door that was seen once is narrower."""
+"""Part of the readings within the limit of a smooth surface that are its echoes. With 0.4 there are more dots."""
 
 CONTRAST = 6.0
 """Times as large as that of the readings beyond."""
@@ -111,7 +110,7 @@ LEAST_STRENGTH = 0.25
 
 IMAGE_AROUND = 0.45
 """Metres around a cell whose echoes decide about it, less than the margin of tiles, half of `LONGEST_GAP`. With less,
-cells of true walls go where they are seen past a corner."""
+cells of true walls go."""
 
 LEAST_EVIDENCE = 0.1
 """Nats, either way, from which on a cell counts as observed though the maximum likelihood map does not know it."""
