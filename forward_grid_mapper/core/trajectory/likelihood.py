@@ -32,6 +32,15 @@ RAYS = (3, 5, 7, 11)
 SPREAD = 0.85
 """Part of the half angle that the rays span: beyond it a cone hears little."""
 
+LEAST_SURVIVAL = 1e-4
+"""s_d below which what lies behind is not asked."""
+
+OFF = 1.0
+"""Cells by which the middle of a cell that a ray meets may be off the ring at the most, and more."""
+
+LANES, SIDE_BY_SIDE = 64, 16
+"""Poses that are asked side by side at the most, and of what they are a multiple."""
+
 SCAN = np.dtype(
     [(name, np.float64) for name in ('x', 'y', 'yaw', 'half', 'z', 'sigma', 'reach', 'floor', 'silence', 'unknown')],
     align=True,
@@ -100,66 +109,177 @@ def make_scan(readings: Readings, poses: Floats, model: ModelParameters, resolut
     return scan
 
 
+class Lanes(NamedTuple):
+    """What is known of L poses that are asked side by side, so that processors work on several at a time.
+
+    Attributes
+    ----------
+    x, y : float64, shape (L,)
+        Of the sensor, in cells of the map.
+    fan : float64, shape (1 + len(RAYS), RAYS[-1], 2, L)
+        Unit vectors along the rays: those of one ray, then those of as many as `RAYS` has it.
+    best, ray : float64, shape (L,)
+        The largest probability that rays have met so far in a ring, and which of them met it first on the map, or −1.
+    survival, hit : float64, shape (L,)
+        s_d, and Σ s_d h_d N(z; d, σ).
+    cell : int32, shape (L,)
+        What a ray meets: a row of `cells` of the map.
+    met : float32, shape (3, L)
+        That row.
+    """
+
+    x: Floats
+    y: Floats
+    fan: Floats
+    best: Floats
+    ray: Floats
+    survival: Floats
+    hit: Floats
+    cell: NDArray[np.int32]
+    met: NDArray[np.float32]
+
+
+def _lanes(count: int) -> Lanes:
+    x, y, best, ray, survival, hit = np.zeros((6, count))
+    fan = np.zeros((1 + len(RAYS), RAYS[-1], 2, count))
+    return Lanes(x, y, fan, best, ray, survival, hit, np.zeros(count, np.int32), np.zeros((3, count), np.float32))
+
+
 @kernel
-def _log_ratio(reading: Any, weight: float, around: LocalMap, pose: tuple[float, float, float]) -> float:
-    """Return log p(z | map) − log p(z | nothing known) of one reading from a pose of the scan's frame."""
-    resolution, hits = around.resolution, around.hit
-    height, width = hits.shape
-    c, s = math.cos(pose[2]), math.sin(pose[2])
-    x = (pose[0] + c * reading.x - s * reading.y) / resolution - around.column
-    y = (pose[1] + s * reading.x + c * reading.y) / resolution - around.row
-    begin = pose[2] + reading.yaw - reading.half
-    axis_x, axis_y = math.cos(begin), math.sin(begin)
+def _fan_out(reading: Any, yaw: float, resolution: float, lanes: Lanes, p: int) -> None:
+    """Set the rays of a reading in one lane, as many as it needs."""
+    fan, begin = lanes.fan, yaw + reading.yaw - reading.half
+    fan[0, 0, 0, p], fan[0, 0, 1, p] = math.cos(begin), math.sin(begin)
+    rays, last = 1, math.ceil(reading.reach / resolution) - 0.5
+    for wide in range(len(RAYS)):
+        if rays >= 1.0 + 2.0 * reading.half * last:
+            break
+        rays = RAYS[wide]
+        step = 2.0 * reading.half / (rays - 1)
+        c, s = math.cos(step), math.sin(step)
+        u, v = fan[0, 0, 0, p], fan[0, 0, 1, p]
+        for k in range(rays):
+            fan[wide + 1, k, 0, p], fan[wide + 1, k, 1, p] = u, v
+            u, v = u * c - v * s, u * s + v * c
+
+
+@kernel
+def _copy_fan(lanes: Lanes, p: int) -> None:
+    """Set the rays of a lane to those of the one before it."""
+    fan = lanes.fan
+    for wide in range(1 + len(RAYS)):
+        for k in range(RAYS[wide - 1] if wide else 1):
+            fan[wide, k, 0, p], fan[wide, k, 1, p] = fan[wide, k, 0, p - 1], fan[wide, k, 1, p - 1]
+
+
+@kernel
+def _meet(around: LocalMap, lanes: Lanes, wide: int, k: int, d: float) -> None:
+    """Set what the k-th ray of each lane meets at distance d."""
+    x, y, fan, cell, met, cells = lanes.x, lanes.y, lanes.fan, lanes.cell, lanes.met, around.cells
+    height, width = float(around.hit.shape[0]), float(around.hit.shape[1])
+    for p in range(len(x)):
+        column, row = np.floor(x[p] + d * fan[wide, k, 0, p]), np.floor(y[p] + d * fan[wide, k, 1, p])
+        inside = (row >= 0.0) & (row < height) & (column >= 0.0) & (column < width)
+        cell[p] = np.int32(row * width + column if inside else height * width)
+    for p in range(len(x)):
+        at = np.uint32(cell[p])
+        met[0, p], met[1, p], met[2, p] = cells[at, 0], cells[at, 1], cells[at, 2]
+
+
+@kernel
+def _raise(around: LocalMap, lanes: Lanes, wide: int, k: int, limit: float) -> None:
+    """Raise the largest probability of a ring to what the k-th rays met."""
+    best, ray, fan, cell, met = lanes.best, lanes.ray, lanes.fan, lanes.cell, lanes.met
+    outside, unknown, this = len(around.cells) - 1, around.unknown, float(k)
+    for p in range(len(best)):
+        # NaN where there is no normal, and not below the limit
+        along = fan[wide, k, 0, p] * met[1, p] + fan[wide, k, 1, p] * met[2, p]
+        here = 0.0 if along * along < limit else np.float64(met[0, p])
+        beyond = cell[p] == outside
+        here = unknown if beyond else here
+        more = here > best[p]
+        best[p] = here if more else best[p]
+        ray[p] = this if more & (not beyond) else ray[p]
+
+
+@kernel
+def _hear(reading: Any, resolution: float, lanes: Lanes, wide: int, d: float) -> None:
+    """Add what a ring returns of the reading."""
+    x, y, fan = lanes.x, lanes.y, lanes.fan
+    for p in range(len(x)):
+        off_x, off_y = d, 0.0
+        if lanes.ray[p] >= 0.0:
+            k = np.uint32(lanes.ray[p])
+            off_x = np.floor(x[p] + d * fan[wide, k, 0, p]) + 0.5 - x[p]
+            off_y = np.floor(y[p] + d * fan[wide, k, 1, p]) + 0.5 - y[p]
+        distance = math.sqrt(off_x * off_x + off_y * off_y)
+        error = (reading.z - distance * resolution) / reading.sigma
+        if abs(error) <= CUT and lanes.survival[p] >= LEAST_SURVIVAL:
+            lanes.hit[p] += lanes.survival[p] * lanes.best[p] * density(error, reading.sigma)
+
+
+@kernel
+def _walk(reading: Any, around: LocalMap, lanes: Lanes) -> None:
+    """Walk the cone of a reading ring by ring, in all lanes."""
+    resolution, best, ray, survival = around.resolution, lanes.best, lanes.ray, lanes.survival
     through = (reading.z - THROUGH * reading.sigma) / resolution
-    survival, hit = 1.0, 0.0
+    heard = (reading.z - CUT * reading.sigma) / resolution - OFF
     rays, wide = 1, 0
-    c1, s1 = 1.0, 0.0
-    for k in range(int(math.ceil(reading.reach / resolution))):
-        d = k + 0.5
+    lanes.hit[:], survival[:] = 0.0, 1.0
+    for ring in range(int(math.ceil(reading.reach / resolution))):
+        d = ring + 0.5
         while wide < len(RAYS) and rays < 1.0 + 2.0 * reading.half * d:
             rays = RAYS[wide]
             wide += 1
-            step = 2.0 * reading.half / (rays - 1)
-            c1, s1 = math.cos(step), math.sin(step)
-        best, off_x, off_y = 0.0, d, 0.0
-        u, v = axis_x, axis_y
-        for _ in range(rays):
-            column, row = int(math.floor(x + d * u)), int(math.floor(y + d * v))
-            here = around.unknown
-            if 0 <= row < height and 0 <= column < width:
-                here = hits[row, column]
-                if here > best and d < through and around.cos2_limit > 0.0:
-                    nx, ny = around.normal_x[row, column], around.normal_y[row, column]
-                    along = u * nx + v * ny
-                    if (nx != 0.0 or ny != 0.0) and along * along < around.cos2_limit:
-                        here = 0.0
-                if here > best:
-                    off_x, off_y = column + 0.5 - x, row + 0.5 - y
-            best = max(best, here)
-            u, v = u * c1 - v * s1, u * s1 + v * c1
-        distance = math.sqrt(off_x * off_x + off_y * off_y)
-        error = (reading.z - distance * resolution) / reading.sigma
-        if abs(error) <= CUT:
-            hit += survival * best * density(error, reading.sigma)
-        survival *= 1.0 - best
-        if survival < 1e-4:
-            break
-    return float(math.log(reading.floor + weight * (hit + survival * reading.silence)) - reading.unknown)
+        best[:], ray[:] = 0.0, -1.0
+        for k in range(rays):
+            _meet(around, lanes, wide, k, d)
+            _raise(around, lanes, wide, k, around.cos2_limit if d < through else 0.0)
+        if d > heard:
+            _hear(reading, resolution, lanes, wide, d)
+        for p in range(len(best)):
+            s = survival[p]
+            survival[p] = s * (1.0 - best[p]) if s >= LEAST_SURVIVAL else s
 
 
 @kernel
-def score_poses(scan: Scan, around: LocalMap, poses: Any, stride: int, out: Any) -> None:
-    """Write Σ log ratio of a scan from each pose, shape (P, 3), to `out`; of every `stride`-th reading, times that."""
-    for k in range(len(poses)):
-        total = 0.0
-        pose = poses[k, 0], poses[k, 1], poses[k, 2]
+def score_poses(scan: Scan, around: LocalMap, poses: Any, stride: int, lanes: Lanes, out: Any) -> None:
+    """Write Σ log ratio of a scan from each pose, shape (P, 3), to `out`; of every `stride`-th reading, times that.
+
+    P is a multiple of the number of lanes. It is quickest where poses of the same yaw follow each other.
+    """
+    resolution, count = around.resolution, len(lanes.x)
+    out[:] = 0.0
+    for first in range(0, len(poses), count):
         for t in range(0, len(scan.readings), stride):
-            total += _log_ratio(scan.readings[t], scan.weight, around, pose)
-        out[k] = total * stride
+            reading = scan.readings[t]
+            c, s = 0.0, 0.0
+            for p in range(count):
+                x, y, yaw = poses[first + p]
+                if p and yaw == poses[first + p - 1, 2]:
+                    _copy_fan(lanes, p)
+                else:
+                    c, s = math.cos(yaw), math.sin(yaw)
+                    _fan_out(reading, yaw, resolution, lanes, p)
+                lanes.x[p] = (x + c * reading.x - s * reading.y) / resolution - around.column
+                lanes.y[p] = (y + s * reading.x + c * reading.y) / resolution - around.row
+            _walk(reading, around, lanes)
+            for p in range(count):
+                heard = lanes.hit[p] + lanes.survival[p] * reading.silence
+                out[first + p] += math.log(reading.floor + scan.weight * heard) - reading.unknown
+    for k in range(len(poses)):
+        out[k] *= stride
 
 
 def scores(scan: Scan, around: LocalMap, poses: Floats, stride: int = 1) -> Floats:
     """Return Σ log p(z | map) − log p(z | nothing known) of a scan from each pose, shape (P, 3), in nats."""
-    out = np.empty(len(poses))
-    score_poses(scan, around, np.ascontiguousarray(poses), stride, out)
+    count = len(poses)
+    lanes = _lanes(min(-(-count // SIDE_BY_SIDE) * SIDE_BY_SIDE, LANES))
+    whole = -(-count // len(lanes.x)) * len(lanes.x)
+    order = np.argsort(poses[:, 2], kind='stable')
+    # lanes that are left over repeat the last pose
+    asked = np.concatenate([order, np.full(whole - count, order[-1] if count else 0)])
+    found, out = np.empty(whole), np.empty(count)
+    score_poses(scan, around, poses[asked], stride, lanes, found)
+    out[order] = found[:count]
     return out

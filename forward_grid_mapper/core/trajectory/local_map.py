@@ -49,8 +49,9 @@ class LocalMap(NamedTuple):
         Metres.
     hit : float32, shape (height, width)
         Probability that a cell returns the echo of a reading that reaches it.
-    normal_x, normal_y : float32, shape (height, width)
-        Along the normal of the surface, as of `SurfaceNormals`; 0 where it is not known.
+    cells : float32, shape (height * width + 1, 3)
+        `hit` and the unit vector along the normal of the surface, as of `SurfaceNormals`, NaN where it is not known. The
+        last row is for what lies outside.
     cos2_limit : float
         As in `surface_normals.SurfaceNormals`.
     unknown : float
@@ -61,10 +62,18 @@ class LocalMap(NamedTuple):
     row: float
     resolution: float
     hit: NDArray[np.float32]
-    normal_x: NDArray[np.float32]
-    normal_y: NDArray[np.float32]
+    cells: NDArray[np.float32]
     cos2_limit: float
     unknown: float
+
+
+def cells_of(hit: NDArray[np.float32], x: NDArray[np.float32], y: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return the `cells` of a local map, given the normals of the surfaces: 0 where they are not known."""
+    out = np.full((hit.size + 1, 3), np.nan, np.float32)
+    out[:-1, 0] = hit.ravel()
+    known = (x.ravel() != 0) | (y.ravel() != 0)
+    out[:-1, 1], out[:-1, 2] = (np.where(known, each.ravel(), np.float32(np.nan)) for each in (x, y))
+    return out
 
 
 def for_matching(parameters: Parameters) -> Parameters:
@@ -100,15 +109,14 @@ def soft_map(evidence: Evidence, grid: Grid, traversed: NDArray[np.bool_], model
     ml = evidence.observed()
     p_hit, normals = hit_probability(model, grid.resolution), evidence.state.normals
     hit = np.where(ml == 1, OCCUPIED, np.where((ml == 0) | traversed, FREE, UNKNOWN)) * p_hit
-    none = np.zeros(grid.shape, np.float32)
-    known = len(normals.known) > 0
+    hit = hit.astype(np.float32)
+    x, y = (normals.x, normals.y) if len(normals.known) else np.zeros((2, hit.size), np.float32)
     return LocalMap(
         float(grid.column),
         float(grid.row),
         grid.resolution,
-        hit.astype(np.float32),
-        normals.x.reshape(grid.shape) if known else none,
-        normals.y.reshape(grid.shape) if known else none,
+        hit,
+        cells_of(hit, x, y),
         normals.cos2_limit,
         UNKNOWN * p_hit,
     )

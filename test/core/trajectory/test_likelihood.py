@@ -11,7 +11,7 @@ from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.common.readings import Readings
 from forward_grid_mapper.core.sensor.density import CUT
 from forward_grid_mapper.core.trajectory.likelihood import RAYS, SPREAD, make_scan, scores
-from forward_grid_mapper.core.trajectory.local_map import UNKNOWN, LocalMap, at_poses, local_map
+from forward_grid_mapper.core.trajectory.local_map import UNKNOWN, LocalMap, at_poses, cells_of, local_map
 from forward_grid_mapper.core.trajectory.loops import LARGE, searched
 from forward_grid_mapper.core.trajectory.matching import CURVED, grid_around, measure
 from forward_grid_mapper.core.trajectory.poses import compose
@@ -29,7 +29,7 @@ def made_map(seed: int, normals: bool) -> LocalMap:
     angle = rng.uniform(0, math.pi, hit.shape)
     known = (rng.random(hit.shape) < 0.5) & normals
     x, y = (np.where(known, f(angle), 0).astype(np.float32) for f in (np.cos, np.sin))
-    return LocalMap(-25.0, -20.0, 0.1, hit, x, y, math.cos(0.7) ** 2 if normals else 0.0, NOTHING)
+    return LocalMap(-25.0, -20.0, 0.1, hit, cells_of(hit, x, y), math.cos(0.7) ** 2 if normals else 0.0, NOTHING)
 
 
 def made_readings(seed: int, count: int = 30) -> Readings:
@@ -72,9 +72,9 @@ def log_likelihood(readings: Readings, t: int, around: LocalMap | None, pose: tu
                 row = math.floor((y + d * math.sin(bearing)) / 0.1 - around.row)
                 if 0 <= row < around.hit.shape[0] and 0 <= column < around.hit.shape[1]:
                     here = float(around.hit[row, column])
-                    n = around.normal_x[row, column], around.normal_y[row, column]
+                    n = around.cells[row * around.hit.shape[1] + column, 1:]
                     along = math.cos(bearing) * n[0] + math.sin(bearing) * n[1]
-                    if d < z - 2 * sigma and any(n) and along * along < around.cos2_limit:
+                    if d < z - 2 * sigma and not any(np.isnan(n)) and along * along < around.cos2_limit:
                         here = 0.0
                     far = math.hypot((column + 0.5 + around.column) * 0.1 - x, (row + 0.5 + around.row) * 0.1 - y)
             if here > best:
@@ -173,7 +173,7 @@ def test_a_bare_wall_measures_no_way_along_it() -> None:
     hit = np.full((60, 60), 0.01, np.float32)
     hit[40] = 0.66
     none = np.zeros_like(hit)
-    around = LocalMap(-30.0, -30.0, 0.1, hit, none, none, 0.0, NOTHING)
+    around = LocalMap(-30.0, -30.0, 0.1, hit, cells_of(hit, none, none), 0.0, NOTHING)
     readings = Readings.from_columns(
         x=np.linspace(-0.2, 0.2, 9), y=0.0, yaw=math.pi / 2, z=np.full(9, 1.02), z_max=4.0, half_angle=0.13
     )
