@@ -122,9 +122,9 @@ class Lanes(NamedTuple):
         The largest probability that rays have met so far in a ring, and which of them met it first on the map, or −1.
     survival, hit : float64, shape (L,)
         s_d, and Σ s_d h_d N(z; d, σ).
-    cell : int32, shape (L,)
-        What a ray meets: a row of `cells` of the map.
-    met : float32, shape (3, L)
+    cell : int32, shape (RAYS[-1], L)
+        What each ray meets in a ring: a row of `cells` of the map.
+    met : float32, shape (RAYS[-1], 3, L)
         That row.
     """
 
@@ -142,14 +142,15 @@ class Lanes(NamedTuple):
 def _lanes(count: int) -> Lanes:
     x, y, best, ray, survival, hit = np.zeros((6, count))
     fan = np.zeros((1 + len(RAYS), RAYS[-1], 2, count))
-    return Lanes(x, y, fan, best, ray, survival, hit, np.zeros(count, np.int32), np.zeros((3, count), np.float32))
+    return Lanes(x, y, fan, best, ray, survival, hit, np.zeros((RAYS[-1], count), np.int32), np.zeros((RAYS[-1], 3, count), np.float32))
 
 
 @kernel
-def _fan_out(reading: Any, yaw: float, resolution: float, lanes: Lanes, p: int) -> None:
-    """Set the rays of a reading in one lane, as many as it needs."""
+def _fan_out(reading: Any, yaw: float, resolution: float, lanes: Lanes, part: tuple[int, int]) -> None:
+    """Set the rays of a reading, as many as it needs, in some lanes, all of one yaw."""
     fan, begin = lanes.fan, yaw + reading.yaw - reading.half
-    fan[0, 0, 0, p], fan[0, 0, 1, p] = math.cos(begin), math.sin(begin)
+    axis_x, axis_y = math.cos(begin), math.sin(begin)
+    fan[0, 0, 0, part[0] : part[1]], fan[0, 0, 1, part[0] : part[1]] = axis_x, axis_y
     rays, last = 1, math.ceil(reading.reach / resolution) - 0.5
     for wide in range(len(RAYS)):
         if rays >= 1.0 + 2.0 * reading.half * last:
@@ -157,49 +158,44 @@ def _fan_out(reading: Any, yaw: float, resolution: float, lanes: Lanes, p: int) 
         rays = RAYS[wide]
         step = 2.0 * reading.half / (rays - 1)
         c, s = math.cos(step), math.sin(step)
-        u, v = fan[0, 0, 0, p], fan[0, 0, 1, p]
+        u, v = axis_x, axis_y
         for k in range(rays):
-            fan[wide + 1, k, 0, p], fan[wide + 1, k, 1, p] = u, v
+            fan[wide + 1, k, 0, part[0] : part[1]], fan[wide + 1, k, 1, part[0] : part[1]] = u, v
             u, v = u * c - v * s, u * s + v * c
 
 
 @kernel
-def _copy_fan(lanes: Lanes, p: int) -> None:
-    """Set the rays of a lane to those of the one before it."""
-    fan = lanes.fan
-    for wide in range(1 + len(RAYS)):
-        for k in range(RAYS[wide - 1] if wide else 1):
-            fan[wide, k, 0, p], fan[wide, k, 1, p] = fan[wide, k, 0, p - 1], fan[wide, k, 1, p - 1]
-
-
-@kernel
-def _meet(around: LocalMap, lanes: Lanes, wide: int, k: int, d: float) -> None:
-    """Set what the k-th ray of each lane meets at distance d."""
+def _meet(around: LocalMap, lanes: Lanes, wide: int, rays: int, d: float) -> None:
+    """Set what the rays of each lane meet at distance d."""
     x, y, fan, cell, met, cells = lanes.x, lanes.y, lanes.fan, lanes.cell, lanes.met, around.cells
     height, width = float(around.hit.shape[0]), float(around.hit.shape[1])
-    for p in range(len(x)):
-        column, row = np.floor(x[p] + d * fan[wide, k, 0, p]), np.floor(y[p] + d * fan[wide, k, 1, p])
-        inside = (row >= 0.0) & (row < height) & (column >= 0.0) & (column < width)
-        cell[p] = np.int32(row * width + column if inside else height * width)
-    for p in range(len(x)):
-        at = np.uint32(cell[p])
-        met[0, p], met[1, p], met[2, p] = cells[at, 0], cells[at, 1], cells[at, 2]
+    for k in range(rays):
+        for p in range(len(x)):
+            column, row = np.floor(x[p] + d * fan[wide, k, 0, p]), np.floor(y[p] + d * fan[wide, k, 1, p])
+            inside = (row >= 0.0) & (row < height) & (column >= 0.0) & (column < width)
+            cell[k, p] = np.int32(row * width + column if inside else height * width)
+        for p in range(len(x)):
+            at = np.uint32(cell[k, p])
+            met[k, 0, p], met[k, 1, p], met[k, 2, p] = cells[at, 0], cells[at, 1], cells[at, 2]
 
 
 @kernel
-def _raise(around: LocalMap, lanes: Lanes, wide: int, k: int, limit: float) -> None:
-    """Raise the largest probability of a ring to what the k-th rays met."""
+def _raise(around: LocalMap, lanes: Lanes, wide: int, rays: int, limit: float) -> None:
+    """Set the largest probability that the rays of each lane met."""
     best, ray, fan, cell, met = lanes.best, lanes.ray, lanes.fan, lanes.cell, lanes.met
-    outside, unknown, this = len(around.cells) - 1, around.unknown, float(k)
-    for p in range(len(best)):
-        # NaN where there is no normal, and not below the limit
-        along = fan[wide, k, 0, p] * met[1, p] + fan[wide, k, 1, p] * met[2, p]
-        here = 0.0 if along * along < limit else np.float64(met[0, p])
-        beyond = cell[p] == outside
-        here = unknown if beyond else here
-        more = here > best[p]
-        best[p] = here if more else best[p]
-        ray[p] = this if more & (not beyond) else ray[p]
+    outside, unknown = len(around.cells) - 1, around.unknown
+    best[:], ray[:] = 0.0, -1.0
+    for k in range(rays):
+        this = float(k)
+        for p in range(len(best)):
+            # NaN where there is no normal, and not below the limit
+            along = fan[wide, k, 0, p] * met[k, 1, p] + fan[wide, k, 1, p] * met[k, 2, p]
+            here = 0.0 if along * along < limit else np.float64(met[k, 0, p])
+            beyond = cell[k, p] == outside
+            here = unknown if beyond else here
+            more = here > best[p]
+            best[p] = here if more else best[p]
+            ray[p] = this if more & (not beyond) else ray[p]
 
 
 @kernel
@@ -221,7 +217,7 @@ def _hear(reading: Any, resolution: float, lanes: Lanes, wide: int, d: float) ->
 @kernel
 def _walk(reading: Any, around: LocalMap, lanes: Lanes) -> None:
     """Walk the cone of a reading ring by ring, in all lanes."""
-    resolution, best, ray, survival = around.resolution, lanes.best, lanes.ray, lanes.survival
+    resolution, best, survival = around.resolution, lanes.best, lanes.survival
     through = (reading.z - THROUGH * reading.sigma) / resolution
     heard = (reading.z - CUT * reading.sigma) / resolution - OFF
     rays, wide = 1, 0
@@ -231,10 +227,8 @@ def _walk(reading: Any, around: LocalMap, lanes: Lanes) -> None:
         while wide < len(RAYS) and rays < 1.0 + 2.0 * reading.half * d:
             rays = RAYS[wide]
             wide += 1
-        best[:], ray[:] = 0.0, -1.0
-        for k in range(rays):
-            _meet(around, lanes, wide, k, d)
-            _raise(around, lanes, wide, k, around.cos2_limit if d < through else 0.0)
+        _meet(around, lanes, wide, rays, d)
+        _raise(around, lanes, wide, rays, around.cos2_limit if d < through else 0.0)
         if d > heard:
             _hear(reading, resolution, lanes, wide, d)
         for p in range(len(best)):
@@ -253,16 +247,17 @@ def score_poses(scan: Scan, around: LocalMap, poses: Any, stride: int, lanes: La
     for first in range(0, len(poses), count):
         for t in range(0, len(scan.readings), stride):
             reading = scan.readings[t]
-            c, s = 0.0, 0.0
-            for p in range(count):
-                x, y, yaw = poses[first + p]
-                if p and yaw == poses[first + p - 1, 2]:
-                    _copy_fan(lanes, p)
-                else:
-                    c, s = math.cos(yaw), math.sin(yaw)
-                    _fan_out(reading, yaw, resolution, lanes, p)
-                lanes.x[p] = (x + c * reading.x - s * reading.y) / resolution - around.column
-                lanes.y[p] = (y + s * reading.x + c * reading.y) / resolution - around.row
+            begin = 0
+            while begin < count:
+                end, yaw = begin, poses[first + begin, 2]
+                c, s = math.cos(yaw), math.sin(yaw)
+                while end == begin or (end < count and poses[first + end, 2] == yaw):
+                    x, y = poses[first + end, 0], poses[first + end, 1]
+                    lanes.x[end] = (x + c * reading.x - s * reading.y) / resolution - around.column
+                    lanes.y[end] = (y + s * reading.x + c * reading.y) / resolution - around.row
+                    end += 1
+                _fan_out(reading, yaw, resolution, lanes, (begin, end))
+                begin = end
             _walk(reading, around, lanes)
             for p in range(count):
                 heard = lanes.hit[p] + lanes.survival[p] * reading.silence
