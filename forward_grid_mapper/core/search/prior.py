@@ -81,15 +81,24 @@ def wall_prior(parameters: SearchParameters, traversed: NDArray[np.bool_], resol
     return Prior(_local(-parameters.wall_cost * resolution, traversed), shapes(parameters.end_cost))
 
 
-def shapes(end_cost: float) -> Floats:
-    """Return what each of the 256 patterns adds to the log prior odds of an occupied cell, nats."""
-    out = np.full(256, -end_cost)
-    out[0] = -2.0 * end_cost
+def _ends() -> Floats:
+    """Return how many ends of a wall each of the 256 patterns leaves."""
+    out = np.ones(256)
+    out[0] = 2.0
     for pattern in range(1, 256):
         bits = [k for k in range(8) if pattern >> k & 1]
         if any(min((a - b) % 8, (b - a) % 8) >= OPPOSITE_ENOUGH for a in bits for b in bits):
             out[pattern] = 0.0
     return out
+
+
+_ENDS = _ends()
+
+
+def shapes(end_cost: float) -> Floats:
+    """Return what each of the 256 patterns adds to the log prior odds of an occupied cell, nats."""
+    # 0, rather than −0, where there is no end
+    return 0.0 - end_cost * _ENDS
 
 
 def _local(odds: float, traversed: NDArray[np.bool_]) -> Floats:

@@ -142,7 +142,8 @@ class Lanes(NamedTuple):
 def _lanes(count: int) -> Lanes:
     x, y, best, ray, survival, hit = np.zeros((6, count))
     fan = np.zeros((1 + len(RAYS), RAYS[-1], 2, count))
-    return Lanes(x, y, fan, best, ray, survival, hit, np.zeros((RAYS[-1], count), np.int32), np.zeros((RAYS[-1], 3, count), np.float32))
+    cell, met = np.zeros((RAYS[-1], count), np.int32), np.zeros((RAYS[-1], 3, count), np.float32)
+    return Lanes(x, y, fan, best, ray, survival, hit, cell, met)
 
 
 @kernel
@@ -269,12 +270,12 @@ def score_poses(scan: Scan, around: LocalMap, poses: Any, stride: int, lanes: La
 def scores(scan: Scan, around: LocalMap, poses: Floats, stride: int = 1) -> Floats:
     """Return Σ log p(z | map) − log p(z | nothing known) of a scan from each pose, shape (P, 3), in nats."""
     count = len(poses)
-    lanes = _lanes(min(-(-count // SIDE_BY_SIDE) * SIDE_BY_SIDE, LANES))
-    whole = -(-count // len(lanes.x)) * len(lanes.x)
+    rounds = max(-(-count // LANES), 1)
+    wide = max(-(-count // (rounds * SIDE_BY_SIDE)), 1) * SIDE_BY_SIDE
     order = np.argsort(poses[:, 2], kind='stable')
     # lanes that are left over repeat the last pose
-    asked = np.concatenate([order, np.full(whole - count, order[-1] if count else 0)])
-    found, out = np.empty(whole), np.empty(count)
-    score_poses(scan, around, poses[asked], stride, lanes, found)
+    asked = np.concatenate([order, np.full(rounds * wide - count, order[-1])])
+    found, out = np.empty(len(asked)), np.empty(count)
+    score_poses(scan, around, poses[asked], stride, _lanes(wide), found)
     out[order] = found[:count]
     return out

@@ -50,8 +50,8 @@ class LocalMap(NamedTuple):
     hit : float32, shape (height, width)
         Probability that a cell returns the echo of a reading that reaches it.
     cells : float32, shape (height * width + 1, 3)
-        `hit` and the unit vector along the normal of the surface, as of `SurfaceNormals`, NaN where it is not known. The
-        last row is for what lies outside.
+        `hit` and the unit vector along the normal of the surface, as of `SurfaceNormals`, NaN where it is not known.
+        The last row is for what lies outside.
     cos2_limit : float
         As in `surface_normals.SurfaceNormals`.
     unknown : float
@@ -108,8 +108,8 @@ def soft_map(evidence: Evidence, grid: Grid, traversed: NDArray[np.bool_], model
     """Return the probabilities of a map that was searched."""
     ml = evidence.observed()
     p_hit, normals = hit_probability(model, grid.resolution), evidence.state.normals
-    hit = np.where(ml == 1, OCCUPIED, np.where((ml == 0) | traversed, FREE, UNKNOWN)) * p_hit
-    hit = hit.astype(np.float32)
+    shown = np.where(ml == 1, OCCUPIED, np.where((ml == 0) | traversed, FREE, UNKNOWN))
+    hit = (shown * p_hit).astype(np.float32)
     x, y = (normals.x, normals.y) if len(normals.known) else np.zeros((2, hit.size), np.float32)
     return LocalMap(
         float(grid.column),

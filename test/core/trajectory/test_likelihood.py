@@ -10,7 +10,7 @@ import pytest
 from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.common.readings import Readings
 from forward_grid_mapper.core.sensor.density import CUT
-from forward_grid_mapper.core.trajectory.likelihood import RAYS, SPREAD, make_scan, scores
+from forward_grid_mapper.core.trajectory.likelihood import LANES, RAYS, SIDE_BY_SIDE, SPREAD, make_scan, scores
 from forward_grid_mapper.core.trajectory.local_map import UNKNOWN, LocalMap, at_poses, cells_of, local_map
 from forward_grid_mapper.core.trajectory.loops import LARGE, searched
 from forward_grid_mapper.core.trajectory.matching import CURVED, grid_around, measure
@@ -99,6 +99,17 @@ def test_scores_are_those_of_plain_python(normals: bool) -> None:
         for pose in poses
     ]
     assert scores(scan, around, poses) == pytest.approx(wanted, abs=2e-3)
+
+
+@pytest.mark.parametrize('count', [1, SIDE_BY_SIDE + 1, LANES, LANES + 1, 2 * LANES + 5])
+def test_poses_that_are_asked_side_by_side_do_not_change_each_other(count: int) -> None:
+    around, readings, rng = made_map(1, True), made_readings(5), np.random.default_rng(count)
+    scan = make_scan(readings, np.stack([readings.x, readings.y, readings.yaw], 1), MODEL, 0.1, NOTHING)
+    # some stand off the map; some have one yaw, in any order
+    poses = rng.uniform(-4.0, 4.0, (count, 3))
+    poses[:, 2] = np.where(rng.random(count) < 0.5, poses[:, 2].round(), poses[:, 2])
+    each = [scores(scan, around, pose[None], 2)[0] for pose in poses]
+    assert (scores(scan, around, poses, 2) == each).all()
 
 
 def test_readings_of_what_nobody_knows_count_nothing() -> None:
