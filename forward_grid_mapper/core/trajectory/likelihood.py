@@ -38,7 +38,7 @@ LEAST_SURVIVAL = 1e-4
 OFF = 1.0
 """Cells by which the middle of a cell that a ray meets may be off the ring at the most, and more."""
 
-LANES, SIDE_BY_SIDE = 64, 16
+LANES, SIDE_BY_SIDE = 64, 4
 """Poses that are asked side by side at the most, and of what they are a multiple."""
 
 SCAN = np.dtype(

@@ -337,6 +337,8 @@ class _Normal:
 
     def draw(self, count: int, rng: np.random.Generator) -> Floats:
         """Return deviations of all unknowns, shape (3 K + C + 2 W, count)."""
+        if not count:
+            return np.zeros((self.size, 0))
         roots = np.linalg.cholesky(self.information + 1e-9 * np.eye(3))
         noise = rng.standard_normal((len(roots), 3, count))
         right = self.j.T @ np.einsum('eij,ejs->eis', roots, noise).reshape(3 * len(roots), count)
