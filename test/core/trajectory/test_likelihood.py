@@ -10,7 +10,15 @@ import pytest
 from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.common.readings import Readings
 from forward_grid_mapper.core.sensor.density import CUT
-from forward_grid_mapper.core.trajectory.likelihood import LANES, LEAST_SURVIVAL, RAYS, SIDE_BY_SIDE, SPREAD, make_scan, scores
+from forward_grid_mapper.core.trajectory.likelihood import (
+    LANES,
+    LEAST_SURVIVAL,
+    RAYS,
+    SIDE_BY_SIDE,
+    SPREAD,
+    make_scan,
+    scores,
+)
 from forward_grid_mapper.core.trajectory.local_map import UNKNOWN, LocalMap, at_poses, cells_of, local_map
 from forward_grid_mapper.core.trajectory.loops import LARGE, searched
 from forward_grid_mapper.core.trajectory.matching import CURVED, grid_around, measure
