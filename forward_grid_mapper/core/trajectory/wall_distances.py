@@ -39,6 +39,11 @@ PEAKS = 2
 MARGIN = math.radians(0.5)
 """Radians that the yaw may be off."""
 
+AHEAD, BESIDE = 0.3, math.radians(3.0)
+"""Radians from the yaw of the robot up to which a wall is ahead, and radians beside cones that its normal may then lie
+where none holds it: robots often look past straight ahead on both sides, a rough wall is heard all the same, and walls
+ahead tell the scale of odometry. Beside the robot, where walls hold the drive straight, this makes it less straight."""
+
 GATE, GATE_OF_SCALE = (0.08, 0.06), (0.04, 0.02)
 """Metres by which a wall may seem to have moved since it was last measured, and that a metre nearer or farther, where
 the scale of odometry counts: at first, and once the nodes are known better."""
@@ -93,14 +98,19 @@ class Distances:
         sensor = compose(w.corrected(w.progress[which], w.robot[which], self._nodes), w.mount[which])
         at = self._nodes[middle]
         rows: list[tuple[float, ...]] = []
+        half, z = w.readings.half_angle[which], w.readings.z[which]
         for direction in range(4):
             angle = direction * math.pi / 2
-            heard = np.abs(wrapped(sensor[:, 2] - angle)) <= w.readings.half_angle[which] + MARGIN
-            mine = which[heard]
-            off = sensor[heard, :2] - at[:2]
+            off = wrapped(sensor[:, 2] - angle)
+            heard = np.abs(off) <= half + MARGIN
+            if heard.sum() < FEWEST and abs(wrapped(at[2] - angle)) < AHEAD:
+                heard = np.abs(off) <= half + BESIDE
+            # the edge of the cone is the first to meet a wall whose normal lies beside it
+            slant = (off - np.clip(off, -half, half))[heard]
+            arm, ranges = sensor[heard, :2] - at[:2], z[heard]
             c, s = math.cos(angle), math.sin(angle)
-            distance, lever = off @ (c, s) + w.readings.z[mine], off @ (s, -c)
-            for same in agreeing(distance, w.progress[mine]):
+            distance, lever = arm @ (c, s) + ranges * np.cos(slant), arm @ (s, -c) - ranges * np.sin(slant)
+            for same in agreeing(distance, w.progress[which[heard]]):
                 rows.append((middle, direction, distance[same].mean(), lever[same].mean(), at[2]))
         return rows
 
