@@ -270,6 +270,8 @@ def score_poses(scan: Scan, around: LocalMap, poses: Any, stride: int, lanes: La
 def scores(scan: Scan, around: LocalMap, poses: Floats, stride: int = 1) -> Floats:
     """Return Σ log p(z | map) − log p(z | nothing known) of a scan from each pose, shape (P, 3), in nats."""
     count = len(poses)
+    if not count:
+        return np.empty(0)
     rounds = max(-(-count // LANES), 1)
     wide = max(-(-count // (rounds * SIDE_BY_SIDE)), 1) * SIDE_BY_SIDE
     order = np.argsort(poses[:, 2], kind='stable')

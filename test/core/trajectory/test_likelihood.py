@@ -113,7 +113,7 @@ def test_scores_are_those_of_plain_python(normals: bool) -> None:
     assert scores(scan, around, poses) == pytest.approx(wanted, abs=1e-9)
 
 
-@pytest.mark.parametrize('count', [1, SIDE_BY_SIDE + 1, LANES, LANES + 1, 2 * LANES + 5])
+@pytest.mark.parametrize('count', [0, 1, SIDE_BY_SIDE + 1, LANES, LANES + 1, 2 * LANES + 5])
 def test_poses_that_are_asked_side_by_side_do_not_change_each_other(count: int) -> None:
     around, readings, rng = made_map(1, True), made_readings(5), np.random.default_rng(count)
     scan = make_scan(readings, np.stack([readings.x, readings.y, readings.yaw], 1), MODEL, 0.1, NOTHING)
