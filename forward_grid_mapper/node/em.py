@@ -31,7 +31,8 @@ from .refining import RefiningMapper
 class Outcome:
     """How a run ended: `maps`, or None and the reason in `message`.
 
-    `warnings` say what is wrong with the readings, `health` how each sensor does, `trajectory` what became of it.
+    `warnings` say what is wrong with the readings, `health` how each sensor does, `trajectory` what became of it,
+    `waited` the seconds that went by until kernels were compiled.
     """
 
     maps: MapSet | None
@@ -39,6 +40,7 @@ class Outcome:
     trajectory: str = ''
     warnings: list[str] = field(default_factory=list)
     health: dict[str, SensorHealth] = field(default_factory=dict)
+    waited: float = 0.0
 
 
 @dataclass
@@ -160,13 +162,15 @@ class EmWorker:
 
         try:
             run.stage = 'waiting for kernels that are being compiled'
+            begin = time.monotonic()
             self._prepare(lambda: run.cancelled)
+            waited = time.monotonic() - begin
             run.stage = 'starting'
             readings, p = run.readings(), run.parameters
             run.count = len(readings)
             if lack := shortage(map_grid(readings, p).size, len(readings), p.search.threads or cores()):
                 raise InputError(lack)
-            return Outcome(run.mapper.run(readings, watch, run.start), '')
+            return Outcome(run.mapper.run(readings, watch, run.start), '', waited=waited)
         except Cancelled:
             return Outcome(None, 'EM was cancelled')
         except MapperError as error:

@@ -86,6 +86,20 @@ def test_what_comes_while_kernels_are_compiled_is_mapped_as_well(robot: EmRobot)
     assert answer.sent[0][1].startswith('8 readings') and robot.em.explained == 8
 
 
+def test_time_in_which_kernels_are_compiled_is_told_apart(robot: EmRobot) -> None:
+    robot.compiled.clear()
+    answer, begin = robot.run_em(), time.monotonic()
+    robot.until(lambda: time.monotonic() - begin > 0.6)
+    robot.compiled.add('EM')
+    robot.settle()
+    message, spent = answer.sent[0][1], time.monotonic() - begin
+    assert message.endswith(' s in which kernels were compiled, as at each first start')
+    assert float(message.split(' in ')[1].split()[0]) < spent - 0.5
+    quick = robot.run_em()
+    robot.settle()
+    assert 'compiled' not in quick.sent[0][1]
+
+
 def test_kernels_of_the_trajectory_are_waited_for_where_one_is_found(make: Callable[..., EmRobot]) -> None:
     robot = make(refine_poses=True)
     robot.run_em()
