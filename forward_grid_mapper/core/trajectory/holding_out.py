@@ -104,15 +104,13 @@ def held_out_blocks(scans: Scans, most: int) -> list[NDArray[np.int64]]:
     return [chosen[k] for k in blocks_of(len(chosen), 1, most)]
 
 
-def came_back(scans: Scans, *trajectories: Floats) -> bool:
-    """Return whether the robot came back to places, by any of these trajectories, float64, shape (K, 3).
+def came_back(scans: Scans, nodes: Floats) -> bool:
+    """Return whether the robot came back to places, by this trajectory of the nodes, float64, shape (K, 3).
 
     So it is where windows that are held out lie near what was driven `LATER` or before; it takes `FEWEST_BLOCKS`.
     """
     chosen, progress = np.flatnonzero(scans.held_out), scans.windows.node_progress
-    apart = np.abs(progress[chosen, None] - progress) > LATER
-    again = np.zeros(len(chosen), np.bool_)
-    for nodes in trajectories:
-        between = nodes[chosen, None, :2] - nodes[:, :2]
-        again |= ((np.hypot(between[..., 0], between[..., 1]) < NEAR) & apart).any(1)
+    between = nodes[chosen, None, :2] - nodes[:, :2]
+    near = np.hypot(between[..., 0], between[..., 1]) < NEAR
+    again = (near & (np.abs(progress[chosen, None] - progress) > LATER)).any(1)
     return bool(again.sum() >= FEWEST_BLOCKS)

@@ -218,18 +218,19 @@ class Refiner:
         if found.solver is not solver:
             solver, simple = found.solver, found.solver.simple(found.solver.calibration_of(found.along))
         nodes = self._choose(scans, simple, found.along.nodes, found.solution.nodes)
-        if not proven and came_back(scans, windows.node, nodes):
+        if not proven:
             # places seen before tell wheels that are right over metres from those that are not, and walls that stand
-            # askew from a yaw that is off
+            # askew from a yaw that is off; where odometry alone says that the robot came back, it need not be so
+            again = came_back(scans, nodes)
+            if not again and not witnessed:
+                return unproven
             better = self._seen_again(scans, windows.node, nodes)
-            said = f'with places seen before, {_said(better)}'
-            if better.sigmas < LEAST_SIGMAS:
+            said = f'with places seen before, {_said(better)}' if again else _said(better)
+            if better.sigmas < (LEAST_SIGMAS if again else LEAST_SIGMAS_WITH_WALLS):
                 reason = f'{said}: not enough to tell that odometry is off'
                 return replace(unproven, reason=reason, gain=better.mean)
-        elif not proven:
-            if not witnessed:
-                return unproven
-            said = f'that walls stand at right angles is likelier by {witness:.0f} nats than with odometry; {said}'
+            if not again:
+                said = f'that walls stand at right angles is likelier by {witness:.0f} nats than with odometry; {said}'
         if nodes is found.solution.nodes:
             named = dict(zip(CALIBRATION, solver.calibration_of(found.solution).tolist(), strict=True))
         trajectory = refined(odometry, windows, nodes)
