@@ -41,8 +41,8 @@ MARGIN = math.radians(0.5)
 
 AHEAD, BESIDE = 0.3, math.radians(3.0)
 """Radians from the yaw of the robot up to which a wall is ahead, and radians beside cones that its normal may then lie
-where none holds it: robots often look past straight ahead on both sides, a rough wall is heard all the same, and walls
-ahead tell the scale of odometry. Beside the robot, where walls hold the drive straight, this makes it less straight."""
+where none holds it, if no sensor looks straight ahead: sonars often look past it on both sides, a rough wall is heard
+all the same, and walls ahead tell the scale of odometry. Beside the robot the drive would be held less straight."""
 
 GATE, GATE_OF_SCALE = (0.08, 0.06), (0.04, 0.02)
 """Metres by which a wall may seem to have moved since it was last measured, and that a metre nearer or farther, where
@@ -81,6 +81,7 @@ class Distances:
         self._windows, self._nodes = windows, nodes
         readings, first = windows.readings, windows.first
         self._usable = readings.echo & (readings.z < FARTHEST) & ~np.repeat(held_out, np.diff(first))
+        self._looks_past = not (np.abs(wrapped(windows.mount[:, 2])) <= readings.half_angle).any()
         rows = [row for k in range(0, len(windows), BLOCK) for row in self._measured(k)]
         table = np.array(rows, np.float64).reshape(-1, 5)
         self.node, self.direction = table[:, 0].astype(np.int64), table[:, 1].astype(np.int64)
@@ -102,12 +103,11 @@ class Distances:
         for direction in range(4):
             angle = direction * math.pi / 2
             off = wrapped(sensor[:, 2] - angle)
-            heard = np.abs(off) <= half + MARGIN
-            if heard.sum() < FEWEST and abs(wrapped(at[2] - angle)) < AHEAD:
-                heard = np.abs(off) <= half + BESIDE
-            # the edge of the cone is the first to meet a wall whose normal lies beside it
-            slant = (off - np.clip(off, -half, half))[heard]
-            arm, ranges = sensor[heard, :2] - at[:2], z[heard]
+            heard, slant = np.abs(off) <= half + MARGIN, np.zeros(len(off))
+            if self._looks_past and heard.sum() < FEWEST and abs(wrapped(at[2] - angle)) < AHEAD:
+                # the edge of the cone is the first to meet a wall whose normal lies beside it
+                heard, slant = np.abs(off) <= half + BESIDE, off - np.clip(off, -half, half)
+            arm, slant, ranges = sensor[heard, :2] - at[:2], slant[heard], z[heard]
             c, s = math.cos(angle), math.sin(angle)
             distance, lever = arm @ (c, s) + ranges * np.cos(slant), arm @ (s, -c) - ranges * np.sin(slant)
             for same in agreeing(distance, w.progress[which[heard]]):

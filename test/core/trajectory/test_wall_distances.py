@@ -143,14 +143,13 @@ def test_normals_are_right_angles() -> None:
     assert normals_of(np.arange(4)) == pytest.approx(np.stack([np.cos(angle), np.sin(angle)], 1))
 
 
-def ahead(past: float, yaw: float = 0.0) -> Windows:
-    """A drive straight up to a rough wall at x = 8 m, with two sonars that look past its normal on both sides."""
+def ahead(*bearings: float, yaw: float = 0.0) -> Windows:
+    """A drive straight up to a rough wall at x = 8 m, with sonars of these bearings; one that looks at it is deaf."""
     half, x = math.radians(7.5), np.arange(0.0, 6.0, 0.1)
-    stamp = (np.arange(len(x)) * 1e8).astype(np.int64)
-    bearing = np.tile([past, -past], len(x))
-    at = np.repeat(x, 2)
-    # what the cone meets first is its edge
-    z = (8.0 - at) / math.cos(max(past - half, 0.0))
+    stamp, count = (np.arange(len(x)) * 1e8).astype(np.int64), len(bearings)
+    bearing, at = np.tile(bearings, len(x)), np.repeat(x, count)
+    # what a cone meets first is its edge
+    z = np.where(bearing == 0.0, np.inf, (8.0 - at) / np.cos(np.maximum(np.abs(bearing) - half, 0.0)))
     readings = Readings.from_columns(
         x=at,
         y=0.0,
@@ -158,26 +157,28 @@ def ahead(past: float, yaw: float = 0.0) -> Windows:
         z=np.minimum(z, 6.0),
         z_max=6.0,
         half_angle=half,
-        stamp=np.repeat(stamp, 2),
-        sensor=np.tile(np.array([0, 1], np.int32), len(x)),
+        stamp=np.repeat(stamp, count),
+        sensor=np.tile(np.arange(count, dtype=np.int32), len(x)),
     )
     return cut(readings, Odometry.of(stamp, np.column_stack([x, np.zeros(len(x)), np.full(len(x), yaw)])))
 
 
 @pytest.mark.parametrize(('past', 'heard'), [(5.0, True), (10.0, True), (10.4, True), (12.0, False)])
 def test_a_wall_ahead_is_heard_by_cones_that_look_past_it(past, heard) -> None:
-    windows = ahead(math.radians(past))
+    sides = math.radians(past), -math.radians(past)
+    windows = ahead(*sides)
     found = measured(windows)
     assert set(found.direction.tolist()) == ({0} if heard else set())
     assert found.distance == pytest.approx(8.0 - windows.node[found.node, 0], abs=1e-6)
     walls = found.walls(strict=True)
     assert walls.total == heard
-    # beside the robot only cones that hold the normal are asked
-    assert len(measured(ahead(math.radians(past), AHEAD + 0.1)).node) == (len(found.node) if past < 7.5 else 0)
+    # beside the robot only cones that hold the normal are asked, and so they are if there is one that looks ahead
+    for other in (ahead(*sides, yaw=AHEAD + 0.1), ahead(*sides, 0.0)):
+        assert len(measured(other).node) == (len(found.node) if past < 7.5 else 0)
 
 
 def test_the_lever_of_a_wall_ahead_is_the_change_with_the_yaw() -> None:
-    windows, turn = ahead(math.radians(10.0)), 0.002
+    windows, turn = ahead(math.radians(10.0), -math.radians(10.0)), 0.002
     one = measured(windows)
     for k in range(len(one.node)):
         middle = windows.node[one.node[k]]
