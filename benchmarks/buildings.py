@@ -82,15 +82,17 @@ def scored(case: Case, changes: dict[str, Any], tool: ModuleType) -> dict[str, l
 def main() -> None:
     """Run the benchmark."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument('names', nargs='*', default=NAMES, metavar='NAME')
+    parser.add_argument('names', nargs='*', metavar='NAME', help=f'by default {", ".join(NAMES)}')
     parser.add_argument('--set', action='append', default=[], metavar='NAME=VALUE', help='change the default')
     parser.add_argument('--drawn', action='store_true', help='buildings drawn by chance, instead')
+    options = parser.parse_args()
+    if options.drawn and options.names:
+        parser.error('--drawn takes the place of names')
     tool = scoring_tool()
     if tool is None:
         sys.exit('without ../shared/tools/score_map.py there are no figures')
-    options = parser.parse_args()
     changes = dict(setting(text) for text in options.set)
-    quality_worlds.RECORDINGS = tuple(options.names)
+    quality_worlds.RECORDINGS = tuple(options.names or NAMES)
     print(f'{"":38s}' + ''.join(f'{name:>10s}' for name in (*FIGURES, 'log_loss')))
     groups = (
         [('drawn', [building_case(seed) for seed in DRAWN])]

@@ -128,7 +128,7 @@ class EmService:
             else:
                 spent = time.monotonic() - begin
                 waited = min(outcome.waited, spent)
-                compiled = f'after {waited:.0f} s in which kernels were compiled, as at each first start'
+                compiled = f'after {waited:.0f} s in which kernels were compiled, as at the first start'
                 said = [summary(outcome.maps, spent - waited), compiled if waited >= LONG_WAIT else '']
                 reply.send(True, '; '.join(filter(None, [*said, outcome.trajectory])))
 

@@ -93,7 +93,7 @@ def test_time_in_which_kernels_are_compiled_is_told_apart(robot: EmRobot) -> Non
     robot.compiled.add('EM')
     robot.settle()
     message, spent = answer.sent[0][1], time.monotonic() - begin
-    assert message.endswith(' s in which kernels were compiled, as at each first start')
+    assert message.endswith(' s in which kernels were compiled, as at the first start')
     assert float(message.split(' in ')[1].split()[0]) < spent - 0.5
     quick = robot.run_em()
     robot.settle()

@@ -109,8 +109,8 @@ def came_back(scans: Scans, nodes: Floats) -> bool:
 
     So it is where windows that are held out lie near what was driven `LATER` or before; it takes `FEWEST_BLOCKS`.
     """
-    chosen, progress = np.flatnonzero(scans.held_out), scans.windows.node_progress
-    between = nodes[chosen, None, :2] - nodes[:, :2]
-    near = np.hypot(between[..., 0], between[..., 1]) < NEAR
-    again = (near & (np.abs(progress[chosen, None] - progress) > LATER)).any(1)
-    return bool(again.sum() >= FEWEST_BLOCKS)
+    progress, count = scans.windows.node_progress, 0
+    for k in np.flatnonzero(scans.held_out):
+        near = np.hypot(*(nodes[:, :2] - nodes[k, :2]).T) < NEAR
+        count += bool((near & (np.abs(progress - progress[k]) > LATER)).any())
+    return count >= FEWEST_BLOCKS

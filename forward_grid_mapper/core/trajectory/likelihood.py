@@ -169,7 +169,7 @@ def _fan_out(reading: Any, yaw: float, resolution: float, lanes: Lanes, part: tu
 def _meet(around: LocalMap, lanes: Lanes, wide: int, rays: int, d: float) -> None:
     """Set what the rays of each lane meet at distance d."""
     x, y, fan, cell, met, cells = lanes.x, lanes.y, lanes.fan, lanes.cell, lanes.met, around.cells
-    height, width = float(around.hit.shape[0]), float(around.hit.shape[1])
+    height, width = float(around.shape[0]), float(around.shape[1])
     for k in range(rays):
         for p in range(len(x)):
             column, row = np.floor(x[p] + d * fan[wide, k, 0, p]), np.floor(y[p] + d * fan[wide, k, 1, p])

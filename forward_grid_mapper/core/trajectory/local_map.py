@@ -47,11 +47,11 @@ class LocalMap(NamedTuple):
         Lattice indices of the lower left cell.
     resolution : float
         Metres.
-    hit : float32, shape (height, width)
-        Probability that a cell returns the echo of a reading that reaches it.
-    cells : float32, shape (height * width + 1, 3)
-        `hit` and the unit vector along the normal of the surface, as of `SurfaceNormals`, NaN where it is not known.
-        The last row is for what lies outside.
+    shape : int, int
+        Rows and columns.
+    cells : float32, shape (rows * columns + 1, 3)
+        Probability that a cell returns the echo of a reading that reaches it, and the unit vector along the normal of
+        its surface, as of `SurfaceNormals`, NaN where it is not known. The last row is for what lies outside.
     cos2_limit : float
         As in `surface_normals.SurfaceNormals`.
     unknown : float
@@ -61,7 +61,7 @@ class LocalMap(NamedTuple):
     column: float
     row: float
     resolution: float
-    hit: NDArray[np.float32]
+    shape: tuple[int, int]
     cells: NDArray[np.float32]
     cos2_limit: float
     unknown: float
@@ -115,7 +115,7 @@ def soft_map(evidence: Evidence, grid: Grid, traversed: NDArray[np.bool_], model
         float(grid.column),
         float(grid.row),
         grid.resolution,
-        hit,
+        grid.shape,
         cells_of(hit, x, y),
         normals.cos2_limit,
         UNKNOWN * p_hit,

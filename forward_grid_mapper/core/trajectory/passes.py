@@ -80,7 +80,7 @@ def bent(progress: Floats, before: Floats, after: Floats, at: NDArray[np.int64])
     at : int64
         Nodes.
     """
-    near = [np.abs(progress - progress[k]) < AROUND for k in at]
+    near = (np.abs(progress - progress[k]) < AROUND for k in at)
     return np.array([rms_after_alignment(before[each], after[each]) for each in near])
 
 

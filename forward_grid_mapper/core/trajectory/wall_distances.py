@@ -42,7 +42,7 @@ MARGIN = math.radians(0.5)
 AHEAD, BESIDE = 0.3, math.radians(3.0)
 """Radians from the yaw of the robot up to which a wall is ahead, and radians beside cones that its normal may then lie
 where none holds it, if no sensor looks straight ahead: sonars often look past it on both sides, a rough wall is heard
-all the same, and walls ahead tell the scale of odometry. Beside the robot the drive would be held less straight."""
+all the same, and walls ahead tell the scale of odometry. With walls beside the robot as well, real drives are worse."""
 
 GATE, GATE_OF_SCALE = (0.08, 0.06), (0.04, 0.02)
 """Metres by which a wall may seem to have moved since it was last measured, and that a metre nearer or farther, where
