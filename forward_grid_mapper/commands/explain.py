@@ -85,6 +85,7 @@ def explanation_data(
             'range': readings.z[i] if readings.echo[i] else None,
             'distance': found.distance[k],
             'ends_here': found.ends_here[k],
+            'through_wall': found.through_wall[k],
             'stamp': readings.stamp[i],
             'sensor': _name(readings, i),
         }
@@ -188,10 +189,18 @@ def _what_decides(maps: MapArchive, found: CellEvidence, state: int) -> str:
     if not len(found.readings):
         return 'no reading says anything of it'
     if state < 0:
-        return (
+        blocked, count = int(found.through_wall.sum()), len(found.readings)
+        behind = (
+            f'a wall stands in the way of {"all" if blocked == count else blocked} of these readings, and what they '
+            f'say does not count: sound that a wall mirrors seems to come from behind it'
+        )
+        if blocked == count:
+            return behind
+        few = (
             f'too little is known: fewer than {maps.parameters.search.least_passed:g} readings are expected to have '
             f'passed through it, or none that would have noticed a wall there, and nothing makes it occupied'
         )
+        return f'{few}; {behind}' if blocked else few
     if (total > 0) != (state == 1):
         return (
             'by itself it would be the other way: it belongs to a wall that is closed, drawn out or removed as a whole'

@@ -55,6 +55,27 @@ def test_a_cell_is_explained(maps: Path, state: int, word: str, capsys: pytest.C
     assert len(re.findall(r' s  \S+$', said, re.MULTILINE)) == min(explain.SHOWN, len(found.readings))
 
 
+def test_a_cell_behind_a_wall_says_so(maps: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    archive = read_npz(maps / 'maps.npz')
+    readings, normals = read_readings(maps / 'readings.npz', archive)
+    x, y = archive.grid.centers()
+    said: dict[str, str] = {}
+    for row, column in np.argwhere(archive.ml == -1):
+        place = float(x[column]), float(y[row])
+        found = cell_evidence(readings, archive.grid, archive.ml, archive.parameters, normals, place)
+        if not len(found.readings):
+            continue
+        part = 'all' if found.through_wall.all() else 'some' if found.through_wall.any() else 'none'
+        if part not in said:
+            assert code_of(explain.main, maps, *place, '-n', 0) == 0
+            said[part] = capsys.readouterr().out
+        if len(said) == 3:
+            break
+    assert 'a wall stands in the way of all of these' in said['all'] and 'too little' not in said['all']
+    assert re.search(r'too little is known.*; a wall stands in the way of \d+ of these', said['some'])
+    assert 'too little is known' in said['none'] and 'in the way' not in said['none']
+
+
 def test_readings_are_kept_as_they_were(maps: Path) -> None:
     archive = read_npz(maps / 'maps.npz')
     readings, normals = read_readings(maps / 'readings.npz', archive)

@@ -7,13 +7,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ..common.constants import STANDS_OFF
 from ..common.grid import Grid
 from ..common.parameters import Parameters
 from ..common.readings import Floats, Readings
+from ..evidence.pairs import Lattice
 from ..search.prior import odds_given_neighbours, wall_prior
 from ..sensor.cone_table import cone_table
 from ..sensor.forward_model import ForwardModel
 from ..sensor.surface_normals import SurfaceNormals
+from .free_ways import on_free_way
 from .traversed import traversed_cells
 
 NOTHING = 1e-9
@@ -46,6 +49,8 @@ class CellEvidence:
         Whether the range lies within `HERE` σ of that; other readings reach farther, or end before it.
     silent : bool, shape (N,)
         Max-range readings.
+    through_wall : bool, shape (N,)
+        Whether an occupied cell stands on the way to the cell: behind walls, what sound seems to tell does not count.
     prior : float
         Log prior odds of an obstacle given the neighbours of the cell, nats.
     wall : float
@@ -61,6 +66,7 @@ class CellEvidence:
     distance: Floats
     ends_here: NDArray[np.bool_]
     silent: NDArray[np.bool_]
+    through_wall: NDArray[np.bool_]
     prior: float
     wall: float
 
@@ -121,6 +127,9 @@ def cell_evidence(
     order = order[np.abs(nats[order]) > NOTHING]
     which, nats = which[order], nats[order]
     traversed = traversed_cells(readings, grid)
+    lattice, walls = Lattice(grid.height, grid.width, grid.resolution), (ml == 1).ravel()
+    until = distance - STANDS_OFF / grid.resolution
+    blocked = [not on_free_way(cones[i], u[i], v[i], until[i], walls, lattice) for i in which]
     error = np.abs(cones['z'][which] - distance[which])
     return CellEvidence(
         row=int(row),
@@ -131,6 +140,7 @@ def cell_evidence(
         distance=(distance[which] - model.surface_offset) * grid.resolution,
         ends_here=(error <= HERE * cones['sigma'][which]) & readings.echo[which],
         silent=~readings.echo[which],
+        through_wall=np.array(blocked, np.bool_),
         wall=wall,
         prior=float(prior_odds(grid, ml, parameters)[row, column]),
     )

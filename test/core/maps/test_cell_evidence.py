@@ -77,6 +77,14 @@ def test_readings_are_told_apart_by_where_they_end() -> None:
     assert not found.traversed
 
 
+def test_readings_that_went_through_a_wall_say_so() -> None:
+    maps = wall_ahead([1.0] * 6 + [1.6, 2.0])
+    for column, behind in ((5, False), (10, False), (12, False), (16, True)):
+        found = asked(maps, -maps.grid.row, column - maps.grid.column)
+        assert len(found.readings)
+        assert (found.through_wall == behind).all()
+
+
 def test_a_cell_that_a_sensor_was_moved_over_says_so() -> None:
     maps = wall_ahead([1.0] * 6)
     assert asked(maps, -maps.grid.row, -maps.grid.column).traversed
