@@ -4,6 +4,9 @@ Odometry that begins anew, as a driver that is started again, says nothing of wh
 same how it moves from there on. So what lies between two jumps is a drive of its own, and two guesses say where it
 begins: where the robot stood before the jump, or where odometry has it, as where messages are missing. Around both its
 readings are compared with the map of what was driven before.
+
+A turn that is too fast for a robot is most often one of a simulated robot, and right. It is a jump only if readings say
+that the robot did not turn, as where a gyroscope begins anew.
 """
 
 from __future__ import annotations
@@ -27,7 +30,13 @@ LONGEST_STEP = 1.0
 """Metres between two poses of odometry, beyond which it jumped."""
 
 LONGEST_TURN, FASTEST_TURN = 0.5, 2 * math.pi
-"""Radians between two poses, and radians a second, beyond both of which it jumped."""
+"""Radians between two poses, and radians a second, beyond both of which no robot turns."""
+
+MOST_TURNS = 20
+"""Fast turns that are looked at: a robot that turns so more often does turn."""
+
+LOOKED_BACK = 20.0
+"""Metres before such a turn that the map is made of on which readings are compared."""
 
 LONGEST_OUTLIER = 0.5
 """Seconds between the poses before and after others that are outliers."""
@@ -67,11 +76,23 @@ MOST_SAID = 3
 
 
 def jumps(odometry: Odometry) -> NDArray[np.int64]:
-    """Return the numbers of the poses that odometry jumps to."""
+    """Return the numbers of the poses that odometry jumps to; fast turns are not among them."""
+    found, far = _found(odometry)
+    return found[far > LONGEST_STEP]
+
+
+def fast_turns(odometry: Odometry) -> NDArray[np.int64]:
+    """Return the numbers of the poses that odometry turns to faster than a robot can, but moves to as one may."""
+    found, far = _found(odometry)
+    return found[far <= LONGEST_STEP]
+
+
+def _found(odometry: Odometry) -> tuple[NDArray[np.int64], Floats]:
+    """Return the numbers of the poses that no robot gets to from the one before, and how far these are, metres."""
     step, pose = np.diff(odometry.stamp) * 1e-9, odometry.pose
     far = np.hypot(*np.diff(pose[:, :2], axis=0).T)
-    out: NDArray[np.int64] = np.flatnonzero(jumped(far, np.diff(pose[:, 2]), step)) + 1
-    return out
+    found = np.flatnonzero(jumped(far, np.diff(pose[:, 2]), step))
+    return found + 1, far[found]
 
 
 def jumped(far: Any, turn: Any, seconds: Any) -> Any:
@@ -97,7 +118,7 @@ def without_outliers(odometry: Odometry) -> Odometry:
 
     The same object if there are none.
     """
-    stay, found = np.ones(len(odometry.stamp), np.bool_), jumps(odometry).tolist()
+    stay, found = np.ones(len(odometry.stamp), np.bool_), _found(odometry)[0].tolist()
     for begin, end in itertools.pairwise(found):
         around = [begin - 1, end]
         seconds = float(np.diff(odometry.stamp[around])[0]) * 1e-9
@@ -138,13 +159,67 @@ FIRST, STOOD, DRIVEN, UNKNOWN = 'first', 'stood', 'driven', 'unknown'
 where odometry has it, though readings do not tell."""
 
 
+def with_yaw_anew(
+    readings: Readings,
+    odometry: Odometry,
+    jumped_to: NDArray[np.int64],
+    parameters: Parameters,
+    stop: NDArray[np.uint8],
+) -> NDArray[np.int64]:
+    """Return the jumps, and with them those fast turns that the robot did not make, as its readings say.
+
+    Parameters
+    ----------
+    readings : Readings
+        Placed by `odometry`.
+    odometry : Odometry
+    jumped_to : int64, shape (J,)
+        As `jumps` returns them.
+    parameters, stop
+        As in `begins_of`.
+
+    Raises
+    ------
+    Cancelled
+        If `stop` was set.
+    """
+    turns = fast_turns(odometry).tolist()
+    if not 0 < len(turns) <= MOST_TURNS:
+        return jumped_to
+    out, travel = set(jumped_to.tolist()), odometry.travel
+    for at in turns:
+        begin = max((k for k in out if k < at), default=0)
+        end = min((k for k in out if k > at), default=len(odometry.stamp))
+        begin = max(begin, int(np.searchsorted(travel, travel[at] - LOOKED_BACK)))
+        end = min(end, int(np.searchsorted(travel, travel[at] + OWN)))
+        before, after = _piece(odometry, begin, at), _piece(odometry, at, end)
+        part = Part(_read_along(readings, after), after, after, False)
+        on_map = _read_along(readings, before)
+        if min(len(part.readings), len(on_map)) < FEWEST_READINGS:
+            continue
+        # right at the turn odometry has not drifted yet, so nothing is searched
+        around = OnMap(part.readings, after.pose[0], on_map, parameters, stop)
+        usual = _Usual(part, parameters, stop)
+        stood, turned = (usual.fits(around, pose, GOOD_AT_REST) for pose in (before.pose[-1], after.pose[0]))
+        if stood and not turned:
+            out.add(at)
+    return np.array(sorted(out), np.int64)
+
+
+def _piece(odometry: Odometry, begin: int, end: int) -> Odometry:
+    return Odometry(odometry.stamp[begin:end], odometry.pose[begin:end])
+
+
+def _read_along(readings: Readings, path: Odometry) -> Readings:
+    return readings.select((readings.stamp >= path.stamp[0]) & (readings.stamp <= path.stamp[-1]))
+
+
 def parts_at(readings: Readings, odometry: Odometry, jumped_to: NDArray[np.int64]) -> list[tuple[Readings, Odometry]]:
     """Return the readings and the odometry of each part; readings of the time of a jump are of none."""
     parts = []
     for begin, end in itertools.pairwise([0, *jumped_to.tolist(), len(odometry.stamp)]):
-        part = Odometry(odometry.stamp[begin:end], odometry.pose[begin:end])
-        within = (readings.stamp >= part.stamp[0]) & (readings.stamp <= part.stamp[-1])
-        parts.append((readings.select(within), part))
+        part = _piece(odometry, begin, end)
+        parts.append((_read_along(readings, part), part))
     return parts
 
 

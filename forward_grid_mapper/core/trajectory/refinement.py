@@ -24,7 +24,7 @@ from ..runtime.cancelling import check
 from .heading import NOISES, Heading, heading
 from .holding_out import LEAST_SIGMAS, Gain, blocks_of, came_back, foreseen, gain, held_out, held_out_blocks
 from .hypotheses import solved
-from .jumps import MOST_JUMPS, UNKNOWN, Begin, Part, begins_of, jumps, parts_at, without_outliers, words
+from .jumps import MOST_JUMPS, UNKNOWN, Begin, Part, begins_of, jumps, parts_at, with_yaw_anew, without_outliers, words
 from .local_map import at_poses, for_matching
 from .odometry_model import CALIBRATION
 from .passes import BLOCK
@@ -155,17 +155,18 @@ class Refiner:
             If `cancel` was called.
         """
         self._watch = watch
-        reason = without_times(readings, odometry)
-        if not reason and (sound := without_outliers(odometry)) is not odometry:
+        if reason := without_times(readings, odometry):
+            return Refinement(False, reason, readings, odometry, {})
+        if (sound := without_outliers(odometry)) is not odometry:
             found = self.run(replaced(readings, odometry, sound), sound, watch)
             return with_outliers(found, readings, odometry, len(odometry.stamp) - len(sound.stamp))
         jumped_to = jumps(odometry)
+        if len(jumped_to) > MOST_JUMPS:
+            reason = f'odometry jumps {len(jumped_to)} times: it is no wheel odometry, or messages are missing'
+            return Refinement(False, reason, readings, odometry, {})
+        jumped_to = with_yaw_anew(readings, odometry, jumped_to, self._parameters, self._stop)
         if not len(jumped_to):
             return self._whole(readings, odometry)
-        if not reason and len(jumped_to) > MOST_JUMPS:
-            reason = f'odometry jumps {len(jumped_to)} times: it is no wheel odometry, or messages are missing'
-        if reason:
-            return Refinement(False, reason, readings, odometry, {})
         return self._in_parts(readings, odometry, jumped_to)
 
     def _in_parts(self, readings: Readings, odometry: Odometry, jumped_to: NDArray[np.int64]) -> Refinement:

@@ -14,7 +14,7 @@ from forward_grid_mapper.core.common.readings import Readings
 from forward_grid_mapper.core.trajectory import jumps as jumping
 from forward_grid_mapper.core.trajectory.correction import Correction
 from forward_grid_mapper.core.trajectory.following import Follower
-from forward_grid_mapper.core.trajectory.jumps import jumps, since_jump, without_outliers
+from forward_grid_mapper.core.trajectory.jumps import fast_turns, jumps, since_jump, without_outliers
 from forward_grid_mapper.core.trajectory.poses import compose, relative, rms_after_alignment
 from forward_grid_mapper.core.trajectory.refinement import Refinement, Refiner
 from forward_grid_mapper.core.trajectory.windows import Odometry
@@ -55,6 +55,19 @@ def without_messages(readings: Readings, odometry: Odometry, seconds: float) -> 
     return readings.select(~unread), Odometry(odometry.stamp[~gone], odometry.pose[~gone])
 
 
+def turning_at_once(readings: Readings, odometry: Odometry, true: Odometry) -> tuple[Readings, Odometry]:
+    """The same drive of a simulated robot that turns on the spot from one message to the next."""
+    since = odometry.stamp - odometry.stamp[0]
+    still = np.hypot(*np.diff(true.pose[:, :2], axis=0).T) < 1e-6
+    inside = np.append(still[:-1] & still[1:], False)
+    lasts = np.where(inside, 0, np.where(still, 5e7, np.diff(since)))
+    begin, stay = np.r_[0.0, np.cumsum(lasts)], np.r_[True, ~inside]
+    stamp = np.interp(readings.stamp - odometry.stamp[0], since, begin)
+    return replace(readings, stamp=odometry.stamp[0] + np.round(stamp).astype(np.int64)), Odometry.of(
+        odometry.stamp[0] + np.round(begin[stay]).astype(np.int64), odometry.pose[stay]
+    )
+
+
 @pytest.fixture(scope='module')
 def exact() -> Recording:
     return drive(building_world(), building_tour()[:10], 0.15, sonar_ring(16), NOISY, seed=3)
@@ -82,13 +95,14 @@ def test_a_jump_is_what_no_robot_drives(seed: int) -> None:
     seconds = rng.choice([0.01, 0.1, 1.0, 10.0], 60)
     pose = np.cumsum(rng.normal(0.0, [0.5, 0.5, 1.5], (60, 3)), 0)
     odometry = Odometry.of(np.cumsum(np.round(seconds * 1e9)).astype(np.int64), pose)
-    expected = []
+    expected, fast = [], []
     for k in range(1, 60):
         far = math.dist(pose[k - 1, :2], pose[k, :2])
         turn = abs(math.remainder(pose[k, 2] - pose[k - 1, 2], 2 * math.pi))
         if far > 1.0 or (turn > 0.5 and turn / seconds[k] > 2 * math.pi):
-            expected.append(k)
+            (expected if far > 1.0 else fast).append(k)
     assert jumps(odometry).tolist() == expected
+    assert fast_turns(odometry).tolist() == fast
     assert since_jump(odometry).stamp[0] == odometry.stamp[expected[-1]]
 
 
@@ -183,6 +197,34 @@ def test_a_few_messages_before_a_jump_do_not_matter(exact: Recording, bent: tupl
     assert found.accepted
     first = jumps(odometry)[0]
     assert off(exact, found.trajectory.between(int(odometry.stamp[first]), int(odometry.stamp[-1]))) < 0.2
+
+
+def test_a_simulated_robot_may_turn_at_once(exact: Recording, bent: tuple[Readings, Odometry]) -> None:
+    _, true = turning_at_once(exact.readings, odometry_of(exact), odometry_of(exact))
+    readings, odometry = turning_at_once(*bent, odometry_of(exact))
+    assert len(fast_turns(odometry)) == 8 and not len(jumps(odometry))
+    found = Refiner(Parameters()).run(readings, odometry)
+    assert found.accepted and not found.jumps
+    assert rms_after_alignment(odometry.pose, true.pose) > 0.7
+    assert rms_after_alignment(found.trajectory.pose, true.pose) < 0.2
+
+
+@pytest.mark.parametrize('at_once', [False, True])
+def test_a_yaw_that_begins_anew_is_told_from_turns(
+    exact: Recording, bent: tuple[Readings, Odometry], at_once: bool
+) -> None:
+    readings, odometry, true = *bent, odometry_of(exact)
+    if at_once:
+        readings, odometry = turning_at_once(*bent, true)
+        _, true = turning_at_once(exact.readings, true, true)
+    first = int(0.55 * len(odometry.stamp))
+    x, y, yaw = odometry.pose[first].tolist()
+    readings, odometry = begun_anew(readings, odometry, 0.55, (x, y, yaw + 1.2))
+    assert first in fast_turns(odometry) and not len(jumps(odometry))
+    found = Refiner(Parameters()).run(readings, odometry)
+    assert found.accepted and found.jumps.count('the readings fit where the robot was before it') == 1
+    assert rms_after_alignment(odometry.pose, true.pose) > 1.0
+    assert rms_after_alignment(found.trajectory.pose, true.pose) < 0.2
 
 
 def test_odometry_that_always_jumps_is_refused(bent: tuple[Readings, Odometry]) -> None:
