@@ -97,6 +97,8 @@ class Solver:
         self._steps = Edges(count[:-1], count[1:], motion, information)
         yaw = windows.node[heading.at, 2] + heading.measured
         self._yaws = Yaws(heading.at, yaw, heading.information, OF_YAWS)
+        middles = (heading.at[1:] + heading.at[:-1]) / 2
+        self._askew = heading.askew[np.searchsorted(middles, count)]
 
     def calibration_of(self, solution: Solution) -> Floats:
         """Return the whole calibration of the odometry, shape (4,)."""
@@ -184,7 +186,7 @@ class Solver:
         return {key: loop for key, loop in looked.items() if same.issuperset(key)}
 
     def _walls(self, nodes: Floats, strict: bool) -> Walls:
-        return Distances(self._windows, self._scans.held_out, nodes).walls(strict)
+        return Distances(self._windows, self._scans.held_out, nodes, self._askew).walls(strict)
 
     def _graph(self, matches: Edges, walls: Walls) -> Graph:
         return Graph(self._steps, self._change, CALIBRATION_SIGMA, matches, self._yaws, walls)

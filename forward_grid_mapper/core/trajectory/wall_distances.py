@@ -68,17 +68,24 @@ class Distances:
         Windows whose echoes do not count.
     nodes : float64, shape (K, 3)
         In a map whose walls lie along its axes.
+    askew : float64, shape (K,), optional
+        Radians by which the walls around each node are turned from that.
 
     Attributes
     ----------
     node, direction : int64, shape (D,)
-        Node, and direction in right angles from the x axis.
+        Node, and direction in right angles from the x axis, or from that as it is turned there.
+    normal : float64, shape (D, 2)
+        The same as a unit vector.
     distance, lever, yaw : float64, shape (D,)
         As in `pose_graph.Walls`.
     """
 
-    def __init__(self, windows: Windows, held_out: NDArray[np.bool_], nodes: Floats) -> None:
+    def __init__(
+        self, windows: Windows, held_out: NDArray[np.bool_], nodes: Floats, askew: Floats | None = None
+    ) -> None:
         self._windows, self._nodes = windows, nodes
+        self._askew = np.zeros(len(windows)) if askew is None else askew
         readings, first = windows.readings, windows.first
         self._usable = readings.echo & (readings.z < FARTHEST) & ~np.repeat(held_out, np.diff(first))
         self._looks_past = not (np.abs(wrapped(windows.mount[:, 2])) <= readings.half_angle).any()
@@ -86,6 +93,7 @@ class Distances:
         table = np.array(rows, np.float64).reshape(-1, 5)
         self.node, self.direction = table[:, 0].astype(np.int64), table[:, 1].astype(np.int64)
         self.distance, self.lever, self.yaw = table[:, 2], table[:, 3], table[:, 4]
+        self.normal = normals_of(self.direction, self._askew[self.node])
 
     def _measured(self, k: int) -> list[tuple[float, ...]]:
         """Return the rows of the block that begins at window k."""
@@ -101,7 +109,7 @@ class Distances:
         rows: list[tuple[float, ...]] = []
         half, z = w.readings.half_angle[which], w.readings.z[which]
         for direction in range(4):
-            angle = direction * math.pi / 2
+            angle = direction * math.pi / 2 + self._askew[middle]
             off = wrapped(sensor[:, 2] - angle)
             heard, slant = np.abs(off) <= half + MARGIN, np.zeros(len(off))
             if self._looks_past and heard.sum() < FEWEST and abs(wrapped(at[2] - angle)) < AHEAD:
@@ -118,13 +126,12 @@ class Distances:
         """Return the number of the wall that each distance is of, shape (D,); `strict` where nodes are known well."""
         gate, of_scale = GATE[strict], GATE_OF_SCALE[strict]
         progress = self._windows.node_progress[self.node]
-        normal = normals_of(self.direction)
-        robot = (normal * self._nodes[self.node, :2]).sum(1)
+        robot = (self.normal * self._nodes[self.node, :2]).sum(1)
         place = robot + self.distance
         out, count = np.zeros(len(place), np.int64), 0
-        last: list[dict[int, int]] = [{}, {}, {}, {}]
-        for i, direction in enumerate(self.direction.tolist()):
-            open_walls = last[direction]
+        last: dict[tuple[int, float], dict[int, int]] = {}
+        for i, direction in enumerate(zip(self.direction.tolist(), self._askew[self.node].tolist(), strict=True)):
+            open_walls = last.setdefault(direction, {})
             for wall in [wall for wall, j in open_walls.items() if progress[i] - progress[j] > LONGEST_GAP]:
                 del open_walls[wall]
             before = {wall: j for wall, j in open_walls.items() if self.node[j] < self.node[i]}
@@ -143,7 +150,7 @@ class Distances:
         wall = self.tracked(strict)
         kept = np.bincount(wall, minlength=1)[wall] > 1
         wall = np.unique(wall[kept], return_inverse=True)[1].astype(np.int64)
-        node, normal = self.node[kept], normals_of(self.direction[kept])
+        node, normal = self.node[kept], self.normal[kept]
         place = self._nodes[node, :2]
         along = place[:, 1] * normal[:, 0] - place[:, 0] * normal[:, 1]
         if len(wall):
@@ -153,9 +160,11 @@ class Distances:
         return Walls(node, wall, normal, self.distance[kept], self.lever[kept], self.yaw[kept], along, information)
 
 
-def normals_of(direction: NDArray[np.int64]) -> Floats:
-    """Return the unit vectors of directions in right angles, shape (D, 2)."""
-    return np.array([(1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0)])[direction]
+def normals_of(direction: NDArray[np.int64], askew: Floats) -> Floats:
+    """Return the unit vectors of directions in right angles, each turned by an angle in radians, shape (D, 2)."""
+    x, y = np.array([(1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0)])[direction].T
+    c, s = np.cos(askew), np.sin(askew)
+    return np.stack([c * x - s * y, s * x + c * y], axis=1)
 
 
 def agreeing(distance: Floats, progress: Floats) -> list[NDArray[np.int64]]:

@@ -153,7 +153,7 @@ def test_a_vote_is_a_likelihood(bent) -> None:
             row = votes[k]
             here = row[left] + (place - left) * (row[(left + 1) % DIRECTIONS] - row[left])
             wanted = module.DOUBT + (1 - module.DOUBT) * here
-            assert chain.likelihood[k, state] == pytest.approx(wanted)
+            assert chain.likelihood[k, 0, state] == pytest.approx(wanted)
 
 
 def test_noise_that_is_told_is_not_looked_for(bent) -> None:

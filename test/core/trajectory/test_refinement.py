@@ -264,7 +264,7 @@ def test_the_noise_of_odometry_is_estimated_or_told(bent, monkeypatch) -> None:
 def test_what_sensors_say_by_where_they_look_is_no_witness(bent, monkeypatch, by_chance, witness) -> None:
     readings, odometry = bent
     nothing = np.zeros(0)
-    found = Heading(nothing.astype(int), nothing, nothing, nothing, Drifts(0.0, 0.0, 0.02), 1.0, 1.0, 50.0)
+    found = Heading(nothing.astype(int), nothing, nothing, nothing, Drifts(0.0, 0.0, 0.02), 1.0, 1.0, 50.0, nothing)
     answers = [found, None if by_chance is None else replace(found, over_odometry=by_chance)]
     monkeypatch.setattr(refinement, 'heading', lambda *rest: answers.pop(0))
     refiner, windows = Refiner(Parameters()), cut(readings, odometry)
