@@ -1,0 +1,187 @@
+"""Buildings in two parts that stand askew to each other: directions of walls are told from drift of the yaw."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from forward_grid_mapper.core.common.parameters import Parameters
+from forward_grid_mapper.core.trajectory import heading as module
+from forward_grid_mapper.core.trajectory.heading import Drifts, Heading, heading
+from forward_grid_mapper.core.trajectory.poses import compose, rms_after_alignment, wrapped
+from forward_grid_mapper.core.trajectory.refinement import Refinement, Refiner
+from forward_grid_mapper.core.trajectory.wall_distances import Distances
+from forward_grid_mapper.core.trajectory.walls import DIRECTIONS, wall_votes
+from forward_grid_mapper.core.trajectory.windows import Odometry, Windows, cut
+from forward_grid_mapper.simulation.drift import LEVELS, with_drift
+from forward_grid_mapper.simulation.drive import Recording, drive
+from forward_grid_mapper.simulation.sonar import NOISY, sonar_ring
+from forward_grid_mapper.simulation.world import Floorplan, World
+
+KINK = math.radians(25.0)
+PIVOT = np.array([16.0, 5.0])
+LENGTH, HALF = 13.0, 1.0
+"""Metres: the length of each of both corridors, and half of their width."""
+
+
+def along(metres: float, aside: float = 0.0) -> np.ndarray:
+    """A place so far along the middle of both corridors, from the kink on, and to the left of it."""
+    angle = KINK if metres > 0.0 else 0.0
+    c, s = math.cos(angle), math.sin(angle)
+    place: np.ndarray = PIVOT + [metres * c - aside * s, metres * s + aside * c]
+    return place
+
+
+def kinked_world() -> World:
+    """Two corridors with a kink of 25° between them, with cupboards along their walls."""
+    plan = Floorplan('kink', 320, 160)
+
+    def line(*places: np.ndarray) -> None:
+        cells = [tuple(np.floor(place * 10).astype(int).tolist()) for place in places]
+        for start, end in zip(cells, cells[1:], strict=False):
+            plan.line(start, end)
+
+    for side in (-HALF, HALF):
+        corner = PIVOT + side / math.cos(KINK / 2) * np.array([-math.sin(KINK / 2), math.cos(KINK / 2)])
+        line(along(-LENGTH, side), corner, along(LENGTH, side))
+        for metres in (-10.5, -6.0, -4.0, 3.5, 7.0, 10.0):
+            near, far = (metres + (0.6 if side > 0 else 0.0) + more for more in (0.0, 0.8))
+            inner = side - math.copysign(0.3, side)
+            line(along(near, side), along(near, inner), along(far, inner), along(far, side))
+    for end in (-LENGTH, LENGTH):
+        line(along(end, -HALF), along(end, HALF))
+    return plan.world((160, 50))
+
+
+def odometry_of(recording: Recording) -> Odometry:
+    messages = recording.odometry
+    return Odometry.of(np.array([m.stamp for m in messages]), np.array([m.pose for m in messages], float))
+
+
+@pytest.fixture(scope='module')
+def exact() -> Recording:
+    ends = [along(-LENGTH + 1.5), along(0.0), along(LENGTH - 1.5), along(0.0)]
+    way = np.array([*ends, *ends, ends[0]])
+    return drive(kinked_world(), way, 0.15, sonar_ring(16), NOISY, seed=3)
+
+
+@pytest.fixture(scope='module')
+def bent(exact: Recording) -> tuple[Recording, Odometry, Windows]:
+    recording = with_drift(exact, LEVELS['middle'], 6)
+    odometry = odometry_of(recording)
+    return recording, odometry, cut(recording.readings, odometry)
+
+
+@pytest.fixture(scope='module')
+def found(bent: tuple[Recording, Odometry, Windows]) -> Heading:
+    windows = bent[2]
+    heard = heading(windows, *wall_votes(windows, np.zeros(len(windows), bool)))
+    assert heard is not None
+    return heard
+
+
+@pytest.fixture(scope='module')
+def outcome(bent: tuple[Recording, Odometry, Windows]) -> Refinement:
+    return Refiner(Parameters()).run(bent[0].readings, bent[1])
+
+
+def test_the_second_part_is_found_with_its_direction(exact, bent, found) -> None:
+    windows = bent[2]
+    x = odometry_of(exact).at(windows.node_stamp)[found.at, 0] - PIVOT[0]
+    second = found.askew != 0.0 if (found.askew[x < -4.0] == 0.0).mean() > 0.5 else found.askew == 0.0
+    assert (second[x > 4.0]).mean() > 0.9 and (second[x < -4.0]).mean() < 0.1
+    directions = set(found.askew.tolist())
+    assert len(directions) == 2
+    angle = max(directions)
+    # drift of the yaw takes some of it
+    assert abs(abs(math.remainder(angle, math.pi / 2)) - KINK) < math.radians(5.0)
+
+
+def test_the_heading_is_right_in_both_parts(exact, bent, found, monkeypatch) -> None:
+    windows = bent[2]
+
+    def off(heard: Heading) -> float:
+        true = odometry_of(exact).at(windows.node_stamp)[heard.at, 2]
+        wrong = wrapped(windows.node[heard.at, 2] + heard.correction - true)
+        middle = math.atan2(np.sin(wrong).mean(), np.cos(wrong).mean())
+        return float(np.degrees(np.sqrt((wrapped(wrong - middle) ** 2).mean())))
+
+    assert off(found) < 4.0
+    monkeypatch.setattr(module, 'PARTS_ASKEW', 0)
+    alike = heading(windows, *wall_votes(windows, np.zeros(len(windows), bool)))
+    assert alike is not None and (alike.askew == 0.0).all()
+    assert off(alike) > 8.0
+
+
+def test_a_drive_through_both_parts_is_refined(exact, bent, outcome) -> None:
+    true, odometry = odometry_of(exact), bent[1]
+    assert rms_after_alignment(odometry.pose, true.pose) > 1.0
+    assert outcome.accepted
+    assert rms_after_alignment(outcome.trajectory.pose, true.pose) < 0.15
+
+
+@pytest.mark.parametrize('askew', [(0.0,), (0.0, 0.7), (0.0, 0.3, 1.1)])
+def test_votes_of_two_places_against_all_pairs_of_states(bent, askew: tuple[float, ...]) -> None:
+    windows = bent[2]
+    at, votes = wall_votes(windows, np.zeros(len(windows), bool))
+    drifts = Drifts(0.01, 0.02, 0.05)
+    chain = module._Chain(windows, at[3:5], votes[3:5], askew)
+    count, states = len(askew), module.STATES
+    moved = drifts.bias * chain.length[0] + drifts.turn_scale * chain.turn[0]
+    sigma = math.sqrt(
+        drifts.noise**2 * chain.length[0] + module.TURN_NOISE**2 * chain.turned[0] + module.LEAST_NOISE**2
+    )
+    x = (chain.grid - moved + math.pi / 4) % (math.pi / 2) - math.pi / 4
+    density = (1 - module.SLIPS) * np.exp(-0.5 * (x / sigma) ** 2) + module.SLIPS / 3 * np.exp(
+        -0.5 * (x / sigma / 3) ** 2
+    )
+    density /= density.sum()
+    other = 1.0 - math.exp(-module.ENTERED * chain.length[0]) if count > 1 else 0.0
+    both = np.zeros((2, count, states))
+    for d0 in range(count):
+        for s0 in range(states):
+            for d1 in range(count):
+                stays = (1.0 - other) * (d0 == d1) + other / count
+                joint = chain.likelihood[0, d0, s0] * stays * np.roll(density, s0) * chain.likelihood[1, d1]
+                joint /= count * states
+                both[0, d0, s0] += joint.sum()
+                both[1, d1] += joint
+    total, _ = chain.forward(drifts)
+    assert total == pytest.approx(math.log(both[1].sum()), abs=1e-9)
+    smooth = chain.smooth(drifts)
+    for k in range(2):
+        assert smooth[k] == pytest.approx(both[k] / both[k].sum(), abs=1e-12)
+
+
+def test_votes_for_walls_askew_are_those_of_a_robot_turned_back(bent) -> None:
+    windows = bent[2]
+    at, votes = wall_votes(windows, np.zeros(len(windows), bool))
+    steps = 50
+    chain = module._Chain(windows, at[:4], votes[:4], (0.0, steps * module.STEP))
+    assert chain.likelihood[:, 1] == pytest.approx(np.roll(chain.likelihood[:, 0], steps, axis=1), abs=1e-9)
+    assert DIRECTIONS * 2 == module.STATES
+
+
+def test_walls_askew_are_as_far_as_those_of_a_map_turned_back(bent) -> None:
+    windows = bent[2]
+    nothing, angle = np.zeros(len(windows), bool), 0.4
+    turned = compose(np.array([0.0, 0.0, angle]), windows.node)
+    one = Distances(windows, nothing, windows.node)
+    other = Distances(windows, nothing, turned, np.full(len(windows), angle))
+    assert np.array_equal(one.direction, other.direction) and np.array_equal(one.node, other.node)
+    assert one.distance == pytest.approx(other.distance, abs=1e-9)
+    assert one.lever == pytest.approx(other.lever, abs=1e-9)
+    assert np.array_equal(one.tracked(True), other.tracked(True))
+    c, s = math.cos(angle), math.sin(angle)
+    assert one.normal @ np.array([[c, s], [-s, c]]) == pytest.approx(other.normal, abs=1e-9)
+
+
+def test_a_wall_ends_where_another_part_begins(bent) -> None:
+    windows = bent[2]
+    nothing, askew = np.zeros(len(windows), bool), np.zeros(len(windows))
+    askew[len(windows) // 2 :] = 1e-12
+    found = Distances(windows, nothing, windows.node, askew)
+    wall, second = found.tracked(True), askew[found.node] != 0.0
+    assert not set(wall[second].tolist()) & set(wall[~second].tolist())
