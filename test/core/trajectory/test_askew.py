@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import numpy as np
@@ -30,8 +31,7 @@ def along(metres: float, aside: float = 0.0) -> np.ndarray:
     """A place so far along the middle of both corridors, from the kink on, and to the left of it."""
     angle = KINK if metres > 0.0 else 0.0
     c, s = math.cos(angle), math.sin(angle)
-    place: np.ndarray = PIVOT + [metres * c - aside * s, metres * s + aside * c]
-    return place
+    return PIVOT + np.array([metres * c - aside * s, metres * s + aside * c])
 
 
 def kinked_world() -> World:
@@ -40,7 +40,7 @@ def kinked_world() -> World:
 
     def line(*places: np.ndarray) -> None:
         cells = [tuple(np.floor(place * 10).astype(int).tolist()) for place in places]
-        for start, end in zip(cells, cells[1:], strict=False):
+        for start, end in itertools.pairwise(cells):
             plan.line(start, end)
 
     for side in (-HALF, HALF):
