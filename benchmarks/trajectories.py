@@ -26,6 +26,7 @@ from typing import Any
 import numpy as np
 from quality_worlds import scoring_tool
 
+from forward_grid_mapper.commands.experiment_drift import odometry_of
 from forward_grid_mapper.core.common.grid import UNKNOWN
 from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.common.readings import Readings
@@ -113,12 +114,6 @@ def worlds(seed: int) -> dict[str, tuple[World, np.ndarray]]:
         'to and fro': (world, np.concatenate([way, way[-2::-1]])),
         'rooms': (building_world(), tour),
     }
-
-
-def odometry_of(recording: Recording) -> Odometry:
-    """Return the odometry of a recording."""
-    messages = recording.odometry
-    return Odometry.of(np.array([m.stamp for m in messages]), np.array([m.pose for m in messages], np.float64))
 
 
 def run(name: str, readings: Readings, odometry: Odometry, true: Odometry) -> dict[str, Any]:

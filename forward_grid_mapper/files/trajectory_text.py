@@ -8,7 +8,7 @@ from typing import Any
 
 from ..core.trajectory.certainty import Told
 from ..core.trajectory.odometry_model import CALIBRATION
-from ..core.trajectory.refinement import Refinement
+from ..core.trajectory.outcome import Refinement
 from ..core.trajectory.windows import Odometry
 
 LEAST_SCALE, LEAST_ANGLE = 0.003, math.radians(0.1)

@@ -20,7 +20,8 @@ from ..core.maps.map_set import MapSet
 from ..core.trajectory.correction import Correction
 from ..core.trajectory.following import Follower
 from ..core.trajectory.keeping import kept
-from ..core.trajectory.refinement import Refinement, Refiner
+from ..core.trajectory.outcome import Refinement
+from ..core.trajectory.refinement import Refiner
 from ..core.trajectory.windows import Odometry
 from ..files.trajectory_text import calibration_words
 from .background import reason

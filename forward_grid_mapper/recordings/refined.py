@@ -17,9 +17,10 @@ from ..core.maps.map_set import MapSet
 from ..core.messages.reading_buffer import bounded
 from ..core.trajectory.certainty import Told, after, certain
 from ..core.trajectory.odometry_model import CALIBRATION, calibrated
+from ..core.trajectory.outcome import Refinement, replaced
 from ..core.trajectory.poses import relative
 from ..core.trajectory.recovering import recovered
-from ..core.trajectory.refinement import Refinement, Refiner, replaced
+from ..core.trajectory.refinement import Refiner
 from ..core.trajectory.registration import moved_to, readings_moved, register
 from ..core.trajectory.windows import Odometry
 from ..files.calibration_file import calibration_text

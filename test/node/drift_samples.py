@@ -11,8 +11,8 @@ import yaml
 
 from forward_grid_mapper.core.common.readings import Readings
 from forward_grid_mapper.core.messages.message_types import OdometryMessage, RangeMessage
+from forward_grid_mapper.core.trajectory.outcome import Refinement, replaced
 from forward_grid_mapper.core.trajectory.poses import compose
-from forward_grid_mapper.core.trajectory.refinement import Refinement, replaced
 from forward_grid_mapper.core.trajectory.windows import Odometry
 from forward_grid_mapper.simulation.drift import LEVELS, with_drift
 from forward_grid_mapper.simulation.drive import Recording, drive

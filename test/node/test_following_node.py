@@ -17,7 +17,7 @@ from inside import Inside
 from refined_robot import HeldRun, odometry_of
 
 from forward_grid_mapper.core.trajectory.following import Follower
-from forward_grid_mapper.core.trajectory.refinement import Refinement, replaced
+from forward_grid_mapper.core.trajectory.outcome import Refinement, replaced
 from forward_grid_mapper.core.trajectory.windows import Odometry
 from forward_grid_mapper.node import refining
 

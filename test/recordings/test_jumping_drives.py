@@ -10,7 +10,7 @@ import pytest
 
 from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.common.readings import Readings
-from forward_grid_mapper.core.trajectory.refinement import Refinement
+from forward_grid_mapper.core.trajectory.outcome import Refinement
 from forward_grid_mapper.core.trajectory.windows import Odometry
 from forward_grid_mapper.recordings import refined
 

@@ -15,8 +15,8 @@ import numpy as np
 
 from ..common.readings import Readings
 from .local_map import at_poses
+from .outcome import replaced
 from .poses import Floats, compose, inverse, relative
-from .refinement import replaced
 from .windows import Odometry
 
 

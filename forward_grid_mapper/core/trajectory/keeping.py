@@ -14,7 +14,8 @@ from ..common.readings import Readings
 from .correction import Correction
 from .holding_out import LEAST_SIGMAS, Gain, foreseen, gain, held_out, held_out_blocks
 from .local_map import for_matching
-from .refinement import HELD_OUT, Refinement, differences, replaced, without_times
+from .outcome import Refinement, differences, replaced
+from .refinement import HELD_OUT, without_times
 from .scans import Scans
 from .windows import Odometry, cut
 

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from forward_grid_mapper.commands.experiment_drift import odometry_of
 from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.trajectory.heading import Heading, heading
 from forward_grid_mapper.core.trajectory.holding_out import held_out
@@ -32,8 +33,7 @@ class Tour(NamedTuple):
 def tour_with(sonars: SonarArray, way: NDArray[np.float64] | None = None) -> Tour:
     """Return the beginning of the tour through the building, or another way."""
     recording = drive(building_world(), building_tour()[:20] if way is None else way, 0.1, sonars, NOISY, seed=3)
-    messages = recording.odometry
-    odometry = Odometry.of(np.array([m.stamp for m in messages]), np.array([m.pose for m in messages], float))
+    odometry = odometry_of(recording)
     windows = cut(recording.readings, odometry)
     scans = Scans(windows, for_matching(Parameters()), np.zeros(1, np.uint8), held_out(len(windows)))
     found = heading(windows, *wall_votes(windows, scans.held_out))

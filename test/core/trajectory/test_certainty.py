@@ -7,10 +7,11 @@ import math
 import numpy as np
 import pytest
 
+from forward_grid_mapper.commands.experiment_drift import odometry_of
 from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.trajectory.certainty import Told, after, certain, of_ways, of_yaw, thinned, top_of
 from forward_grid_mapper.core.trajectory.odometry_model import CALIBRATION, calibrated
-from forward_grid_mapper.core.trajectory.refinement import replaced
+from forward_grid_mapper.core.trajectory.outcome import replaced
 from forward_grid_mapper.core.trajectory.windows import Odometry
 from forward_grid_mapper.simulation.drive import Recording, drive
 from forward_grid_mapper.simulation.sonar import NOISY, front_array
@@ -22,11 +23,6 @@ STOP = np.zeros(1, np.uint8)
 @pytest.fixture(scope='module')
 def tour() -> Recording:
     return drive(building_world(), building_tour()[:14], 0.1, front_array(), NOISY, seed=3)
-
-
-def odometry_of(recording: Recording) -> Odometry:
-    messages = recording.odometry
-    return Odometry.of(np.array([m.stamp for m in messages]), np.array([m.pose for m in messages], float))
 
 
 def vector(**values: float) -> np.ndarray:

@@ -7,9 +7,9 @@ import pytest
 
 from forward_grid_mapper.core.common.readings import Readings
 from forward_grid_mapper.core.trajectory.correction import Correction
+from forward_grid_mapper.core.trajectory.outcome import replaced
 from forward_grid_mapper.core.trajectory.poses import compose, wrapped
 from forward_grid_mapper.core.trajectory.recovering import recovered
-from forward_grid_mapper.core.trajectory.refinement import replaced
 from forward_grid_mapper.core.trajectory.windows import Odometry
 
 MOUNTS = {'left': (0.1, 0.2, 1.0), 'right': (0.1, -0.2, -2.5)}

@@ -7,6 +7,7 @@ import math
 import numpy as np
 import pytest
 
+from forward_grid_mapper.commands.experiment_drift import odometry_of
 from forward_grid_mapper.core.trajectory import heading as module
 from forward_grid_mapper.core.trajectory.heading import LEAST_GAIN, NOISES, heading
 from forward_grid_mapper.core.trajectory.odometry_model import calibrated, motions, sensitivity, with_yaw
@@ -27,11 +28,6 @@ from forward_grid_mapper.simulation.drift import LEVELS, with_drift
 from forward_grid_mapper.simulation.drive import Recording, drive
 from forward_grid_mapper.simulation.sonar import NOISY, front_array
 from forward_grid_mapper.simulation.world import building_tour, building_world
-
-
-def odometry_of(recording: Recording) -> Odometry:
-    messages = recording.odometry
-    return Odometry.of(np.array([m.stamp for m in messages]), np.array([m.pose for m in messages], float))
 
 
 @pytest.fixture(scope='module')

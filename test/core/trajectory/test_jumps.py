@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from forward_grid_mapper.commands.experiment_drift import odometry_of
 from forward_grid_mapper.core.common.errors import Cancelled
 from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.common.readings import Readings
@@ -15,18 +16,14 @@ from forward_grid_mapper.core.trajectory import jumps as jumping
 from forward_grid_mapper.core.trajectory.correction import Correction
 from forward_grid_mapper.core.trajectory.following import Follower
 from forward_grid_mapper.core.trajectory.jumps import fast_turns, jumps, since_jump, without_outliers
+from forward_grid_mapper.core.trajectory.outcome import Refinement
 from forward_grid_mapper.core.trajectory.poses import compose, relative, rms_after_alignment
-from forward_grid_mapper.core.trajectory.refinement import Refinement, Refiner
+from forward_grid_mapper.core.trajectory.refinement import Refiner
 from forward_grid_mapper.core.trajectory.windows import Odometry
 from forward_grid_mapper.simulation.drift import LEVELS, with_drift
 from forward_grid_mapper.simulation.drive import Recording, drive
 from forward_grid_mapper.simulation.sonar import NOISY, sonar_ring
 from forward_grid_mapper.simulation.world import building_tour, building_world
-
-
-def odometry_of(recording: Recording) -> Odometry:
-    messages = recording.odometry
-    return Odometry.of(np.array([m.stamp for m in messages]), np.array([m.pose for m in messages], np.float64))
 
 
 def moved(readings: Readings, before: Odometry, after: Odometry) -> Readings:

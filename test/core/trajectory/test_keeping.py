@@ -7,22 +7,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from forward_grid_mapper.commands.experiment_drift import odometry_of
 from forward_grid_mapper.core.common.errors import Cancelled
 from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.trajectory.correction import Correction
 from forward_grid_mapper.core.trajectory.keeping import kept
+from forward_grid_mapper.core.trajectory.outcome import Refinement
 from forward_grid_mapper.core.trajectory.poses import compose, rms_after_alignment
-from forward_grid_mapper.core.trajectory.refinement import Refinement
 from forward_grid_mapper.core.trajectory.windows import Odometry
 from forward_grid_mapper.simulation.drift import LEVELS, with_drift
-from forward_grid_mapper.simulation.drive import Recording, drive
+from forward_grid_mapper.simulation.drive import drive
 from forward_grid_mapper.simulation.sonar import NOISY, sonar_ring
 from forward_grid_mapper.simulation.world import building_tour, building_world
-
-
-def odometry_of(recording: Recording) -> Odometry:
-    messages = recording.odometry
-    return Odometry.of(np.array([m.stamp for m in messages]), np.array([m.pose for m in messages], np.float64))
 
 
 def first_of(path: Odometry, part: float) -> Odometry:

@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from forward_grid_mapper.commands.experiment_drift import odometry_of
 from forward_grid_mapper.core.common.errors import Cancelled
 from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.common.readings import Readings
@@ -16,8 +17,9 @@ from forward_grid_mapper.core.mapping import Mapper
 from forward_grid_mapper.core.trajectory import refinement
 from forward_grid_mapper.core.trajectory.heading import NOISES, Drifts, Heading
 from forward_grid_mapper.core.trajectory.holding_out import FEWEST_BLOCKS, LATER, NEAR, Gain, came_back, held_out
+from forward_grid_mapper.core.trajectory.outcome import Refinement
 from forward_grid_mapper.core.trajectory.poses import compose, relative, rms_after_alignment
-from forward_grid_mapper.core.trajectory.refinement import Refinement, Refiner, unfit
+from forward_grid_mapper.core.trajectory.refinement import Refiner, unfit
 from forward_grid_mapper.core.trajectory.scans import Scans
 from forward_grid_mapper.core.trajectory.windows import Odometry, cut
 from forward_grid_mapper.simulation.drift import LEVELS, with_drift
@@ -26,11 +28,6 @@ from forward_grid_mapper.simulation.sonar import NOISY, front_array, sonar_ring
 from forward_grid_mapper.simulation.world import building_tour, building_world
 
 TOUR = building_tour()[:20]
-
-
-def odometry_of(recording: Recording) -> Odometry:
-    messages = recording.odometry
-    return Odometry.of(np.array([m.stamp for m in messages]), np.array([m.pose for m in messages], float))
 
 
 @pytest.fixture(scope='module')
