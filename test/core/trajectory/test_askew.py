@@ -12,15 +12,18 @@ from forward_grid_mapper.commands.experiment_drift import odometry_of
 from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.trajectory import heading as module
 from forward_grid_mapper.core.trajectory.heading import Drifts, Heading, heading
+from forward_grid_mapper.core.trajectory.holding_out import held_out
 from forward_grid_mapper.core.trajectory.poses import compose, rms_after_alignment, wrapped
 from forward_grid_mapper.core.trajectory.refinement import Refiner
+from forward_grid_mapper.core.trajectory.scans import Scans
+from forward_grid_mapper.core.trajectory.solving import Solver
 from forward_grid_mapper.core.trajectory.wall_distances import Distances
 from forward_grid_mapper.core.trajectory.walls import DIRECTIONS, wall_votes
 from forward_grid_mapper.core.trajectory.windows import Odometry, Windows, cut
 from forward_grid_mapper.simulation.drift import LEVELS, with_drift
 from forward_grid_mapper.simulation.drive import Recording, drive
-from forward_grid_mapper.simulation.sonar import NOISY, sonar_ring
-from forward_grid_mapper.simulation.world import Floorplan, World
+from forward_grid_mapper.simulation.sonar import NOISY, front_array, sonar_ring
+from forward_grid_mapper.simulation.world import Floorplan, World, building_tour, building_world
 
 KINK = math.radians(25.0)
 PIVOT = np.array([16.0, 5.0])
@@ -106,6 +109,23 @@ def test_the_heading_is_right_in_both_parts(exact, bent, found, monkeypatch) -> 
 
 
 @pytest.mark.parametrize('seed', [8, 9, 11])
+def test_places_of_both_parts_measure_the_yaw(found) -> None:
+    for part in (found.askew == 0.0, found.askew != 0.0):
+        told = part & (found.information > 0.0)
+        assert told.sum() > 0.6 * part.sum()
+        off = np.degrees(wrapped(found.measured - found.correction))[told]
+        assert np.sqrt((off**2).mean()) < 2.0
+
+
+def test_a_node_has_the_direction_of_the_nearest_votes(bent, found) -> None:
+    recording, odometry, windows = bent
+    scans = Scans(windows, Parameters(), np.zeros(1, np.uint8), held_out(len(windows)))
+    solver = Solver(odometry, windows, scans, found, lambda stage: lambda part: None)
+    for node, angle in enumerate(solver._askew.tolist()):
+        off = np.abs(found.at - node)
+        assert angle in found.askew[off == off.min()]
+
+
 def test_a_drive_through_both_parts_is_refined(exact: Recording, seed: int) -> None:
     recording, true = with_drift(exact, LEVELS['low'], seed), odometry_of(exact)
     odometry = odometry_of(recording)
@@ -175,6 +195,15 @@ def test_walls_askew_are_as_far_as_those_of_a_map_turned_back(bent) -> None:
     assert np.array_equal(one.tracked(True), other.tracked(True))
     c, s = math.cos(angle), math.sin(angle)
     assert one.normal @ np.array([[c, s], [-s, c]]) == pytest.approx(other.normal, abs=1e-9)
+
+
+@pytest.mark.parametrize('seed', [0, 2])
+def test_drift_is_not_taken_for_another_part(seed: int) -> None:
+    recording = drive(building_world(), building_tour(), 0.1, front_array(), NOISY, seed=3)
+    drifting = with_drift(recording, LEVELS['wheels'], seed)
+    windows = cut(drifting.readings, odometry_of(drifting))
+    heard = heading(windows, *wall_votes(windows, np.zeros(len(windows), bool)))
+    assert heard is not None and (heard.askew == 0.0).all()
 
 
 def test_a_wall_ends_where_another_part_begins(bent) -> None:

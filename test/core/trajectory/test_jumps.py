@@ -224,6 +224,23 @@ def test_a_yaw_that_begins_anew_is_told_from_turns(
     assert rms_after_alignment(found.trajectory.pose, true.pose) < 0.2
 
 
+@pytest.mark.parametrize('stood', [False, True])
+@pytest.mark.parametrize('turned', [False, True])
+def test_a_turn_is_a_jump_only_if_readings_fit_where_the_robot_stood_alone(
+    bent: tuple[Readings, Odometry], monkeypatch: pytest.MonkeyPatch, stood: bool, turned: bool
+) -> None:
+    readings, odometry = bent
+    first = len(odometry.stamp) // 2
+    before = odometry.pose[first - 1]
+    x, y, yaw = odometry.pose[first].tolist()
+    readings, odometry = begun_anew(readings, odometry, 0.5, (x, y, yaw + 1.2))
+    where = {tuple(before.tolist()): stood, tuple(odometry.pose[first].tolist()): turned}
+    monkeypatch.setattr(jumping._Usual, 'fits', lambda self, around, begin, least: where[tuple(begin.tolist())])
+    nothing, stop = np.zeros(0, np.int64), np.zeros(1, np.uint8)
+    found = jumping.with_yaw_anew(readings, odometry, nothing, Parameters(), stop)
+    assert found.tolist() == ([first] if stood and not turned else [])
+
+
 def test_odometry_that_always_jumps_is_refused(bent: tuple[Readings, Odometry]) -> None:
     readings, odometry = bent
     pose = odometry.pose.copy()
