@@ -26,7 +26,6 @@ from typing import Any
 import numpy as np
 from quality_worlds import scoring_tool
 
-from forward_grid_mapper.commands.experiment_drift import odometry_of
 from forward_grid_mapper.core.common.grid import UNKNOWN
 from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.common.readings import Readings
@@ -36,7 +35,7 @@ from forward_grid_mapper.core.trajectory.refinement import Refiner
 from forward_grid_mapper.core.trajectory.windows import Odometry
 from forward_grid_mapper.core.warm_up import warm_up
 from forward_grid_mapper.recordings.read_drive import read_drive
-from forward_grid_mapper.simulation.drift import LEVELS, with_drift
+from forward_grid_mapper.simulation.drift import LEVELS, odometry_of, with_drift
 from forward_grid_mapper.simulation.drive import Recording, drive
 from forward_grid_mapper.simulation.score import SURFACE_DEPTH, score_map, visible_surface
 from forward_grid_mapper.simulation.sonar import NoiseModel, front_array, sonar_ring

@@ -19,7 +19,7 @@ from ..core.trajectory.poses import Floats, compose, rms_after_alignment
 from ..core.trajectory.refinement import Refiner
 from ..core.trajectory.windows import Odometry
 from ..files.panels import Box, Tile
-from ..simulation.drift import LEVELS, with_drift
+from ..simulation.drift import LEVELS, odometry_of, with_drift
 from ..simulation.drive import Recording, corridor_drive, drive
 from ..simulation.score import SURFACE_DEPTH, score_map, visible_surface
 from ..simulation.sonar import NOISY, sonar_ring
@@ -86,12 +86,6 @@ def aligned(poses: Floats, true: Floats) -> Floats:
     c, s = math.cos(turn), math.sin(turn)
     x, y = true[:, :2].mean(0) - np.array([[c, -s], [s, c]]) @ poses[:, :2].mean(0)
     return np.array([x, y, turn])
-
-
-def odometry_of(recording: Recording) -> Odometry:
-    """Return the odometry of a recording."""
-    poses = np.array([message.pose for message in recording.odometry], np.float64)
-    return Odometry.of(np.array([message.stamp for message in recording.odometry], np.int64), poses)
 
 
 def drift(options: argparse.Namespace, parameters: Parameters, ticker: Ticker) -> tuple[str, dict[str, Figure]]:

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.messages.message_types import Pose2
+from ..core.trajectory.windows import Odometry
 from .drive import Recording
 
 Floats = NDArray[np.float64]
@@ -126,3 +127,9 @@ def with_drift(recording: Recording, drift: Drift, seed: int) -> Recording:
     dx, dy = readings.x - was[0], readings.y - was[1]
     placed = replace(readings, x=now[0] + c * dx - s * dy, y=now[1] + s * dx + c * dy, yaw=readings.yaw + turn)
     return replace(recording, odometry=odometry, readings=placed)
+
+
+def odometry_of(recording: Recording) -> Odometry:
+    """Return the odometry of a recording."""
+    poses = np.array([message.pose for message in recording.odometry], np.float64)
+    return Odometry.of(np.array([message.stamp for message in recording.odometry], np.int64), poses)

@@ -8,7 +8,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from forward_grid_mapper.commands.experiment_drift import odometry_of
 from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.trajectory.heading import Heading, heading
 from forward_grid_mapper.core.trajectory.holding_out import held_out
@@ -16,6 +15,7 @@ from forward_grid_mapper.core.trajectory.local_map import for_matching
 from forward_grid_mapper.core.trajectory.scans import Scans
 from forward_grid_mapper.core.trajectory.walls import wall_votes
 from forward_grid_mapper.core.trajectory.windows import Odometry, Windows, cut
+from forward_grid_mapper.simulation.drift import odometry_of
 from forward_grid_mapper.simulation.drive import drive
 from forward_grid_mapper.simulation.sonar import NOISY, SonarArray
 from forward_grid_mapper.simulation.world import building_tour, building_world

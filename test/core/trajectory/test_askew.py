@@ -8,7 +8,6 @@ import math
 import numpy as np
 import pytest
 
-from forward_grid_mapper.commands.experiment_drift import odometry_of
 from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.trajectory import heading as module
 from forward_grid_mapper.core.trajectory.heading import Drifts, Heading, heading
@@ -20,7 +19,7 @@ from forward_grid_mapper.core.trajectory.solving import Solver
 from forward_grid_mapper.core.trajectory.wall_distances import Distances
 from forward_grid_mapper.core.trajectory.walls import DIRECTIONS, wall_votes
 from forward_grid_mapper.core.trajectory.windows import Odometry, Windows, cut
-from forward_grid_mapper.simulation.drift import LEVELS, with_drift
+from forward_grid_mapper.simulation.drift import LEVELS, odometry_of, with_drift
 from forward_grid_mapper.simulation.drive import Recording, drive
 from forward_grid_mapper.simulation.sonar import NOISY, front_array, sonar_ring
 from forward_grid_mapper.simulation.world import Floorplan, World, building_tour, building_world

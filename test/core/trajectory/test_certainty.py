@@ -7,12 +7,12 @@ import math
 import numpy as np
 import pytest
 
-from forward_grid_mapper.commands.experiment_drift import odometry_of
 from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.trajectory.certainty import Told, after, certain, of_ways, of_yaw, thinned, top_of
 from forward_grid_mapper.core.trajectory.odometry_model import CALIBRATION, calibrated
 from forward_grid_mapper.core.trajectory.outcome import replaced
 from forward_grid_mapper.core.trajectory.windows import Odometry
+from forward_grid_mapper.simulation.drift import odometry_of
 from forward_grid_mapper.simulation.drive import Recording, drive
 from forward_grid_mapper.simulation.sonar import NOISY, front_array
 from forward_grid_mapper.simulation.world import building_tour, building_world

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from forward_grid_mapper.commands.experiment_drift import odometry_of
 from forward_grid_mapper.core import warm_up
 from forward_grid_mapper.core.common.errors import Cancelled
 from forward_grid_mapper.core.common.parameters import Parameters
@@ -20,7 +19,7 @@ from forward_grid_mapper.core.trajectory.following import LATE, LONGEST, SETTLED
 from forward_grid_mapper.core.trajectory.pose_graph import Edges, no_edges
 from forward_grid_mapper.core.trajectory.poses import axes_at, compose, relative, wrapped
 from forward_grid_mapper.core.trajectory.windows import Odometry, cut
-from forward_grid_mapper.simulation.drift import LEVELS, with_drift
+from forward_grid_mapper.simulation.drift import LEVELS, odometry_of, with_drift
 from forward_grid_mapper.simulation.drive import drive
 from forward_grid_mapper.simulation.sonar import NOISY, sonar_ring
 from forward_grid_mapper.simulation.world import building_tour, building_world

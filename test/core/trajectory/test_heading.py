@@ -7,7 +7,6 @@ import math
 import numpy as np
 import pytest
 
-from forward_grid_mapper.commands.experiment_drift import odometry_of
 from forward_grid_mapper.core.trajectory import heading as module
 from forward_grid_mapper.core.trajectory.heading import LEAST_GAIN, NOISES, heading
 from forward_grid_mapper.core.trajectory.odometry_model import calibrated, motions, sensitivity, with_yaw
@@ -24,7 +23,7 @@ from forward_grid_mapper.core.trajectory.walls import (
     wall_votes,
 )
 from forward_grid_mapper.core.trajectory.windows import Odometry, Windows, corrected, cut
-from forward_grid_mapper.simulation.drift import LEVELS, with_drift
+from forward_grid_mapper.simulation.drift import LEVELS, odometry_of, with_drift
 from forward_grid_mapper.simulation.drive import Recording, drive
 from forward_grid_mapper.simulation.sonar import NOISY, front_array
 from forward_grid_mapper.simulation.world import building_tour, building_world

@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from forward_grid_mapper.commands.experiment_drift import odometry_of
 from forward_grid_mapper.core.common.errors import Cancelled
 from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.common.readings import Readings
@@ -20,7 +19,7 @@ from forward_grid_mapper.core.trajectory.outcome import Refinement
 from forward_grid_mapper.core.trajectory.poses import compose, relative, rms_after_alignment
 from forward_grid_mapper.core.trajectory.refinement import Refiner
 from forward_grid_mapper.core.trajectory.windows import Odometry
-from forward_grid_mapper.simulation.drift import LEVELS, with_drift
+from forward_grid_mapper.simulation.drift import LEVELS, odometry_of, with_drift
 from forward_grid_mapper.simulation.drive import Recording, drive
 from forward_grid_mapper.simulation.sonar import NOISY, sonar_ring
 from forward_grid_mapper.simulation.world import building_tour, building_world

@@ -9,7 +9,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from forward_grid_mapper.commands.experiment_drift import odometry_of
 from forward_grid_mapper.core.common.errors import Cancelled
 from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.common.readings import Readings
@@ -22,7 +21,7 @@ from forward_grid_mapper.core.trajectory.poses import compose, relative, rms_aft
 from forward_grid_mapper.core.trajectory.refinement import Refiner, unfit
 from forward_grid_mapper.core.trajectory.scans import Scans
 from forward_grid_mapper.core.trajectory.windows import Odometry, cut
-from forward_grid_mapper.simulation.drift import LEVELS, with_drift
+from forward_grid_mapper.simulation.drift import LEVELS, odometry_of, with_drift
 from forward_grid_mapper.simulation.drive import Recording, drive
 from forward_grid_mapper.simulation.sonar import NOISY, front_array, sonar_ring
 from forward_grid_mapper.simulation.world import building_tour, building_world
