@@ -142,7 +142,9 @@ class RefiningMapper:
 
     def _follow(self, correction: Correction, found: Refinement, now: Callable[[], Drive]) -> None:
         """Follow what was driven while the drive before was looked at; without it the maps are as good."""
-        follower = self._follower = Follower(correction, found.calibration, self._parameters, found.noise)
+        follower = self._follower = Follower(
+            correction, found.calibration, self._parameters, found.noise, found.right_angles
+        )
         if self._cancelled:
             raise Cancelled('the work was cancelled')
         try:

@@ -32,7 +32,7 @@ from .local_map import at_poses, for_matching, local_map
 from .matching import grid_around, measure
 from .odometry_model import CALIBRATION, Noise, calibrated, covariances, motions
 from .passes import BEHIND, BLOCK
-from .pose_graph import Edges, Graph, Yaws, joined, no_edges, solve
+from .pose_graph import Edges, Graph, Yaws, joined, no_edges, no_walls, solve
 from .poses import Floats, axes_at, compose, interpolated, relative
 from .refinement import MOST_WORSE, SHORTEST
 from .scans import FEWEST_ON_MAP, Scans
@@ -112,6 +112,8 @@ class Follower:
     noise : float
         By how much the yaw of odometry strays, radians a √metre, as the whole drive says; 0 if it is not known. What
         `odometry_noise` says goes before.
+    right_angles : bool
+        Whether walls are taken to stand at right angles to each other; without, only places are recognised.
 
     Attributes
     ----------
@@ -133,7 +135,9 @@ class Follower:
         calibration: Mapping[str, float],
         parameters: Parameters,
         noise: float = 0.0,
+        right_angles: bool = True,
     ) -> None:
+        self._right_angles = right_angles
         self.correction = self._before = self._proven = self._now = correction
         self.kept, self.windows, self.places, self.obstacle = False, 0, 0, ''
         self._parameters, self._stop = for_matching(parameters), np.zeros(1, np.uint8)
@@ -237,7 +241,7 @@ class Follower:
         settled = count[: tail.settled]
         sure = np.broadcast_to(np.diag(SIGMA_SETTLED**-2.0), (len(settled), 3, 3))
         stay = Edges(np.zeros_like(settled), settled, relative(nodes[0], nodes[settled]), sure)
-        at, votes = wall_votes(windows, count < tail.settled - OF_VOTES)
+        at, votes = wall_votes(windows, (count < tail.settled - OF_VOTES) | (not self._right_angles))
         at, votes = at[at >= tail.settled], votes[at >= tail.settled]
         off, of_votes = yaws_of_votes(votes, windows.node[at, 2], nodes[at, 2] - windows.node[at, 2])
         yaws = Yaws(
@@ -245,7 +249,7 @@ class Follower:
             np.concatenate([nodes[settled, 2], windows.node[at, 2] + off]),
             np.concatenate([np.full(len(settled), SIGMA_SETTLED[2] ** -2.0), of_votes]),
         )
-        walls = Distances(windows, none, nodes).walls(True)
+        walls = Distances(windows, none, nodes).walls(True) if self._right_angles else no_walls()
         # the calibration is known
         known = np.zeros((len(motion), 3, 0)), np.zeros(0)
         return Graph(steps, *known, joined(stay, tail.places), yaws, walls)

@@ -71,6 +71,7 @@ def kept(
         jumps=refused.jumps,
         unplaced=refused.unplaced,
         stretch=before.stretch,
+        right_angles=before.right_angles,
     )
 
 

@@ -49,6 +49,8 @@ class Refinement:
         First and last stamp of what `calibration` and `noise` are of; None for the whole drive.
     noise : float
         By how much the yaw of odometry strays, radians a √metre, as walls say; 0 if they say nothing.
+    right_angles : bool
+        Whether walls are taken to stand at right angles to each other.
     """
 
     accepted: bool
@@ -65,6 +67,7 @@ class Refinement:
     jumps: str = ''
     unplaced: bool = False
     stretch: tuple[int, int] | None = None
+    right_angles: bool = True
 
 
 def joined_parts(
@@ -107,6 +110,7 @@ def joined_parts(
         jumps=said,
         unplaced=unplaced,
         stretch=(int(span[0]), int(span[-1])),
+        right_angles=all(outcome.right_angles for outcome in outcomes),
     )
 
 

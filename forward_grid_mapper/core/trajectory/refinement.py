@@ -10,9 +10,11 @@ judgement       what was held out and where walls stand must speak for the traje
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,17 +22,32 @@ from numpy.typing import NDArray
 from ..common.parameters import Parameters
 from ..common.readings import Readings
 from ..runtime.cancelling import check
+from .certainty import of_yaw
 from .heading import NOISES, Heading, heading
-from .holding_out import LEAST_SIGMAS, Gain, blocks_of, came_back, foreseen, gain, held_out, held_out_blocks
+from .holding_out import (
+    FEWEST_BLOCKS,
+    LEAST_SIGMAS,
+    Gain,
+    blocks_of,
+    came_back,
+    foreseen,
+    gain,
+    held_out,
+    held_out_blocks,
+)
 from .hypotheses import solved
 from .jumps import MOST_JUMPS, Part, begins_of, jumps, parts_at, with_yaw_anew, without_outliers
 from .local_map import for_matching
-from .odometry_model import CALIBRATION
+from .loops import Loop
+from .odometry_model import CALIBRATION, sensitivity
 from .outcome import Refinement, differences, joined_parts, replaced, with_outliers
 from .passes import BLOCK
-from .poses import Floats, compose, inverse
+from .pose_graph import solution_at
+from .poses import Floats, compose, inverse, relative, wrapped
+from .relocating import recognised_part
+from .scan_matching import TRUSTS, Trust, scan_matched
 from .scans import Scans
-from .solving import Solver
+from .solving import MatchSolver, Solver
 from .walls import wall_votes
 from .windows import Odometry, Windows, corrected, cut
 
@@ -64,6 +81,19 @@ LEAST_CERTAINTY = 0.9
 LEAST_MOVED = 0.15
 """Metres that odometry must be off, in the root mean square: about the error of what takes its place."""
 
+LEAST_RECOGNISED = 0.85
+"""Part of the blocks where the robot was before that are recognised if walls do stand at right angles. Else the map is
+bent somewhere, and matches alone may say more."""
+
+TURNED, LEAST_SIGMAS_OF_TURNS = math.radians(8.0), 1.5
+"""Radians by which odometry must turn otherwise within `SPAN` for readings to tell it, and by how many standard errors
+they must then be foreseen better. Corners that are not square make it -4 to -6, drift 2 to 7."""
+
+LEFT_BY_SCANS = math.radians(3.0)
+"""By how much the yaw strays after scan matching, radians a √metre."""
+
+NOT_ENOUGH = ': not enough to tell that odometry is off'
+
 NO_WALLS = (
     'echoes do not agree on the directions of walls, so the drift of the yaw cannot be told: it takes walls at right '
     'angles to each other beside the robot, and odometry whose yaw holds for a few metres'
@@ -71,6 +101,23 @@ NO_WALLS = (
 
 Watch = Callable[[str, float], None]
 """Receives what is going on, and how much of it is done, from 0 to 1."""
+
+
+class _Drive(NamedTuple):
+    """A drive, in windows."""
+
+    readings: Readings
+    odometry: Odometry
+    windows: Windows
+    scans: Scans
+
+
+class _Attempt(NamedTuple):
+    """What became of a drive in one way: its nodes, and whether no other way needs to be tried."""
+
+    refinement: Refinement
+    nodes: Floats
+    sure: bool = False
 
 
 class Refiner:
@@ -137,12 +184,25 @@ class Refiner:
             return Refinement(False, reason, readings, odometry, {})
         windows = cut(readings, odometry)
         scans = Scans(windows, self._parameters, self._stop, held_out(len(windows)))
+        drive = _Drive(readings, odometry, windows, scans)
+        by_walls = self._at_right_angles(drive, least_moved)
+        if by_walls.sure:
+            return by_walls.refinement
+        return self._at_any_angle(drive, by_walls, least_moved)
+
+    def _at_right_angles(self, drive: _Drive, least_moved: float) -> _Attempt:
+        """Return the trajectory if walls stand at right angles to each other, or why there is none."""
+        readings, odometry, windows, scans = drive
         walls, witness = self._heading(windows, scans)
         if walls is None:
-            return Refinement(False, NO_WALLS, readings, odometry, {})
+            return _Attempt(Refinement(False, NO_WALLS, readings, odometry, {}), windows.node)
 
         def solver_of(heading: Heading) -> Solver:
             return Solver(odometry, windows, scans, heading, self._say)
+
+        def left(reason: str, better: Gain) -> _Attempt:
+            refused = Refinement(False, reason, readings, odometry, named, gain=better.mean)
+            return _Attempt(refused, windows.node)
 
         solver = solver_of(walls)
         along = solver.along_walls()
@@ -153,17 +213,15 @@ class Refiner:
         named = dict(zip(CALIBRATION, calibration.tolist(), strict=True))
         proven = better.sigmas >= LEAST_SIGMAS
         witnessed = witness > LEAST_WITNESS and better.sigmas >= LEAST_SIGMAS_WITH_WALLS
-        unproven = Refinement(
-            False, f'{said}: not enough to tell that odometry is off', readings, odometry, named, gain=better.mean
-        )
+        unproven = left(said + NOT_ENOUGH, better)
         if not proven and not witnessed:
             if walls.certainty < LEAST_CERTAINTY:
-                return Refinement(False, lost_words(walls.certainty), readings, odometry, {}, lost=True)
+                return _lost(drive, walls.certainty)
             if witness <= LEAST_WITNESS:
                 return unproven
         found = solved(scans, walls, solver, along, solver_of)
         if found.certainty < LEAST_CERTAINTY:
-            return Refinement(False, lost_words(found.certainty), readings, odometry, {}, lost=True)
+            return _lost(drive, found.certainty)
         if found.solver is not solver:
             solver, simple = found.solver, found.solver.simple(found.solver.calibration_of(found.along))
         nodes = self._choose(scans, simple, found.along.nodes, found.solution.nodes)
@@ -176,8 +234,7 @@ class Refiner:
             better = self._seen_again(scans, windows.node, nodes)
             said = f'with places seen before, {_said(better)}' if again else _said(better)
             if better.sigmas < (LEAST_SIGMAS if again else LEAST_SIGMAS_WITH_WALLS):
-                reason = f'{said}: not enough to tell that odometry is off'
-                return replace(unproven, reason=reason, gain=better.mean)
+                return left(said + NOT_ENOUGH, better)
             if not again:
                 said = f'that walls stand at right angles is likelier by {witness:.0f} nats than with odometry; {said}'
         if nodes is found.solution.nodes:
@@ -185,12 +242,57 @@ class Refiner:
         trajectory = refined(odometry, windows, nodes)
         moved, turned = differences(odometry, trajectory)
         if moved < least_moved:
-            reason = f'odometry is off by {moved:.2f} m, which is no more than sonar can tell'
-            return Refinement(False, reason, readings, odometry, named, gain=better.mean)
+            return left(too_little_words(moved), better)._replace(sure=True)
         placed, noise = replaced(readings, odometry, trajectory), walls.drifts.noise
-        return Refinement(
+        outcome = Refinement(
             True, said, placed, trajectory, named, moved, turned, len(found.loops), better.mean, noise=noise
         )
+        sure = recognised_part(scans, nodes, found.loops) >= LEAST_RECOGNISED and self._turned_right(scans, nodes)
+        return _Attempt(outcome, nodes, sure)
+
+    def _at_any_angle(self, drive: _Drive, by_walls: _Attempt, least_moved: float) -> Refinement:
+        """Return the trajectory that matches alone say, if it is better than what walls at right angles say."""
+        readings, odometry, windows, scans = drive
+        tried = [found for found in (self._matched(drive, trust) for trust in TRUSTS) if found is not None]
+        if not tried:
+            return by_walls.refinement
+        nodes, loops = tried[0]
+        for other, seen in tried[1:]:
+            if self._seen_again(scans, nodes, other).mean > 0.0:
+                nodes, loops = other, seen
+        better = self._seen_again(scans, windows.node, nodes)
+        trajectory = refined(odometry, windows, nodes)
+        moved, turned = differences(odometry, trajectory)
+        if better.sigmas < LEAST_SIGMAS or moved < least_moved:
+            return by_walls.refinement
+        if by_walls.refinement.accepted and self._seen_again(scans, by_walls.nodes, nodes).mean <= 0.0:
+            return by_walls.refinement
+        named = dict.fromkeys(CALIBRATION, 0.0) | {
+            name: told.value for name, told in of_yaw(odometry, trajectory).items()
+        }
+        return Refinement(
+            True,
+            f'walls are not taken to stand at right angles; with places seen before, {_said(better)}',
+            replaced(readings, odometry, trajectory),
+            trajectory,
+            named,
+            moved,
+            turned,
+            len(loops),
+            better.mean,
+            right_angles=False,
+        )
+
+    def _matched(self, drive: _Drive, trust: Trust) -> tuple[Floats, list[Loop]] | None:
+        """Return the nodes that matches alone say, and the loops among them; None if scan matching gains nothing."""
+        windows, scans = drive.windows, drive.scans
+        start, blocks = scan_matched(scans, trust, self._say('scan matching')), held_out_blocks(scans, len(windows))
+        if gain(*(foreseen(scans, nodes, blocks, SPAN) for nodes in (windows.node, start))).mean <= 0.0:
+            return None
+        change = sensitivity(drive.odometry, windows)
+        solver = MatchSolver(windows, scans, self._say, relative(start[:-1], start[1:]), LEFT_BY_SCANS, change)
+        solution, loops = solver.with_matches(solution_at(start, len(CALIBRATION)))
+        return solution.nodes, loops
 
     def _say(self, stage: str) -> Callable[[float], None]:
         def progress(part: float) -> None:
@@ -226,6 +328,22 @@ class Refiner:
         say(0.5)
         return gain(one, foreseen(scans, after, blocks, SPAN))
 
+    def _turned_right(self, scans: Scans, nodes: Floats) -> bool:
+        """Return whether readings are foreseen better where these nodes turn within a few metres as odometry does not.
+
+        A robot that goes around a corner which is not square looks as if its odometry were off by as much.
+        """
+        windows = scans.windows
+        blocks = blocks_of(len(windows), BLOCK, len(windows))
+        by = np.array([_turned(windows, nodes, block[len(block) // 2]) for block in blocks])
+        chosen = [blocks[k] for k in np.sort(np.argsort(-by, kind='stable')[:JUDGED_ON]) if by[k] > TURNED]
+        if len(chosen) < FEWEST_BLOCKS:
+            return True
+        return (
+            gain(*(foreseen(scans, each, chosen, SPAN) for each in (windows.node, nodes))).sigmas
+            > LEAST_SIGMAS_OF_TURNS
+        )
+
     def _seen_again(self, scans: Scans, before: Floats, after: Floats) -> Gain:
         """Return by how much what was held out is foreseen better on maps of all times that the robot came by."""
         # it is the only proof, so all that was held out has a say
@@ -242,6 +360,12 @@ class Refiner:
             if gain(seen, now).sigmas > -MOST_WORSE:
                 best, seen = nodes, now
         return best
+
+
+def _turned(windows: Windows, nodes: Floats, middle: int) -> float:
+    """Return by how much nodes turn, radians, within `SPAN` about one of them, beyond what odometry has."""
+    near = np.flatnonzero(np.abs(windows.node_progress - windows.node_progress[middle]) <= SPAN / 2)[[0, -1]]
+    return float(abs(wrapped(np.diff(nodes[near, 2] - windows.node[near, 2])[0])))
 
 
 def without_times(readings: Readings, odometry: Odometry) -> str:
@@ -271,6 +395,11 @@ def unfit(readings: Readings, odometry: Odometry) -> str:
     return ''
 
 
+def too_little_words(moved: float) -> str:
+    """Return why a drive stays that is off by so little, metres."""
+    return f'odometry is off by {moved:.2f} m, which is no more than sonar can tell'
+
+
 def lost_words(certainty: float) -> str:
     """Return why a drive stays whose heading is this certain."""
     return f'the heading was lost somewhere: that it is not off by a right angle is only {certainty:.0%} certain'
@@ -284,6 +413,11 @@ def refined(odometry: Odometry, windows: Windows, nodes: Floats) -> Odometry:
     pose = compose(home, pose)
     pose[:, 2] = np.unwrap(pose[:, 2])
     return Odometry(odometry.stamp, pose)
+
+
+def _lost(drive: _Drive, certainty: float) -> _Attempt:
+    refused = Refinement(False, lost_words(certainty), drive.readings, drive.odometry, {}, lost=True)
+    return _Attempt(refused, drive.windows.node)
 
 
 def _said(better: Gain) -> str:

@@ -80,6 +80,12 @@ def revisits(scans: Scans, nodes: Floats, passed: int | None = None) -> NDArray[
     return np.array(out, np.int64)
 
 
+def recognised_part(scans: Scans, nodes: Floats, loops: Sequence[Loop]) -> float:
+    """Return the part of the blocks that lie where the robot was before that are recognised; 1 if there are none."""
+    blocks = revisits(scans, nodes).tolist()
+    return len(recognised(loops).intersection(blocks)) / len(blocks) if blocks else 1.0
+
+
 def unsupported(blocks: NDArray[np.int64], seen: set[int], begin: int) -> NDArray[np.int64] | None:
     """Return the first blocks from `begin` on, of those that lie where the robot was, that are hardly recognised.
 

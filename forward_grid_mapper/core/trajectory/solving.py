@@ -26,7 +26,7 @@ from .odometry_model import (
     with_yaw,
 )
 from .passes import BLOCK, Found, Progress, again, ahead, bent
-from .pose_graph import Edges, Graph, Solution, Walls, Yaws, joined, no_edges, solve
+from .pose_graph import Edges, Graph, Solution, Walls, Yaws, joined, no_edges, no_walls, no_yaws, solve
 from .poses import Floats, rms_after_alignment
 from .relocating import MORE, displaced, loops_at, recognised, revisits, unsupported, windows_of
 from .scans import Scans
@@ -63,62 +63,38 @@ OF_WAYS = np.array([1.0, 1.0, 0.0, 0.0])
 """The part of a calibration that is left where the yaw is known."""
 
 
-class Solver:
-    """What is known about a drive, and its solutions.
+class MatchSolver:
+    """What odometry and matches know about a drive, and its solutions.
 
     Parameters
     ----------
-    odometry : Odometry
     windows : Windows
     scans : Scans
-    heading : Heading
     say : callable
         Receives a stage, and returns what receives how much of it is done.
+    motion : float64, shape (K − 1, 3)
+        From each node to the next one, in the frame of the first of the two.
+    noise : float
+        Of its yaw, radians a √metre.
+    change : float64, shape (K − 1, 3, C)
+        How `motion` changes with the calibration.
     """
 
     def __init__(
         self,
-        odometry: Odometry,
         windows: Windows,
         scans: Scans,
-        heading: Heading,
         say: Callable[[str], Progress],
+        motion: Floats,
+        noise: float,
+        change: Floats,
     ) -> None:
-        self._odometry, self._windows, self._scans, self._heading = odometry, windows, scans, heading
-        self._say = say
+        self._windows, self._scans, self._say, self._change = windows, scans, say, change
         self._in_place: set[int] = set()
-        drifts = heading.drifts
-        self.first_calibration = np.array([0.0, 0.0, drifts.bias, drifts.turn_scale])
-        self._change = sensitivity(odometry, windows)
-        motion = motions(odometry, windows) + self._change @ self.first_calibration
-        noise = Noise(yaw=max(LEAST_YAW, UNSEEN * drifts.noise))
-        information = np.asarray(np.linalg.inv(covariances(windows, noise)), np.float64)
+        information = np.asarray(np.linalg.inv(covariances(windows, Noise(yaw=noise))), np.float64)
         count = np.arange(len(windows))
         self._steps = Edges(count[:-1], count[1:], motion, information)
-        yaw = windows.node[heading.at, 2] + heading.measured
-        self._yaws = Yaws(heading.at, yaw, heading.information, OF_YAWS)
-        middles = (heading.at[1:] + heading.at[:-1]) / 2
-        self._askew = heading.askew[np.searchsorted(middles, count)]
-
-    def calibration_of(self, solution: Solution) -> Floats:
-        """Return the whole calibration of the odometry, shape (4,)."""
-        return self.first_calibration + solution.calibration
-
-    def simple(self, calibration: Floats) -> Floats:
-        """Return the nodes of odometry with the heading of walls and a calibration, shape (K, 3)."""
-        w = self._windows
-        turned = with_yaw(self._odometry, w.node_progress[self._heading.at], self._heading.correction)
-        return calibrated(turned, calibration * OF_WAYS).at(w.node_stamp)
-
-    def along_walls(self) -> Solution:
-        """Return what odometry and straight walls say."""
-        self._say('straight walls')
-        nodes, calibration = self.simple(np.zeros(len(CALIBRATION))), np.zeros(len(CALIBRATION))
-        for k in range(WALL_ROUNDS):
-            walls = self._walls(nodes, k == WALL_ROUNDS - 1)
-            solution = solve(self._graph(no_edges(), walls), nodes, calibration)
-            nodes, calibration = solution.nodes, solution.calibration
-        return solution
+        self._yaws = no_yaws()
 
     def with_matches(self, solution: Solution) -> tuple[Solution, list[Loop]]:
         """Return what matches with local maps say as well, and the loops among them."""
@@ -186,7 +162,7 @@ class Solver:
         return {key: loop for key, loop in looked.items() if same.issuperset(key)}
 
     def _walls(self, nodes: Floats, strict: bool) -> Walls:
-        return Distances(self._windows, self._scans.held_out, nodes, self._askew).walls(strict)
+        return no_walls()
 
     def _graph(self, matches: Edges, walls: Walls) -> Graph:
         return Graph(self._steps, self._change, CALIBRATION_SIGMA, matches, self._yaws, walls)
@@ -205,6 +181,63 @@ class Solver:
                 return solution, loops
             most = max(LARGEST_RESIDUAL, FIRST_OUT * float(off.max()))
             loops = [loop for loop, mean in zip(loops, off.tolist(), strict=True) if mean <= most]
+
+
+class Solver(MatchSolver):
+    """The same, and what walls say that stand at right angles.
+
+    Parameters
+    ----------
+    odometry : Odometry
+    windows : Windows
+    scans : Scans
+    heading : Heading
+    say : callable
+        Receives a stage, and returns what receives how much of it is done.
+    """
+
+    def __init__(
+        self,
+        odometry: Odometry,
+        windows: Windows,
+        scans: Scans,
+        heading: Heading,
+        say: Callable[[str], Progress],
+    ) -> None:
+        self._odometry, self._heading = odometry, heading
+        drifts = heading.drifts
+        self.first_calibration = np.array([0.0, 0.0, drifts.bias, drifts.turn_scale])
+        change = sensitivity(odometry, windows)
+        motion = motions(odometry, windows) + change @ self.first_calibration
+        super().__init__(windows, scans, say, motion, max(LEAST_YAW, UNSEEN * drifts.noise), change)
+        count = np.arange(len(windows))
+        yaw = windows.node[heading.at, 2] + heading.measured
+        self._yaws = Yaws(heading.at, yaw, heading.information, OF_YAWS)
+        middles = (heading.at[1:] + heading.at[:-1]) / 2
+        self._askew = heading.askew[np.searchsorted(middles, count)]
+
+    def calibration_of(self, solution: Solution) -> Floats:
+        """Return the whole calibration of the odometry, shape (4,)."""
+        return self.first_calibration + solution.calibration
+
+    def simple(self, calibration: Floats) -> Floats:
+        """Return the nodes of odometry with the heading of walls and a calibration, shape (K, 3)."""
+        w = self._windows
+        turned = with_yaw(self._odometry, w.node_progress[self._heading.at], self._heading.correction)
+        return calibrated(turned, calibration * OF_WAYS).at(w.node_stamp)
+
+    def along_walls(self) -> Solution:
+        """Return what odometry and straight walls say."""
+        self._say('straight walls')
+        nodes, calibration = self.simple(np.zeros(len(CALIBRATION))), np.zeros(len(CALIBRATION))
+        for k in range(WALL_ROUNDS):
+            walls = self._walls(nodes, k == WALL_ROUNDS - 1)
+            solution = solve(self._graph(no_edges(), walls), nodes, calibration)
+            nodes, calibration = solution.nodes, solution.calibration
+        return solution
+
+    def _walls(self, nodes: Floats, strict: bool) -> Walls:
+        return Distances(self._windows, self._scans.held_out, nodes, self._askew).walls(strict)
 
 
 def _edges_of(found: Found) -> Edges:

@@ -1,0 +1,265 @@
+"""Buildings whose walls stand at any angle: scan matching, and the trajectory that matches alone say."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from forward_grid_mapper.core.common.errors import Cancelled
+from forward_grid_mapper.core.common.parameters import Parameters
+from forward_grid_mapper.core.trajectory import refinement, scan_matching
+from forward_grid_mapper.core.trajectory.holding_out import Gain, held_out
+from forward_grid_mapper.core.trajectory.likelihood import scores
+from forward_grid_mapper.core.trajectory.local_map import for_matching
+from forward_grid_mapper.core.trajectory.outcome import Refinement
+from forward_grid_mapper.core.trajectory.poses import Floats, compose, relative, rms_after_alignment
+from forward_grid_mapper.core.trajectory.refinement import Refiner, _Attempt, _Drive
+from forward_grid_mapper.core.trajectory.scan_matching import BLOCK, FIRST, TRUSTS, scan_matched
+from forward_grid_mapper.core.trajectory.scans import Scans
+from forward_grid_mapper.core.trajectory.windows import Odometry, cut
+from forward_grid_mapper.simulation.drift import LEVELS, odometry_of, with_drift
+from forward_grid_mapper.simulation.drive import Recording, drive
+from forward_grid_mapper.simulation.sonar import NOISY, sonar_ring
+from forward_grid_mapper.simulation.world import Floorplan, World, building_tour, building_world
+
+TRUST = TRUSTS[0]
+
+MIDDLE, RADIUS, HALF = np.array([10.0, 10.0]), 7.0, 0.9
+"""Metres: a corridor along the five sides of a pentagon, whose walls have five directions modulo a right angle."""
+
+
+def corners(radius: float) -> Floats:
+    angle = np.radians(np.arange(0.0, 360.0, 72.0) + 10.0)
+    return MIDDLE + radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+
+
+def pentagon() -> World:
+    """Walls of the corridor, with a cupboard on each side."""
+    plan = Floorplan('pentagon', 200, 200)
+
+    def closed(places: Floats) -> None:
+        cells = [tuple(np.floor(place * 10).astype(int).tolist()) for place in (*places, places[0])]
+        for start, end in itertools.pairwise(cells):
+            plan.line(start, end)
+
+    inner, outer = (corners(RADIUS + side * HALF / math.cos(math.radians(36.0))) for side in (-1, 1))
+    closed(inner)
+    closed(outer)
+    for k in range(5):
+        a, b = outer[k], outer[(k + 1) % 5]
+        along = (b - a) / math.dist(a, b)
+        inside = np.array([-along[1], along[0]])
+        foot = a + (2.0 + 0.8 * k) * along
+        closed(np.array([foot, foot + 0.6 * along, foot + 0.6 * along + 0.3 * inside, foot + 0.3 * inside]))
+    return plan.world((170, 110))
+
+
+@pytest.fixture(scope='module')
+def exact() -> Recording:
+    way = corners(RADIUS)
+    return drive(pentagon(), np.concatenate([way, way[:4]]), 0.12, sonar_ring(12), NOISY, seed=3)
+
+
+def bent_by(exact: Recording, level: str, seed: int) -> tuple[Recording, Odometry]:
+    recording = with_drift(exact, LEVELS[level], seed)
+    return recording, odometry_of(recording)
+
+
+def scans_of(recording: Recording, odometry: Odometry) -> Scans:
+    windows = cut(recording.readings, odometry)
+    return Scans(windows, for_matching(Parameters()), np.zeros(1, np.uint8), held_out(len(windows)))
+
+
+def quietly(part: float) -> None:
+    """Receives how much is done."""
+
+
+@pytest.fixture(scope='module')
+def bent(exact: Recording) -> tuple[Recording, Odometry]:
+    return bent_by(exact, 'high', 5)
+
+
+@pytest.fixture(scope='module')
+def scans(bent: tuple[Recording, Odometry]) -> Scans:
+    return scans_of(*bent)
+
+
+@pytest.fixture(scope='module')
+def matched(scans: Scans) -> Floats:
+    return scan_matched(scans, TRUST, quietly)
+
+
+def off_after(nodes: Floats, true: Floats, apart: int = 12) -> Floats:
+    """By how much the motion over so many windows is off, metres, metres and radians."""
+    off = relative(relative(true[:-apart], true[apart:]), relative(nodes[:-apart], nodes[apart:]))
+    off[:, 2] = (off[:, 2] + math.pi) % (2 * math.pi) - math.pi
+    return off
+
+
+def test_scan_matching_takes_most_of_the_yaw_out_of_five_metres(exact, scans, matched) -> None:
+    true = odometry_of(exact).at(scans.windows.node_stamp)
+    before, after = (np.sqrt((off_after(nodes, true) ** 2).mean(0)) for nodes in (scans.windows.node, matched))
+    assert before[2] > math.radians(5.0)
+    assert after[2] < 0.6 * before[2]
+    assert np.hypot(*after[:2]) < 0.8 * np.hypot(*before[:2])
+
+
+def test_the_first_windows_stay(scans, matched) -> None:
+    np.testing.assert_array_equal(matched[:FIRST], scans.windows.node[:FIRST])
+
+
+def test_what_is_held_out_moves_nothing(scans, matched) -> None:
+    w = scans.windows
+    silent = np.repeat(scans.held_out, np.diff(w.first))
+    spoilt = replace(w, readings=replace(w.readings, z=np.where(silent, 0.5, w.readings.z)))
+    other = Scans(spoilt, for_matching(Parameters()), np.zeros(1, np.uint8), scans.held_out)
+    np.testing.assert_array_equal(scan_matched(other, TRUST, quietly), matched)
+
+
+def test_a_drive_that_is_moved_is_matched_the_same(bent, matched) -> None:
+    recording, odometry = bent
+    home = np.array([3.0, -12.0, math.pi / 2])
+    r = recording.readings
+    x, y, yaw = compose(home, np.stack([r.x, r.y, r.yaw], axis=1)).T
+    moved = Odometry.of(odometry.stamp, compose(home, odometry.pose))
+    windows = cut(replace(r, x=x, y=y, yaw=yaw), moved)
+    scans = Scans(windows, for_matching(Parameters()), np.zeros(1, np.uint8), held_out(len(windows)))
+    # maps are made in the frame of a node, wherever that is
+    np.testing.assert_allclose(relative(home, scan_matched(scans, TRUST, quietly))[:, :2], matched[:, :2], atol=1e-3)
+
+
+def test_the_mean_of_poses_against_plain_python(scans, matched) -> None:
+    k = FIRST + 10 * BLOCK
+    block, nodes = np.arange(k, k + BLOCK), matched[:k]
+    motion = relative(scans.windows.node[k - 1], scans.windows.node[block])
+    got = scan_matching._off(scans, nodes, block, motion, TRUST)
+    w = scans.windows
+    members = [j for j in range(k) if w.node_progress[k] - w.node_progress[j] < scan_matching.BEHIND]
+    around = scans.map(np.array(members), nodes[-1], nodes, scan_matching.ON_MAP)
+    joint = scans.joint(block, motion)
+    length, turn = (column[k + BLOCK - 1] - column[k - 1] for column in (w.travel, w.turn))
+    near, far = scan_matching.ALONG
+    yaw = math.sqrt(TRUST.yaw**2 * length + (scan_matching.YAW_OF_TURN * turn) ** 2 + scan_matching.LEAST_YAW**2)
+    sigmas = (near + far * length, near + far * length, yaw)
+    each, steps = [], range(-int(min(3.0 * yaw, scan_matching.FARTHEST) / math.radians(2.0)), 0)
+    turns = [math.radians(2.0) * n for n in (*steps, 0, *(-n for n in reversed(steps)))]
+    for x in (-0.1, 0.0, 0.1):
+        for y in (-0.1, 0.0, 0.1):
+            for t in turns:
+                pose = np.array([[x, y, t]])
+                fit = float(scores(joint, around, pose, max(len(joint.readings) // scan_matching.ASKED, 1))[0])
+                against = sum(min(0.5 * (v / s) ** 2, 4.0) for v, s in zip((x, y, t), sigmas, strict=True))
+                each.append((TRUST.counts * fit - against, pose[0]))
+    best = max(value for value, _ in each)
+    weights = [math.exp(value - best) for value, _ in each]
+    expected = sum(weight * pose for weight, (_, pose) in zip(weights, each, strict=True)) / sum(weights)
+    assert got == pytest.approx(expected, abs=1e-9)
+    assert np.abs(got).max() > 1e-3
+
+
+def test_nothing_to_match_with_is_odometry(scans) -> None:
+    w = scans.windows
+    empty = Scans(w, for_matching(Parameters()), np.zeros(1, np.uint8), np.ones(len(w), np.bool_))
+    np.testing.assert_allclose(scan_matched(empty, TRUST, quietly), w.node, atol=1e-9)
+
+
+@pytest.mark.parametrize('seed', [5, 6])
+def test_a_building_without_right_angles_is_refined(exact, seed: int) -> None:
+    # five sides would do as four, with odometry that is off by 18° at each corner
+    recording, odometry = bent_by(exact, 'high', seed)
+    true = odometry_of(exact)
+    outcome = Refiner(Parameters()).run(recording.readings, odometry)
+    assert rms_after_alignment(odometry.pose, true.pose) > 0.6
+    assert outcome.accepted and not outcome.right_angles
+    assert outcome.reason.startswith('walls are not taken to stand at right angles; with places seen before')
+    assert rms_after_alignment(outcome.trajectory.pose, true.pose) < 0.25
+    assert outcome.trajectory.pose[0] == pytest.approx(odometry.pose[0], abs=1e-6)
+    assert outcome.loops > 0
+
+
+def test_exact_odometry_stays_without_right_angles(exact) -> None:
+    outcome = Refiner(Parameters()).run(exact.readings, odometry_of(exact))
+    assert not outcome.accepted
+    assert outcome.readings is exact.readings
+
+
+def no_walls(self, windows, scans) -> tuple[None, float]:
+    return None, 0.0
+
+
+def test_what_readings_do_not_speak_for_is_left(bent, monkeypatch) -> None:
+    recording, odometry = bent
+    monkeypatch.setattr(Refiner, '_heading', no_walls)
+    monkeypatch.setattr(Refiner, '_seen_again', lambda *rest: Gain(0.02, 0.01))
+    left = Refiner(Parameters()).run(recording.readings, odometry)
+    assert not left.accepted and left.trajectory is odometry
+    assert left.reason == refinement.NO_WALLS
+    # where scan matching foresees nothing better, nothing is matched any more
+    monkeypatch.setattr(refinement, 'scan_matched', lambda scans, trust, watch: scans.windows.node)
+    monkeypatch.setattr(refinement, 'MatchSolver', None)
+    assert not Refiner(Parameters()).run(recording.readings, odometry).accepted
+
+
+def by_walls(scans: Scans, recording: Recording, odometry: Odometry) -> _Attempt:
+    """A trajectory that walls at right angles would give: odometry, which is taken for something else."""
+    found = Refinement(True, 'walls', recording.readings, odometry, {})
+    return _Attempt(found, scans.windows.node)
+
+
+@pytest.mark.parametrize('better', [0.1, -0.1])
+def test_of_two_trajectories_the_one_that_foresees_better_is_taken(
+    bent, scans, matched, monkeypatch, better: float
+) -> None:
+    recording, odometry = bent
+    attempt = by_walls(scans, recording, odometry)
+    # of both ways to match, of odometry, of walls
+    gains = [Gain(-0.1, 0.01), Gain(0.1, 0.01), Gain(better, 0.2)]
+    monkeypatch.setattr(Refiner, '_seen_again', lambda *rest: gains.pop(0))
+    monkeypatch.setattr(Refiner, '_matched', lambda self, drive, trust: (matched, []))
+    found = Refiner(Parameters())._at_any_angle(
+        _Drive(recording.readings, odometry, scans.windows, scans), attempt, 0.15
+    )
+    assert (found is attempt.refinement) == (better < 0.0)
+
+
+def test_turns_that_odometry_does_not_have_are_told_from_those_of_drift(exact, bent, scans) -> None:
+    true = odometry_of(exact).at(scans.windows.node_stamp)
+    refiner, odometry = Refiner(Parameters()), scans.windows.node
+    assert refiner._turned_right(scans, true)
+    # odometry turned at every corner as if it were square
+    corner = np.cumsum(np.abs(np.diff(true[:, 2], prepend=true[0, 2]))) // math.radians(72.0)
+    steps = relative(odometry[:-1], odometry[1:])
+    steps[:, 2] += np.diff(corner) * math.radians(18.0)
+    square = odometry[:1]
+    for step in steps:
+        square = np.concatenate([square, compose(square[-1:], step[None])])
+    assert not refiner._turned_right(scans, square)
+    # nothing is asked where odometry turns as the nodes do
+    assert refiner._turned_right(scans, odometry)
+
+
+def test_what_walls_say_stays_where_places_are_recognised(monkeypatch) -> None:
+    exact = drive(building_world(), building_tour()[:20], 0.15, sonar_ring(16), NOISY, seed=3)
+    recording, odometry = bent_by(exact, 'high', 6)
+    monkeypatch.setattr(Refiner, '_at_any_angle', None)
+    outcome = Refiner(Parameters()).run(recording.readings, odometry)
+    assert outcome.accepted and outcome.right_angles
+
+
+def test_scan_matching_can_be_cancelled(bent, monkeypatch) -> None:
+    recording, odometry = bent
+    monkeypatch.setattr(Refiner, '_heading', no_walls)
+    refiner, stages = Refiner(Parameters()), []
+
+    def watch(stage: str, part: float) -> None:
+        stages.append(stage)
+        if stage == 'scan matching' and part > 0.1:
+            refiner.cancel()
+
+    with pytest.raises(Cancelled):
+        refiner.run(recording.readings, odometry, watch)
+    assert stages[-1] == 'scan matching'
