@@ -275,8 +275,8 @@ class NodeParameters:
     )
     refine_poses: bool = param(
         False,
-        'Take the drift out of odometry when run_em is called, and publish the transform from map to odom. Needs walls '
-        "at right angles; odometry's poses stay where readings that were held out do not speak for others.",
+        'Take the drift out of odometry when run_em is called, and publish the transform from map to odom. Best with '
+        "walls at right angles; odometry's poses stay where readings that were held out do not speak for others.",
     )
     refine_every: float = param(
         0.0,

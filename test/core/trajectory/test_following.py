@@ -68,6 +68,23 @@ def followed(sample: Sample) -> Follower:
     return follower
 
 
+def test_without_right_angles_walls_have_no_say(sample: Sample, monkeypatch: pytest.MonkeyPatch) -> None:
+    follower = Follower(sample.correction, {}, Parameters(), right_angles=False)
+    graphs = []
+
+    def graph(self: Follower, *rest: Any) -> Any:
+        graphs.append(asked(self, *rest))
+        return graphs[-1]
+
+    asked = Follower._graph
+    monkeypatch.setattr(Follower, '_graph', graph)
+    follower.follow(sample.readings, sample.odometry)
+    assert follower.windows > 20
+    for each in graphs:
+        assert each.walls.total == 0
+        assert (each.yaws.information[SETTLED:] == 0.0).all()
+
+
 def same(one: Correction, other: Correction) -> bool:
     return np.array_equal(one.trajectory.stamp, other.trajectory.stamp) and np.array_equal(
         one.trajectory.pose, other.trajectory.pose
