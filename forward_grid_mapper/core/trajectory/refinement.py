@@ -5,7 +5,7 @@ heading         yaw from walls at right angles, followed over the whole drive
 straight walls  distances of walls along the drive, which hold it straight and tell scale and heading of the wheels
 matching        each block matched with what was driven before it, and then with what lies around it
 places          blocks matched with what was mapped there at another time
-scan matching   where walls tell no heading, or a doubtful one: windows matched one after the other, and places as before
+scan matching   where walls tell no heading, or a doubtful one: windows matched one by one, then blocks and places
 judgement       what was held out and where walls stand must speak for the trajectory, or odometry stays
 """
 
