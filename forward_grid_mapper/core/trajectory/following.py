@@ -26,6 +26,7 @@ from ..runtime.cancelling import check
 from .correction import Correction
 from .heading import yaws_of_votes
 from .holding_out import LEAST_SIGMAS, gain
+from .judging import MOST_WORSE
 from .jumps import jumps, since_jump
 from .likelihood import scores
 from .local_map import at_poses, for_matching, local_map
@@ -34,7 +35,7 @@ from .odometry_model import CALIBRATION, Noise, calibrated, covariances, motions
 from .passes import BEHIND, BLOCK
 from .pose_graph import Edges, Graph, Yaws, joined, no_edges, no_walls, solve
 from .poses import Floats, axes_at, compose, interpolated, relative
-from .refinement import MOST_WORSE, SHORTEST
+from .refinement import SHORTEST
 from .scans import FEWEST_ON_MAP, Scans
 from .solving import LEAST_YAW, UNSEEN
 from .wall_distances import Distances

@@ -13,9 +13,10 @@ from ..common.parameters import Parameters
 from ..common.readings import Readings
 from .correction import Correction
 from .holding_out import LEAST_SIGMAS, Gain, foreseen, gain, held_out, held_out_blocks
+from .judging import HELD_OUT
 from .local_map import for_matching
 from .outcome import Refinement, differences, replaced
-from .refinement import HELD_OUT, without_times
+from .refinement import without_times
 from .scans import Scans
 from .windows import Odometry, cut
 

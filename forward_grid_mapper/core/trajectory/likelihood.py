@@ -109,6 +109,16 @@ def make_scan(readings: Readings, poses: Floats, model: ModelParameters, resolut
     return scan
 
 
+def blurred(scan: Scan, by: float, around: LocalMap) -> Scan:
+    """Return a scan whose readings have a larger σ, to be asked at poses that lie far apart; `by` metres are added."""
+    table = scan.readings.copy()
+    table['sigma'] = np.hypot(table['sigma'], by)
+    table['reach'] += CUT * (table['sigma'] - scan.readings['sigma'])
+    blurry = Scan(table, scan.weight)
+    _set_unknown(blurry, around.resolution, around.unknown)
+    return blurry
+
+
 class Lanes(NamedTuple):
     """What is known of L poses that are asked side by side, so that processors work on several at a time.
 

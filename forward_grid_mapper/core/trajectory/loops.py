@@ -17,12 +17,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from .likelihood import Scan, scores
 from .local_map import LocalMap
-from .matching import grid_around, measure
+from .matching import measure
 from .passes import FEWEST, Found, Progress
 from .poses import Floats, axes_at, compose, relative, wrapped
 from .scans import FEWEST_ON_MAP, Scans
+from .searching import search
 
 LENGTH = 8
 """Windows of a block that is looked for."""
@@ -44,17 +44,6 @@ LARGEST = np.array([2.5, 2.5, math.radians(20.0)])
 """How far a block is searched: σ, and metres and radians at most."""
 
 LEAST = np.array([0.2, 0.2, math.radians(3.0)])
-
-STEPS = (0.15, 0.15, math.radians(2.5))
-
-ASKED = 60
-"""Readings that the search asks."""
-
-FIRST_ASKED, FOLLOWED = 12, 0.1
-"""Readings that it asks at all poses of a large search first, and the part of the poses where it asks the others."""
-
-LARGE = 300
-"""Poses of a large search."""
 
 SHARED = 4
 """Windows between places, so that blocks, and each time the robot comes by, share maps."""
@@ -143,17 +132,6 @@ def candidates(
     return out
 
 
-def searched(joint: Scan, around: LocalMap, poses: Floats, prior: Floats) -> Floats:
-    """Return Σ log ratio at each pose, shape (P,); of a large search only roughly where it is low."""
-    asked = FIRST_ASKED if len(poses) > LARGE else ASKED
-    values = scores(joint, around, poses, max(len(joint.readings) // asked, 1))
-    if len(poses) > LARGE:
-        count = max(int(FOLLOWED * len(poses)), LARGE)
-        best = np.argpartition(prior - values, count - 1)[:count]
-        values[best] = scores(joint, around, poses[best], max(len(joint.readings) // ASKED, 1))
-    return values
-
-
 def find_loop(
     scans: Scans, block: NDArray[np.int64], nodes: Floats, place: int, sigma: Floats, around: LocalMap, usual: float
 ) -> Loop | None:
@@ -163,12 +141,8 @@ def find_loop(
     joint = scans.joint(block, shape)
     guess = relative(nodes[place], nodes[middle])
     reach = np.clip(SIGMAS * sigma, LEAST, LARGEST)
-    poses = grid_around(guess, reach, STEPS)
-    off = relative(guess, poses)
-    prior = 0.5 * ((off / np.maximum(sigma, LEAST / 2)) ** 2).sum(1)
-    values = searched(joint, around, poses, prior)
-    total = values - prior
-    best = poses[int(total.argmax())]
+    found = search(joint, around, guess, np.maximum(sigma, LEAST / 2), reach)
+    best = found.best
     for _ in range(CLIMBS):
         best = measure(joint, around, best, MEASURED).pose
     final = measure(joint, around, best, MEASURED)
@@ -176,16 +150,16 @@ def find_loop(
     if final.score < GOOD * usual * count:
         return None
     # directions that are not measured may not decide
-    apart, axes = relative(best, poses), axes_at(best[2])
+    apart, axes = relative(best, found.poses), axes_at(best[2])
     curved = np.einsum('pi,ij,pj->p', apart, axes.T @ final.information @ axes, apart)
     elsewhere = (np.hypot(apart[:, 0], apart[:, 1]) > OTHER) & (curved > TOLD)
-    if elsewhere.any() and final.score - values[elsewhere].max() < CLEAR:
+    if elsewhere.any() and final.score - found.values[elsewhere].max() < CLEAR:
         return None
-    found = Found()
+    matches = Found()
     for j, local in zip(block, shape, strict=True):
         if scans.count[j] >= FEWEST:
-            found.add(place, int(j), measure(scans.scan[j], around, compose(best, local)), int(scans.count[j]))
-    return Loop(int(middle), place, found)
+            matches.add(place, int(j), measure(scans.scan[j], around, compose(best, local)), int(scans.count[j]))
+    return Loop(int(middle), place, matches)
 
 
 def find_loops(

@@ -11,7 +11,6 @@ judgement       what was held out and where walls stand must speak for the traje
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -23,32 +22,20 @@ from numpy.typing import NDArray
 from ..common.parameters import Parameters
 from ..common.readings import Readings
 from ..runtime.cancelling import check
+from .any_angle import matched
 from .certainty import of_yaw
 from .heading import NOISES, Heading, heading
-from .holding_out import (
-    FEWEST_BLOCKS,
-    LEAST_SIGMAS,
-    Gain,
-    blocks_of,
-    came_back,
-    foreseen,
-    gain,
-    held_out,
-    held_out_blocks,
-)
+from .holding_out import LEAST_SIGMAS, Gain, came_back, held_out
 from .hypotheses import solved
+from .judging import chosen, over_the_drive, seen_again, turned_right
 from .jumps import MOST_JUMPS, Part, begins_of, jumps, parts_at, with_yaw_anew, without_outliers
 from .local_map import for_matching
-from .loops import Loop
-from .odometry_model import CALIBRATION, sensitivity
+from .odometry_model import CALIBRATION
 from .outcome import Refinement, differences, joined_parts, replaced, with_outliers
-from .passes import BLOCK
-from .pose_graph import solution_at
-from .poses import Floats, compose, inverse, relative, wrapped
-from .relocating import recognised_part
-from .scan_matching import TRUSTS, Trust, scan_matched
+from .poses import Floats, compose, inverse
+from .relocating import LEAST_RECOGNISED, recognised_part
 from .scans import Scans
-from .solving import MatchSolver, Solver
+from .solving import Solver
 from .walls import wall_votes
 from .windows import Odometry, Windows, corrected, cut
 
@@ -62,36 +49,16 @@ LEAST_ECHOES = 0.05
 
 LEAST_SENSORS = 2
 
-SPAN = 6.0
-"""Metres of progress before and after a block that the map is made of on which odometry is compared."""
-
-JUDGED_ON, HELD_OUT = 60, 40
-"""Blocks, and held-out windows, that trajectories are compared on at the most."""
-
 LEAST_WITNESS, LEAST_SIGMAS_WITH_WALLS = 10.0, -1.0
 """Nats that the votes of walls must say against odometry's yaw, beyond what sensors say by where they look, to be a
 witness of their own, and the standard errors that are then enough where the robot came to no place twice: readings must
 not be foreseen worse. Little drift hardly shows in a few metres."""
-
-MOST_WORSE = 1.0
-"""Standard errors by which matching may foresee what was held out worse."""
 
 LEAST_CERTAINTY = 0.9
 """Probability that the heading did not get lost by a right angle."""
 
 LEAST_MOVED = 0.15
 """Metres that odometry must be off, in the root mean square: about the error of what takes its place."""
-
-LEAST_RECOGNISED = 0.85
-"""Part of the blocks where the robot was before that are recognised if walls do stand at right angles. Else the map is
-bent somewhere, and matches alone may say more."""
-
-TURNED, LEAST_SIGMAS_OF_TURNS = math.radians(8.0), 1.5
-"""Radians by which odometry must turn otherwise within `SPAN` for readings to tell it, and by how many standard errors
-they must then be foreseen better. Corners that are not square make it -4 to -6, drift 2 to 7."""
-
-LEFT_BY_SCANS = math.radians(3.0)
-"""By how much the yaw strays after scan matching, radians a √metre."""
 
 NOT_ENOUGH = ': not enough to tell that odometry is off'
 
@@ -209,7 +176,7 @@ class Refiner:
         along = solver.along_walls()
         calibration = solver.calibration_of(along)
         simple = solver.simple(calibration)
-        better = self._compare(scans, windows.node, simple)
+        better = over_the_drive(scans, windows.node, simple, self._say('judgement'))
         said = _said(better)
         named = dict(zip(CALIBRATION, calibration.tolist(), strict=True))
         proven = better.sigmas >= LEAST_SIGMAS
@@ -225,14 +192,15 @@ class Refiner:
             return _lost(drive, found.certainty)
         if found.solver is not solver:
             solver, simple = found.solver, found.solver.simple(found.solver.calibration_of(found.along))
-        nodes = self._choose(scans, simple, found.along.nodes, found.solution.nodes)
+        self._say('judgement')
+        nodes = chosen(scans, simple, found.along.nodes, found.solution.nodes)
         if not proven:
             # places seen before tell wheels that are right over metres from those that are not, and walls that stand
             # askew from a yaw that is off; where odometry alone says that the robot came back, it need not be so
             again = came_back(scans, nodes)
             if not again and not witnessed:
                 return unproven
-            better = self._seen_again(scans, windows.node, nodes)
+            better = seen_again(scans, windows.node, nodes)
             said = f'with places seen before, {_said(better)}' if again else _said(better)
             if better.sigmas < (LEAST_SIGMAS if again else LEAST_SIGMAS_WITH_WALLS):
                 return left(said + NOT_ENOUGH, better)
@@ -248,25 +216,22 @@ class Refiner:
         outcome = Refinement(
             True, said, placed, trajectory, named, moved, turned, len(found.loops), better.mean, noise=noise
         )
-        sure = recognised_part(scans, nodes, found.loops) >= LEAST_RECOGNISED and self._turned_right(scans, nodes)
+        sure = recognised_part(scans, nodes, found.loops) >= LEAST_RECOGNISED and turned_right(scans, nodes)
         return _Attempt(outcome, nodes, sure)
 
     def _at_any_angle(self, drive: _Drive, by_walls: _Attempt, least_moved: float) -> Refinement:
         """Return the trajectory that matches alone say, if it is better than what walls at right angles say."""
         readings, odometry, windows, scans = drive
-        tried = [found for found in (self._matched(drive, trust) for trust in TRUSTS) if found is not None]
-        if not tried:
+        found = matched(odometry, scans, self._say)
+        if found is None:
             return by_walls.refinement
-        nodes, loops = tried[0]
-        for other, seen in tried[1:]:
-            if self._seen_again(scans, nodes, other).mean > 0.0:
-                nodes, loops = other, seen
-        better = self._seen_again(scans, windows.node, nodes)
+        nodes = found.nodes
+        better = seen_again(scans, windows.node, nodes)
         trajectory = refined(odometry, windows, nodes)
         moved, turned = differences(odometry, trajectory)
         if better.sigmas < LEAST_SIGMAS or moved < least_moved:
             return by_walls.refinement
-        if by_walls.refinement.accepted and self._seen_again(scans, by_walls.nodes, nodes).mean <= 0.0:
+        if by_walls.refinement.accepted and seen_again(scans, by_walls.nodes, nodes).mean <= 0.0:
             return by_walls.refinement
         named = dict.fromkeys(CALIBRATION, 0.0) | {
             name: told.value for name, told in of_yaw(odometry, trajectory).items()
@@ -279,21 +244,10 @@ class Refiner:
             named,
             moved,
             turned,
-            len(loops),
+            len(found.loops),
             better.mean,
             right_angles=False,
         )
-
-    def _matched(self, drive: _Drive, trust: Trust) -> tuple[Floats, list[Loop]] | None:
-        """Return the nodes that matches alone say, and the loops among them; None if scan matching gains nothing."""
-        windows, scans = drive.windows, drive.scans
-        start, blocks = scan_matched(scans, trust, self._say('scan matching')), held_out_blocks(scans, len(windows))
-        if gain(*(foreseen(scans, nodes, blocks, SPAN) for nodes in (windows.node, start))).mean <= 0.0:
-            return None
-        change = sensitivity(drive.odometry, windows)
-        solver = MatchSolver(windows, scans, self._say, relative(start[:-1], start[1:]), LEFT_BY_SCANS, change)
-        solution, loops = solver.with_matches(solution_at(start, len(CALIBRATION)))
-        return solution.nodes, loops
 
     def _say(self, stage: str) -> Callable[[float], None]:
         def progress(part: float) -> None:
@@ -319,54 +273,6 @@ class Refiner:
         chance = heading(by_chance, *wall_votes(by_chance, scans.held_out), noises)
         looks = 0.0 if chance is None else max(chance.over_odometry, 0.0)
         return found, found.over_odometry - looks
-
-    def _compare(self, scans: Scans, before: Floats, after: Floats) -> Gain:
-        """Return by how much one trajectory foresees readings better than another, all over the drive."""
-        say = self._say('judgement')
-        blocks = blocks_of(len(before), BLOCK, JUDGED_ON)
-        # places of another time are left out: where they overlap by half they contradict, far apart they say nothing
-        one = foreseen(scans, before, blocks, SPAN)
-        say(0.5)
-        return gain(one, foreseen(scans, after, blocks, SPAN))
-
-    def _turned_right(self, scans: Scans, nodes: Floats) -> bool:
-        """Return whether readings are foreseen better where these nodes turn within a few metres as odometry does not.
-
-        A robot that goes around a corner which is not square looks as if its odometry were off by as much.
-        """
-        windows = scans.windows
-        blocks = blocks_of(len(windows), BLOCK, len(windows))
-        by = np.array([_turned(windows, nodes, block[len(block) // 2]) for block in blocks])
-        chosen = [blocks[k] for k in np.sort(np.argsort(-by, kind='stable')[:JUDGED_ON]) if by[k] > TURNED]
-        if len(chosen) < FEWEST_BLOCKS:
-            return True
-        return (
-            gain(*(foreseen(scans, each, chosen, SPAN) for each in (windows.node, nodes))).sigmas
-            > LEAST_SIGMAS_OF_TURNS
-        )
-
-    def _seen_again(self, scans: Scans, before: Floats, after: Floats) -> Gain:
-        """Return by how much what was held out is foreseen better on maps of all times that the robot came by."""
-        # it is the only proof, so all that was held out has a say
-        blocks = held_out_blocks(scans, len(before))
-        return gain(foreseen(scans, before, blocks), foreseen(scans, after, blocks))
-
-    def _choose(self, scans: Scans, first: Floats, *others: Floats) -> Floats:
-        """Return the last nodes that do not foresee what was held out from them worse than those before."""
-        self._say('judgement')
-        blocks = held_out_blocks(scans, HELD_OUT)
-        best, seen = first, foreseen(scans, first, blocks)
-        for nodes in others:
-            now = foreseen(scans, nodes, blocks)
-            if gain(seen, now).sigmas > -MOST_WORSE:
-                best, seen = nodes, now
-        return best
-
-
-def _turned(windows: Windows, nodes: Floats, middle: int) -> float:
-    """Return by how much nodes turn, radians, within `SPAN` about one of them, beyond what odometry has."""
-    near = np.flatnonzero(np.abs(windows.node_progress - windows.node_progress[middle]) <= SPAN / 2)[[0, -1]]
-    return float(abs(wrapped(np.diff(nodes[near, 2] - windows.node[near, 2])[0])))
 
 
 def without_times(readings: Readings, odometry: Odometry) -> str:

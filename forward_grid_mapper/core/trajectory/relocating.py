@@ -53,6 +53,9 @@ MOVED = 0.5
 SIGMA = np.array([0.1, 0.1, math.radians(1.5)])
 """σ of a block in the stretch, once this is in its place."""
 
+LEAST_RECOGNISED = 0.85
+"""Part of the blocks that lie where the robot was before that are recognised where nothing is bent."""
+
 MORE = 2
 """Blocks more that must be recognised in another place."""
 

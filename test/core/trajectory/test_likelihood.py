@@ -20,7 +20,6 @@ from forward_grid_mapper.core.trajectory.likelihood import (
     scores,
 )
 from forward_grid_mapper.core.trajectory.local_map import UNKNOWN, LocalMap, at_poses, cells_of, local_map
-from forward_grid_mapper.core.trajectory.loops import LARGE, searched
 from forward_grid_mapper.core.trajectory.matching import CURVED, grid_around, measure
 from forward_grid_mapper.core.trajectory.poses import compose
 from forward_grid_mapper.simulation.drive import drive
@@ -167,18 +166,6 @@ def test_a_scan_fits_where_it_was_taken(room) -> None:
     moved = compose(found, robot) - robot
     assert np.hypot(*moved[:2]) < 0.06
     assert abs(moved[2]) < math.radians(1.5)
-
-
-def test_a_large_search_finds_what_asking_all_finds(room) -> None:
-    around, scan = room
-    poses = grid_around(np.array([0.5, -0.4, 0.0]), np.array([1.2, 1.2, 0.2]))
-    assert len(poses) > LARGE
-    prior = np.zeros(len(poses))
-    found, right = searched(scan, around, poses, prior), scores(scan, around, poses)
-    assert found.argmax() == right.argmax()
-    assert (found == right).sum() >= LARGE
-    few = poses[: LARGE // 2]
-    assert (searched(scan, around, few, prior[: len(few)]) == right[: len(few)]).all()
 
 
 def test_the_parabola_is_that_of_the_scores(room) -> None:

@@ -78,15 +78,20 @@ def test_what_speaks_for_it_is_named(small, monkeypatch, outcome, small_outcome)
     assert 'that walls stand at right angles is likelier by' in Refiner(Parameters()).run(*small).reason
 
 
+def no_matches(odometry, scans, say) -> None:
+    """What matches alone say where they say nothing."""
+
+
 def test_places_seen_before_prove_what_nothing_nearby_does(tour, bent, monkeypatch) -> None:
     # wheels that are right over metres foresee what is near better than the yaws of walls
-    monkeypatch.setattr(Refiner, '_compare', lambda *rest: Gain(-0.05, 0.01))
+    monkeypatch.setattr(refinement, 'matched', no_matches)
+    monkeypatch.setattr(refinement, 'over_the_drive', lambda *rest: Gain(-0.05, 0.01))
     found, true = Refiner(Parameters()).run(*bent), odometry_of(tour).pose
     assert found.accepted
     assert found.reason.startswith('with places seen before, readings are foreseen +')
     assert rms_after_alignment(found.trajectory.pose, true) < 0.2
     # the same without such places, and without walls that say that the yaw is off
-    monkeypatch.setattr(Refiner, '_seen_again', lambda *rest: Gain(0.0, 0.01))
+    monkeypatch.setattr(refinement, 'seen_again', lambda *rest: Gain(0.0, 0.01))
     left = Refiner(Parameters()).run(*bent)
     monkeypatch.setattr(refinement, 'LEAST_WITNESS', 1e9)
     for outcome in (left, Refiner(Parameters()).run(*bent)):
@@ -96,8 +101,9 @@ def test_places_seen_before_prove_what_nothing_nearby_does(tour, bent, monkeypat
 
 def test_walls_are_no_proof_where_places_seen_before_say_nothing(bent, monkeypatch) -> None:
     # walls that stand askew tell a yaw that is off, and readings are foreseen about as well
-    monkeypatch.setattr(Refiner, '_compare', lambda *rest: Gain(0.001, 0.01))
-    monkeypatch.setattr(Refiner, '_seen_again', lambda *rest: Gain(0.001, 0.01))
+    monkeypatch.setattr(refinement, 'matched', no_matches)
+    monkeypatch.setattr(refinement, 'over_the_drive', lambda *rest: Gain(0.001, 0.01))
+    monkeypatch.setattr(refinement, 'seen_again', lambda *rest: Gain(0.001, 0.01))
     left = Refiner(Parameters()).run(*bent)
     assert not left.accepted
     assert left.reason.startswith('with places seen before, readings are foreseen +')
@@ -107,7 +113,7 @@ def test_walls_are_no_proof_where_places_seen_before_say_nothing(bent, monkeypat
     found = Refiner(Parameters()).run(*bent)
     assert found.accepted
     assert found.reason.startswith('that walls stand at right angles is likelier')
-    monkeypatch.setattr(Refiner, '_seen_again', lambda *rest: Gain(-0.02, 0.01))
+    monkeypatch.setattr(refinement, 'seen_again', lambda *rest: Gain(-0.02, 0.01))
     worse = Refiner(Parameters()).run(*bent)
     assert not worse.accepted
     assert worse.reason.startswith('readings are foreseen -')

@@ -15,7 +15,7 @@ from forward_grid_mapper.core.trajectory.hypotheses import solved
 from forward_grid_mapper.core.trajectory.loops import LENGTH, Loop
 from forward_grid_mapper.core.trajectory.matching import Match
 from forward_grid_mapper.core.trajectory.passes import Found, ahead
-from forward_grid_mapper.core.trajectory.pose_graph import Solution
+from forward_grid_mapper.core.trajectory.pose_graph import solution_at
 from forward_grid_mapper.core.trajectory.poses import Floats, compose, relative
 from forward_grid_mapper.core.trajectory.relocating import (
     CONFIRMING,
@@ -72,15 +72,11 @@ def test_a_stretch_is_found_farther_off_than_single_blocks_are_looked_for(there_
     assert displaced(scans, true, stretch) is None
 
 
-def solution_at(nodes: Floats) -> Solution:
-    return Solution(nodes, np.zeros(4), np.zeros(0), np.zeros(len(nodes) - 1), np.zeros((1, len(nodes), 3)))
-
-
 def test_what_was_led_astray_is_put_where_it_belongs(there_and_back) -> None:
     true, first = there_and_back.windows.node, turning(there_and_back)
     solver = Solver(*there_and_back, quietly)
     found = ahead(there_and_back.scans, true, lambda part: None)
-    wrong = solution_at(astray(there_and_back))
+    wrong = solution_at(astray(there_and_back), 4)
     solution, loops = solver._relocated(found.edges(), [], wrong, found.usual)
     off = relative(solution.nodes[0], solution.nodes) - relative(true[0], true)
     assert np.hypot(off[:, 0], off[:, 1]).max() < 0.3
@@ -107,7 +103,7 @@ def test_another_place_is_taken_only_if_readings_are_foreseen_better(there_and_b
 
     monkeypatch.setattr(solving, 'displaced', aside)
     monkeypatch.setattr(solving, 'loops_at', loops_there)
-    solver, start = Solver(*there_and_back, quietly), solution_at(true)
+    solver, start = Solver(*there_and_back, quietly), solution_at(true, 4)
     blocks = revisits(there_and_back.scans, true)
     blocks = blocks[blocks * LENGTH > first][:RUN]
     solution, loops = solver._elsewhere(blocks, Found().edges(), [], start, 1.0)
@@ -117,7 +113,7 @@ def test_another_place_is_taken_only_if_readings_are_foreseen_better(there_and_b
 
 def test_what_is_in_its_place_stays(there_and_back) -> None:
     solver, true = Solver(*there_and_back, quietly), there_and_back.windows.node
-    start = solution_at(true)
+    start = solution_at(true, 4)
     solution, loops = solver._relocated(Found().edges(), [], start, 1.0)
     assert solution is start
     assert loops == []

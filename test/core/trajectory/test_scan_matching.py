@@ -11,11 +11,14 @@ import pytest
 
 from forward_grid_mapper.core.common.errors import Cancelled
 from forward_grid_mapper.core.common.parameters import Parameters
-from forward_grid_mapper.core.trajectory import refinement, scan_matching
+from forward_grid_mapper.core.trajectory import any_angle, refinement, scan_matching
+from forward_grid_mapper.core.trajectory.any_angle import Matched
 from forward_grid_mapper.core.trajectory.holding_out import Gain, held_out
+from forward_grid_mapper.core.trajectory.judging import turned_right
 from forward_grid_mapper.core.trajectory.likelihood import scores
 from forward_grid_mapper.core.trajectory.local_map import for_matching
 from forward_grid_mapper.core.trajectory.outcome import Refinement
+from forward_grid_mapper.core.trajectory.pose_graph import Solution, solution_at
 from forward_grid_mapper.core.trajectory.poses import Floats, compose, relative, rms_after_alignment
 from forward_grid_mapper.core.trajectory.refinement import Refiner, _Attempt, _Drive
 from forward_grid_mapper.core.trajectory.scan_matching import BLOCK, FIRST, TRUSTS, scan_matched
@@ -194,14 +197,45 @@ def no_walls(self, windows, scans) -> tuple[None, float]:
 def test_what_readings_do_not_speak_for_is_left(bent, monkeypatch) -> None:
     recording, odometry = bent
     monkeypatch.setattr(Refiner, '_heading', no_walls)
-    monkeypatch.setattr(Refiner, '_seen_again', lambda *rest: Gain(0.02, 0.01))
+    monkeypatch.setattr(refinement, 'seen_again', lambda *rest: Gain(0.02, 0.01))
     left = Refiner(Parameters()).run(recording.readings, odometry)
     assert not left.accepted and left.trajectory is odometry
     assert left.reason == refinement.NO_WALLS
     # where scan matching foresees nothing better, nothing is matched any more
-    monkeypatch.setattr(refinement, 'scan_matched', lambda scans, trust, watch: scans.windows.node)
-    monkeypatch.setattr(refinement, 'MatchSolver', None)
+    monkeypatch.setattr(any_angle, 'scan_matched', lambda scans, trust, watch: scans.windows.node)
+    monkeypatch.setattr(any_angle, 'MatchSolver', None)
     assert not Refiner(Parameters()).run(recording.readings, odometry).accepted
+
+
+class Trials:
+    """A solver in whose place the drive is put by a metre more with each trial, and what is asked of it."""
+
+    def __init__(self, monkeypatch, parts: list[float], gains: list[float]) -> None:
+        self.count = 0
+        monkeypatch.setattr(any_angle, 'MatchSolver', lambda *rest: self)
+        monkeypatch.setattr(any_angle, 'scan_matched', lambda scans, trust, watch: scans.windows.node)
+        monkeypatch.setattr(any_angle, 'held_out_nearby', lambda *rest: Gain(0.1, 0.01))
+        monkeypatch.setattr(any_angle, 'recognised_part', lambda *rest: parts.pop(0))
+        monkeypatch.setattr(any_angle, 'seen_again', lambda *rest: Gain(gains.pop(0), 0.01))
+
+    def with_matches(self, solution: Solution) -> tuple[Solution, list]:
+        self.count += 1
+        moved = solution.nodes + np.array([self.count, 0.0, 0.0])
+        return solution_at(moved, 4), []
+
+
+@pytest.mark.parametrize(
+    ('parts', 'gains', 'trials', 'best'),
+    [([0.9], [], 1, 1), ([0.5, 0.5], [0.1], 2, 2), ([0.5, 0.5], [-0.1], 2, 1)],
+)
+def test_another_trust_is_tried_where_places_are_not_recognised(
+    bent, scans, monkeypatch, parts, gains, trials, best
+) -> None:
+    asked = Trials(monkeypatch, parts, gains)
+    found = any_angle.matched(bent[1], scans, lambda stage: quietly)
+    assert found is not None
+    assert asked.count == trials
+    np.testing.assert_allclose(found.nodes[:, 0] - scans.windows.node[:, 0], best)
 
 
 def by_walls(scans: Scans, recording: Recording, odometry: Odometry) -> _Attempt:
@@ -216,10 +250,10 @@ def test_of_two_trajectories_the_one_that_foresees_better_is_taken(
 ) -> None:
     recording, odometry = bent
     attempt = by_walls(scans, recording, odometry)
-    # of both ways to match, of odometry, of walls
-    gains = [Gain(-0.1, 0.01), Gain(0.1, 0.01), Gain(better, 0.2)]
-    monkeypatch.setattr(Refiner, '_seen_again', lambda *rest: gains.pop(0))
-    monkeypatch.setattr(Refiner, '_matched', lambda self, drive, trust: (matched, []))
+    # than odometry, than walls
+    gains = [Gain(0.1, 0.01), Gain(better, 0.2)]
+    monkeypatch.setattr(refinement, 'seen_again', lambda *rest: gains.pop(0))
+    monkeypatch.setattr(refinement, 'matched', lambda *rest: Matched(matched, []))
     found = Refiner(Parameters())._at_any_angle(
         _Drive(recording.readings, odometry, scans.windows, scans), attempt, 0.15
     )
@@ -228,8 +262,8 @@ def test_of_two_trajectories_the_one_that_foresees_better_is_taken(
 
 def test_turns_that_odometry_does_not_have_are_told_from_those_of_drift(exact, bent, scans) -> None:
     true = odometry_of(exact).at(scans.windows.node_stamp)
-    refiner, odometry = Refiner(Parameters()), scans.windows.node
-    assert refiner._turned_right(scans, true)
+    odometry = scans.windows.node
+    assert turned_right(scans, true)
     # odometry turned at every corner as if it were square
     corner = np.cumsum(np.abs(np.diff(true[:, 2], prepend=true[0, 2]))) // math.radians(72.0)
     steps = relative(odometry[:-1], odometry[1:])
@@ -237,9 +271,9 @@ def test_turns_that_odometry_does_not_have_are_told_from_those_of_drift(exact, b
     square = odometry[:1]
     for step in steps:
         square = np.concatenate([square, compose(square[-1:], step[None])])
-    assert not refiner._turned_right(scans, square)
+    assert not turned_right(scans, square)
     # nothing is asked where odometry turns as the nodes do
-    assert refiner._turned_right(scans, odometry)
+    assert turned_right(scans, odometry)
 
 
 def test_what_walls_say_stays_where_places_are_recognised(monkeypatch) -> None:

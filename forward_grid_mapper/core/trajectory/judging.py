@@ -1,0 +1,92 @@
+"""Judging: whether readings speak for one trajectory rather than another, by what each foresees of readings not used.
+
+All over the drive, maps of a few metres of it are compared: so the drift of odometry shows. At places seen before, maps
+of all times are compared with windows that were held out: so a drive that is bent as a whole shows.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from .holding_out import FEWEST_BLOCKS, Gain, blocks_of, foreseen, gain, held_out_blocks
+from .passes import BLOCK, Progress
+from .poses import Floats, wrapped
+from .scans import Scans
+from .windows import Windows
+
+SPAN = 6.0
+"""Metres of progress before and after a block that the map is made of on which odometry is compared."""
+
+JUDGED_ON, HELD_OUT = 60, 40
+"""Blocks, and held-out windows, that trajectories are compared on at the most."""
+
+MOST_WORSE = 1.0
+"""Standard errors by which matching may foresee what was held out worse."""
+
+TURNED, LEAST_SIGMAS_OF_TURNS = math.radians(8.0), 1.5
+"""Radians by which odometry must turn otherwise within `SPAN` for readings to tell it, and by how many standard errors
+they must then be foreseen better. Corners that are not square make it -4 to -6, drift 2 to 7."""
+
+
+def over_the_drive(scans: Scans, before: Floats, after: Floats, watch: Progress) -> Gain:
+    """Return by how much one trajectory foresees readings better than another, all over the drive.
+
+    Parameters
+    ----------
+    scans : Scans
+    before, after : float64, shape (K, 3)
+        Nodes; places in `after` must not come from readings.
+    watch : callable
+    """
+    blocks = blocks_of(len(before), BLOCK, JUDGED_ON)
+    # places of another time are left out: where they overlap by half they contradict, far apart they say nothing
+    one = foreseen(scans, before, blocks, SPAN)
+    watch(0.5)
+    return gain(one, foreseen(scans, after, blocks, SPAN))
+
+
+def held_out_nearby(scans: Scans, before: Floats, after: Floats) -> Gain:
+    """Return by how much what was held out is foreseen better on maps of the metres around it."""
+    blocks = held_out_blocks(scans, len(before))
+    return gain(foreseen(scans, before, blocks, SPAN), foreseen(scans, after, blocks, SPAN))
+
+
+def seen_again(scans: Scans, before: Floats, after: Floats) -> Gain:
+    """Return by how much what was held out is foreseen better on maps of all times that the robot came by."""
+    # it is the only proof, so all that was held out has a say
+    blocks = held_out_blocks(scans, len(before))
+    return gain(foreseen(scans, before, blocks), foreseen(scans, after, blocks))
+
+
+def chosen(scans: Scans, first: Floats, *others: Floats) -> Floats:
+    """Return the last nodes that do not foresee what was held out from them worse than those before."""
+    blocks = held_out_blocks(scans, HELD_OUT)
+    best, seen = first, foreseen(scans, first, blocks)
+    for nodes in others:
+        now = foreseen(scans, nodes, blocks)
+        if gain(seen, now).sigmas > -MOST_WORSE:
+            best, seen = nodes, now
+    return best
+
+
+def turned_right(scans: Scans, nodes: Floats) -> bool:
+    """Return whether readings are foreseen better where nodes turn within a few metres as odometry does not.
+
+    A robot that goes around a corner which is not square looks as if its odometry were off by as much.
+    """
+    windows = scans.windows
+    blocks = blocks_of(len(windows), BLOCK, len(windows))
+    by = np.array([_turned(windows, nodes, block[len(block) // 2]) for block in blocks])
+    sharp = [blocks[k] for k in np.sort(np.argsort(-by, kind='stable')[:JUDGED_ON]) if by[k] > TURNED]
+    if len(sharp) < FEWEST_BLOCKS:
+        return True
+    better = gain(*(foreseen(scans, each, sharp, SPAN) for each in (windows.node, nodes)))
+    return better.sigmas > LEAST_SIGMAS_OF_TURNS
+
+
+def _turned(windows: Windows, nodes: Floats, middle: int) -> float:
+    """Return by how much nodes turn, radians, within `SPAN` about one of them, beyond what odometry has."""
+    near = np.flatnonzero(np.abs(windows.node_progress - windows.node_progress[middle]) <= SPAN / 2)[[0, -1]]
+    return float(abs(wrapped(np.diff(nodes[near, 2] - windows.node[near, 2])[0])))

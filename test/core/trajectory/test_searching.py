@@ -1,0 +1,103 @@
+"""Searching from coarse to fine against asking every pose."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from forward_grid_mapper.core.common.parameters import Parameters
+from forward_grid_mapper.core.trajectory.likelihood import Scan, blurred, make_scan, scores
+from forward_grid_mapper.core.trajectory.local_map import UNKNOWN, LocalMap, local_map
+from forward_grid_mapper.core.trajectory.matching import grid_around
+from forward_grid_mapper.core.trajectory.poses import Floats, compose, relative
+from forward_grid_mapper.core.trajectory.searching import ASKED, LARGE, STEPS, Searched, search
+from forward_grid_mapper.simulation.drive import drive
+from forward_grid_mapper.simulation.sonar import NOISY, sonar_ring
+from forward_grid_mapper.simulation.world import building_tour, building_world
+
+MODEL = Parameters().model
+NOTHING = UNKNOWN * MODEL.p_hit
+APART = 0.6
+"""Metres between two places."""
+
+
+@pytest.fixture(scope='module')
+def places() -> list[tuple[LocalMap, Scan, Floats]]:
+    """Maps along a drive, a scan of 2 m of it that is not on each map, and where the scan was taken."""
+    recording = drive(building_world(), building_tour()[:12], 0.1, sonar_ring(8), NOISY, seed=2)
+    readings, out = recording.readings, []
+    robot = np.array([each.pose for each in recording.odometry], float)
+    stamps = np.array([each.stamp for each in recording.odometry])
+    for k in range(60, len(stamps) - 60, 50):
+        when = np.abs(np.searchsorted(stamps, readings.stamp) - k)
+        scan, rest = readings.select(when < 10), readings.select((when >= 10) & (when < 50))
+        around = local_map(rest, Parameters(), np.zeros(1, np.uint8))
+        sensors = relative(robot[k], np.stack([scan.x, scan.y, scan.yaw], axis=1))
+        out.append((around, make_scan(scan, sensors, MODEL, 0.1, NOTHING), robot[k]))
+    assert len(out) >= 5
+    return out
+
+
+def asked_all(scan: Scan, around: LocalMap, guess: Floats, sigma: Floats, reach: Floats) -> Searched:
+    poses = grid_around(guess, reach, STEPS)
+    prior = 0.5 * ((relative(guess, poses) / sigma) ** 2).sum(1)
+    return Searched(poses, scores(scan, around, poses, max(len(scan.readings) // ASKED, 1)), prior)
+
+
+def second(found: Searched) -> float:
+    """The best value at another place than the best one's."""
+    apart = found.poses - found.best
+    return float(found.values[np.hypot(apart[:, 0], apart[:, 1]) > APART].max())
+
+
+SIGMA, REACH = np.array([1.0, 1.0, math.radians(8.0)]), np.array([2.1, 2.1, math.radians(15.0)])
+
+
+def test_a_large_search_finds_what_asking_all_finds(places) -> None:
+    for around, scan, true in places:
+        guess = compose(true, np.array([0.7, -0.5, math.radians(6.0)]))
+        found, right = (each(scan, around, guess, SIGMA, REACH) for each in (search, asked_all))
+        assert len(found.poses) < 0.3 * len(right.poses)
+        assert found.best == pytest.approx(right.best, abs=1e-9)
+        # what fits about as well elsewhere is known too
+        assert second(found) > second(right) - 3.0
+
+
+def test_a_small_search_asks_all(places) -> None:
+    around, scan, true = places[0]
+    reach = np.array([0.3, 0.3, math.radians(7.5)])
+    found, right = (each(scan, around, true, SIGMA, reach) for each in (search, asked_all))
+    assert len(right.poses) <= LARGE
+    for one, other in zip(found, right, strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_nothing_outside_of_the_reach_is_asked(places) -> None:
+    around, scan, true = places[1]
+    off = relative(true, search(scan, around, true, SIGMA, REACH).poses)
+    assert (np.abs(off) <= REACH + 1e-9).all()
+    assert len(np.unique(off.round(6), axis=0)) == len(off)
+
+
+def test_a_direction_that_is_certain_is_not_searched(places) -> None:
+    around, scan, true = places[2]
+    reach = np.array([2.1, 0.0, math.radians(15.0)])
+    off = relative(true, search(scan, around, true, SIGMA, reach).poses)
+    assert np.abs(off[:, 1]).max() < 1e-9 and np.abs(off[:, 0]).max() > 1.0
+
+
+def test_a_blurred_scan_is_one_of_a_larger_sigma(places) -> None:
+    around, scan, true = places[0]
+    by = 0.2
+    blurry = blurred(scan, by, around)
+    np.testing.assert_allclose(blurry.readings['sigma'], np.hypot(scan.readings['sigma'], by))
+    poses = grid_around(true, np.array([0.3, 0.3, 0.0]), (0.15, 0.15, 0.1))
+    sharp, soft = (scores(each, around, poses) for each in (scan, blurry))
+    # it falls less where it is off by a step
+    assert np.ptp(soft) < np.ptp(sharp)
+    # what nobody knows counts nothing still
+    far = np.array([[90.0, 9.0, 1.0]])
+    assert scores(blurry, around, far) == pytest.approx([0.0], abs=1e-3)
+    assert blurred(scan, 0.0, around).readings.tolist() == scan.readings.tolist()
