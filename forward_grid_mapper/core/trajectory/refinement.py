@@ -181,7 +181,9 @@ class Refiner:
         named = dict(zip(CALIBRATION, calibration.tolist(), strict=True))
         proven = better.sigmas >= LEAST_SIGMAS
         witnessed = witness > LEAST_WITNESS and better.sigmas >= LEAST_SIGMAS_WITH_WALLS
-        unproven = left(said + NOT_ENOUGH, better)
+        # where walls stand at right angles along odometry as it is, that is the answer
+        stands = differences(odometry, refined(odometry, windows, along.nodes))[0] < LEAST_MOVED
+        unproven = left(said + NOT_ENOUGH, better)._replace(sure=stands)
         if not proven and not witnessed:
             if walls.certainty < LEAST_CERTAINTY:
                 return _lost(drive, walls.certainty)

@@ -154,8 +154,10 @@ def test_the_map_explains_more(bent, outcome) -> None:
     assert refined > drifted + 0.1 * len(outcome.readings)
 
 
-def test_exact_odometry_stays(tour) -> None:
+def test_exact_odometry_stays(tour, monkeypatch) -> None:
     odometry = odometry_of(tour)
+    # walls stand at right angles along it, so no other way is tried
+    monkeypatch.setattr(refinement, 'matched', None)
     left = Refiner(Parameters()).run(tour.readings, odometry)
     assert not left.accepted
     assert left.reason
