@@ -15,7 +15,7 @@ from ..core.common.parameters import Parameters
 from ..core.common.readings import Readings, of_drives
 from ..core.maps.map_set import MapSet
 from ..core.messages.reading_buffer import bounded
-from ..core.trajectory.certainty import Told, after, certain
+from ..core.trajectory.certainty import OF_YAW, Told, after, certain
 from ..core.trajectory.odometry_model import CALIBRATION, calibrated
 from ..core.trajectory.outcome import Refinement, replaced
 from ..core.trajectory.poses import relative
@@ -184,12 +184,14 @@ def _told(
         begin, end = outcome.stretch
         readings = readings.select((readings.stamp >= begin) & (readings.stamp <= end))
         odometry, trajectory = odometry.between(begin, end), trajectory.between(begin, end)
-    if given is None:
-        return certain(readings, odometry, trajectory, outcome.calibration, parameters, stop)
-    applied = _calibrated(odometry, given)
-    readings = replaced(readings, odometry, applied)
+    applied = odometry if given is None else _calibrated(odometry, given)
+    if given is not None:
+        readings = replaced(readings, odometry, applied)
     told = certain(readings, applied, trajectory, outcome.calibration, parameters, stop)
-    return after(given.calibration, told)
+    if not outcome.right_angles:
+        # without walls the yaw follows odometry where readings say little, and would agree with it
+        told = {name: each for name, each in told.items() if name not in OF_YAW}
+    return told if given is None else after(given.calibration, told)
 
 
 def _fitted(outcomes: list[Refinement], parameters: Parameters) -> tuple[list[Refinement], list[str]]:

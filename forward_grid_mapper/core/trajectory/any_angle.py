@@ -36,7 +36,7 @@ class Matched(NamedTuple):
     loops: list[Loop]
 
 
-def matched(odometry: Odometry, scans: Scans, say: Callable[[str], Progress]) -> Matched | None:
+def matched(odometry: Odometry, scans: Scans, say: Callable[[str], Progress], noise: float = 0.0) -> Matched | None:
     """Return the nodes that matches alone say; None if scan matching foresees nothing better.
 
     Parameters
@@ -45,14 +45,18 @@ def matched(odometry: Odometry, scans: Scans, say: Callable[[str], Progress]) ->
     scans : Scans
     say : callable
         Receives a stage, and returns what receives how much of it is done.
+    noise : float
+        By how much the yaw of odometry strays, radians a √metre; 0 if nobody knows.
     """
     windows, best = scans.windows, None
     change = sensitivity(odometry, windows)
+    left = min(LEFT_BY_SCANS, noise or LEFT_BY_SCANS)
     for trust in TRUSTS:
-        start = scan_matched(scans, trust, say('scan matching'))
+        own = trust._replace(yaw=noise or trust.yaw)
+        start = scan_matched(scans, own, say('scan matching'))
         if held_out_nearby(scans, windows.node, start).mean <= 0.0:
             continue
-        solver = MatchSolver(windows, scans, say, relative(start[:-1], start[1:]), LEFT_BY_SCANS, change)
+        solver = MatchSolver(windows, scans, say, relative(start[:-1], start[1:]), left, change)
         solution, loops = solver.with_matches(solution_at(start, len(CALIBRATION)))
         found = Matched(solution.nodes, loops)
         if best is None or seen_again(scans, best.nodes, found.nodes).mean > 0.0:

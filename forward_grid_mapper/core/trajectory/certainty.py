@@ -1,6 +1,6 @@
 """How certain a calibration is that a drive tells of its odometry.
 
-Yaw is known all along a refined trajectory, since walls measure it. So what odometry errs by in a metre and in a radian
+Yaw is known all along a trajectory whose yaw walls measure. So what odometry errs by in a metre and in a radian
 is a regression over pieces of the drive,
 
     Δyaw of the trajectory − Δyaw of odometry  =  bias · ahead + turn_scale · turn + noise
@@ -59,6 +59,10 @@ LEAST = {'scale': 0.004, 'heading': math.radians(0.3), 'bias': math.radians(0.05
 
 MOST = {'scale': 0.012, 'heading': math.radians(0.6), 'bias': math.radians(0.5), 'turn_scale': 0.015}
 """σ from which on nothing is told."""
+
+
+OF_YAW = ('bias', 'turn_scale')
+"""What `of_yaw` tells."""
 
 
 class Told(NamedTuple):
@@ -139,7 +143,7 @@ def of_yaw(odometry: Odometry, trajectory: Odometry) -> dict[str, Told]:
     # each residual by itself: wheels slip now and then
     spread = given * (left * math.sqrt(len(left) / (len(left) - 2)))[:, None]
     sigma = np.sqrt(np.diag(inverse @ (spread.T @ spread) @ inverse))
-    return {name: Told(float(v), float(s)) for name, v, s in zip(('bias', 'turn_scale'), values, sigma, strict=True)}
+    return {name: Told(float(v), float(s)) for name, v, s in zip(OF_YAW, values, sigma, strict=True)}
 
 
 def of_ways(

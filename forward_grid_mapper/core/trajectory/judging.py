@@ -20,14 +20,14 @@ SPAN = 6.0
 """Metres of progress before and after a block that the map is made of on which odometry is compared."""
 
 JUDGED_ON, HELD_OUT = 60, 40
-"""Blocks, and held-out windows, that trajectories are compared on at the most."""
+"""Blocks of `over_the_drive`, and held-out windows of `chosen`, at the most."""
 
 MOST_WORSE = 1.0
 """Standard errors by which matching may foresee what was held out worse."""
 
 TURNED, LEAST_SIGMAS_OF_TURNS = math.radians(8.0), 1.5
 """Radians by which odometry must turn otherwise within `SPAN` for readings to tell it, and by how many standard errors
-they must then be foreseen better. Corners that are not square make it -4 to -6, drift 2 to 7."""
+they must then be foreseen better: with corners that are not square it is -4 to -6, with drift 2 to 7."""
 
 
 def over_the_drive(scans: Scans, before: Floats, after: Floats, watch: Progress) -> Gain:
@@ -37,7 +37,7 @@ def over_the_drive(scans: Scans, before: Floats, after: Floats, watch: Progress)
     ----------
     scans : Scans
     before, after : float64, shape (K, 3)
-        Nodes; places in `after` must not come from readings.
+        Nodes; those of `after` may owe readings a few figures for the whole drive, and nothing else.
     watch : callable
     """
     blocks = blocks_of(len(before), BLOCK, JUDGED_ON)
@@ -74,7 +74,8 @@ def chosen(scans: Scans, first: Floats, *others: Floats) -> Floats:
 def turned_right(scans: Scans, nodes: Floats) -> bool:
     """Return whether readings are foreseen better where nodes turn within a few metres as odometry does not.
 
-    A robot that goes around a corner which is not square looks as if its odometry were off by as much.
+    So it is, too, where there are too few such turns to tell. A robot that goes around a corner which is not square
+    looks as if its odometry were off by as much.
     """
     windows = scans.windows
     blocks = blocks_of(len(windows), BLOCK, len(windows))
@@ -83,7 +84,7 @@ def turned_right(scans: Scans, nodes: Floats) -> bool:
     if len(sharp) < FEWEST_BLOCKS:
         return True
     better = gain(*(foreseen(scans, each, sharp, SPAN) for each in (windows.node, nodes)))
-    return better.sigmas > LEAST_SIGMAS_OF_TURNS
+    return bool(np.isinf(better.error)) or better.sigmas > LEAST_SIGMAS_OF_TURNS
 
 
 def _turned(windows: Windows, nodes: Floats, middle: int) -> float:

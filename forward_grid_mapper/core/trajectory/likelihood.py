@@ -110,10 +110,12 @@ def make_scan(readings: Readings, poses: Floats, model: ModelParameters, resolut
 
 
 def blurred(scan: Scan, by: float, around: LocalMap) -> Scan:
-    """Return a scan whose readings have a larger σ, to be asked at poses that lie far apart; `by` metres are added."""
+    """Return a scan whose echoes have a larger σ, for poses that lie far apart; `by` metres are added."""
     table = scan.readings.copy()
     table['sigma'] = np.hypot(table['sigma'], by)
-    table['reach'] += CUT * (table['sigma'] - scan.readings['sigma'])
+    # nothing is heard beyond z_max, which is as far as readings without echo reach
+    echo = table['reach'] > table['z']
+    table['reach'] += np.where(echo, CUT * (table['sigma'] - scan.readings['sigma']), 0.0)
     blurry = Scan(table, scan.weight)
     _set_unknown(blurry, around.resolution, around.unknown)
     return blurry

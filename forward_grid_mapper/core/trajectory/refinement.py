@@ -23,7 +23,7 @@ from ..common.parameters import Parameters
 from ..common.readings import Readings
 from ..runtime.cancelling import check
 from .any_angle import matched
-from .certainty import of_yaw
+from .certainty import MOST, of_yaw
 from .heading import NOISES, Heading, heading
 from .holding_out import LEAST_SIGMAS, Gain, came_back, held_out
 from .hypotheses import solved
@@ -63,9 +63,11 @@ LEAST_MOVED = 0.15
 NOT_ENOUGH = ': not enough to tell that odometry is off'
 
 NO_WALLS = (
-    'echoes do not agree on the directions of walls, so the drift of the yaw cannot be told: it takes walls at right '
-    'angles to each other beside the robot, and odometry whose yaw holds for a few metres'
+    'echoes do not agree on directions of walls: it takes walls at right angles to each other beside the robot, and '
+    'odometry whose yaw holds for a few metres'
 )
+
+NOR_MATCHES = '; matches alone tell no better trajectory'
 
 Watch = Callable[[str, float], None]
 """Receives what is going on, and how much of it is done, from 0 to 1."""
@@ -205,9 +207,10 @@ class Refiner:
             better = seen_again(scans, windows.node, nodes)
             said = f'with places seen before, {_said(better)}' if again else _said(better)
             if better.sigmas < (LEAST_SIGMAS if again else LEAST_SIGMAS_WITH_WALLS):
-                return left(said + NOT_ENOUGH, better)
+                return left(said + NOT_ENOUGH, better)._replace(sure=stands)
             if not again:
                 said = f'that walls stand at right angles is likelier by {witness:.0f} nats than with odometry; {said}'
+        loops = found.loops if nodes is found.solution.nodes else []
         if nodes is found.solution.nodes:
             named = dict(zip(CALIBRATION, solver.calibration_of(found.solution).tolist(), strict=True))
         trajectory = refined(odometry, windows, nodes)
@@ -215,32 +218,31 @@ class Refiner:
         if moved < least_moved:
             return left(too_little_words(moved), better)._replace(sure=True)
         placed, noise = replaced(readings, odometry, trajectory), walls.drifts.noise
-        outcome = Refinement(
-            True, said, placed, trajectory, named, moved, turned, len(found.loops), better.mean, noise=noise
-        )
-        sure = recognised_part(scans, nodes, found.loops) >= LEAST_RECOGNISED and turned_right(scans, nodes)
+        outcome = Refinement(True, said, placed, trajectory, named, moved, turned, len(loops), better.mean, noise=noise)
+        sure = recognised_part(scans, nodes, loops) >= LEAST_RECOGNISED and turned_right(scans, nodes)
         return _Attempt(outcome, nodes, sure)
 
     def _at_any_angle(self, drive: _Drive, by_walls: _Attempt, least_moved: float) -> Refinement:
         """Return the trajectory that matches alone say, if it is better than what walls at right angles say."""
         readings, odometry, windows, scans = drive
-        found = matched(odometry, scans, self._say)
+        found = matched(odometry, scans, self._say, self._parameters.association.odometry_noise)
         if found is None:
-            return by_walls.refinement
+            return _stays(by_walls.refinement)
         nodes = found.nodes
         better = seen_again(scans, windows.node, nodes)
         trajectory = refined(odometry, windows, nodes)
         moved, turned = differences(odometry, trajectory)
         if better.sigmas < LEAST_SIGMAS or moved < least_moved:
-            return by_walls.refinement
+            return _stays(by_walls.refinement)
         if by_walls.refinement.accepted and seen_again(scans, by_walls.nodes, nodes).mean <= 0.0:
             return by_walls.refinement
+        again = 'with places seen before, ' if came_back(scans, nodes) else ''
         named = dict.fromkeys(CALIBRATION, 0.0) | {
-            name: told.value for name, told in of_yaw(odometry, trajectory).items()
+            name: told.value for name, told in of_yaw(odometry, trajectory).items() if told.sigma <= MOST[name]
         }
         return Refinement(
             True,
-            f'walls are not taken to stand at right angles; with places seen before, {_said(better)}',
+            f'walls are not taken to stand at right angles; {again}{_said(better)}',
             replaced(readings, odometry, trajectory),
             trajectory,
             named,
@@ -322,6 +324,11 @@ def refined(odometry: Odometry, windows: Windows, nodes: Floats) -> Odometry:
     pose = compose(home, pose)
     pose[:, 2] = np.unwrap(pose[:, 2])
     return Odometry(odometry.stamp, pose)
+
+
+def _stays(found: Refinement) -> Refinement:
+    """Return what walls said, after matches alone told nothing better."""
+    return found if found.accepted else replace(found, reason=found.reason + NOR_MATCHES)
 
 
 def _lost(drive: _Drive, certainty: float) -> _Attempt:

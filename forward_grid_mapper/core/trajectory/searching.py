@@ -1,7 +1,7 @@
 """Searching: where a scan fits best in a local map, anywhere around a pose, from coarse to fine.
 
 Multi-resolution correlative scan matching (Olson, 2009), with the forward model in place of a table of echoes: on a
-coarse grid of poses σ of the readings is larger, so that none of them misses what lies between two poses. Around the
+coarse grid of poses σ of the readings is larger, so that echoes hardly miss what lies between two places. Around the
 best of them a finer grid is asked, and so on. Another place that fits about as well must be known too: it tells that
 the best one may be chance. So the best poses away from the first one are followed as well.
 """
@@ -29,9 +29,9 @@ BLUR = 0.4
 """σ that is added to that of readings on a coarse grid, steps."""
 
 FOLLOWED = (40, 25)
-"""Poses of each coarse grid that a finer one lies around: so many near the best, and so many elsewhere."""
+"""Poses of each coarse grid that a finer one lies around: so many near the best, and as many elsewhere."""
 
-NEAR = 0.6
+NEAR = 0.65
 """Metres from the best pose within which poses are near it."""
 
 ASKED = 60

@@ -200,7 +200,7 @@ def test_what_readings_do_not_speak_for_is_left(bent, monkeypatch) -> None:
     monkeypatch.setattr(refinement, 'seen_again', lambda *rest: Gain(0.02, 0.01))
     left = Refiner(Parameters()).run(recording.readings, odometry)
     assert not left.accepted and left.trajectory is odometry
-    assert left.reason == refinement.NO_WALLS
+    assert left.reason == refinement.NO_WALLS + refinement.NOR_MATCHES
     # where scan matching foresees nothing better, nothing is matched any more
     monkeypatch.setattr(any_angle, 'scan_matched', lambda scans, trust, watch: scans.windows.node)
     monkeypatch.setattr(any_angle, 'MatchSolver', None)
@@ -236,6 +236,30 @@ def test_another_trust_is_tried_where_places_are_not_recognised(
     assert found is not None
     assert asked.count == trials
     np.testing.assert_allclose(found.nodes[:, 0] - scans.windows.node[:, 0], best)
+
+
+def test_a_noise_of_odometry_that_is_told_is_the_one_that_is_taken(bent, scans, monkeypatch) -> None:
+    trusts, left = [], []
+    Trials(monkeypatch, [0.5, 0.5, 0.5, 0.5], [0.1, 0.1])
+    trials = any_angle.MatchSolver
+    monkeypatch.setattr(any_angle, 'MatchSolver', lambda *rest: left.append(rest[4]) or trials())
+    monkeypatch.setattr(any_angle, 'scan_matched', lambda scans, trust, _: trusts.append(trust) or scans.windows.node)
+    for noise in (0.0, 0.01):
+        any_angle.matched(bent[1], scans, lambda stage: quietly, noise)
+    assert trusts == [*TRUSTS, *(trust._replace(yaw=0.01) for trust in TRUSTS)]
+    assert left == [any_angle.LEFT_BY_SCANS] * 2 + [0.01] * 2
+
+
+@pytest.mark.parametrize('again', [True, False])
+def test_places_seen_before_are_named_where_there_are_any(bent, scans, matched, monkeypatch, again: bool) -> None:
+    recording, odometry = bent
+    monkeypatch.setattr(refinement, 'seen_again', lambda *rest: Gain(0.1, 0.01))
+    monkeypatch.setattr(refinement, 'matched', lambda *rest: Matched(matched, []))
+    monkeypatch.setattr(refinement, 'came_back', lambda *rest: again)
+    drive_of = _Drive(recording.readings, odometry, scans.windows, scans)
+    found = Refiner(Parameters())._at_any_angle(drive_of, by_walls(scans, recording, odometry), 0.15)
+    assert not found.right_angles
+    assert ('with places seen before' in found.reason) == again
 
 
 def by_walls(scans: Scans, recording: Recording, odometry: Odometry) -> _Attempt:

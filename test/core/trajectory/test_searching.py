@@ -8,11 +8,20 @@ import numpy as np
 import pytest
 
 from forward_grid_mapper.core.common.parameters import Parameters
+from forward_grid_mapper.core.trajectory import searching
 from forward_grid_mapper.core.trajectory.likelihood import Scan, blurred, make_scan, scores
 from forward_grid_mapper.core.trajectory.local_map import UNKNOWN, LocalMap, local_map
 from forward_grid_mapper.core.trajectory.matching import grid_around
 from forward_grid_mapper.core.trajectory.poses import Floats, compose, relative
-from forward_grid_mapper.core.trajectory.searching import ASKED, LARGE, STEPS, Searched, search
+from forward_grid_mapper.core.trajectory.searching import (
+    ASKED,
+    BLUR,
+    COARSER,
+    LARGE,
+    STEPS,
+    Searched,
+    search,
+)
 from forward_grid_mapper.simulation.drive import drive
 from forward_grid_mapper.simulation.sonar import NOISY, sonar_ring
 from forward_grid_mapper.simulation.world import building_tour, building_world
@@ -38,6 +47,14 @@ def places() -> list[tuple[LocalMap, Scan, Floats]]:
         out.append((around, make_scan(scan, sensors, MODEL, 0.1, NOTHING), robot[k]))
     assert len(out) >= 5
     return out
+
+
+def test_coarse_grids_are_asked_with_blurred_readings(places, monkeypatch) -> None:
+    around, scan, true = places[0]
+    by = []
+    monkeypatch.setattr(searching, 'blurred', lambda scan, more, around: by.append(more) or scan)
+    search(scan, around, true, SIGMA, REACH)
+    assert by == pytest.approx([BLUR * times * STEPS[0] for times in COARSER])
 
 
 def asked_all(scan: Scan, around: LocalMap, guess: Floats, sigma: Floats, reach: Floats) -> Searched:
@@ -93,6 +110,9 @@ def test_a_blurred_scan_is_one_of_a_larger_sigma(places) -> None:
     by = 0.2
     blurry = blurred(scan, by, around)
     np.testing.assert_allclose(blurry.readings['sigma'], np.hypot(scan.readings['sigma'], by))
+    farther = blurry.readings['reach'] - scan.readings['reach']
+    echo = scan.readings['reach'] > scan.readings['z']
+    assert (farther[echo] > 0.0).all() and (farther[~echo] == 0.0).all() and echo.any()
     poses = grid_around(true, np.array([0.3, 0.3, 0.0]), (0.15, 0.15, 0.1))
     sharp, soft = (scores(each, around, poses) for each in (scan, blurry))
     # it falls less where it is off by a step
