@@ -236,13 +236,14 @@ class Refiner:
             return _stays(by_walls.refinement)
         if by_walls.refinement.accepted and seen_again(scans, by_walls.nodes, nodes).mean <= 0.0:
             return by_walls.refinement
+        part = recognised_part(scans, nodes, found.loops)
         again = 'with places seen before, ' if came_back(scans, nodes) else ''
         named = dict.fromkeys(CALIBRATION, 0.0) | {
             name: told.value for name, told in of_yaw(odometry, trajectory).items() if told.sigma <= MOST[name]
         }
         return Refinement(
             True,
-            f'walls are not taken to stand at right angles; {again}{_said(better)}',
+            f'walls are not taken to stand at right angles; {again}{_said(better)}{_doubt(part)}',
             replaced(readings, odometry, trajectory),
             trajectory,
             named,
@@ -338,6 +339,13 @@ def _lost(drive: _Drive, certainty: float) -> _Attempt:
 
 def _said(better: Gain) -> str:
     return f'readings are foreseen {better.mean:+.3f} ± {better.error:.3f} nats a reading better than with odometry'
+
+
+def _doubt(part: float) -> str:
+    """Return what is to be said where this part of the blocks at places seen before is recognised."""
+    if part >= LEAST_RECOGNISED:
+        return ''
+    return f'; {part:.0%} of the way through places seen before is recognised: the drive may be bent as a whole'
 
 
 def _named(watch: Watch, name: str, stage: str, part: float) -> None:

@@ -21,6 +21,7 @@ from forward_grid_mapper.core.trajectory.outcome import Refinement
 from forward_grid_mapper.core.trajectory.pose_graph import Solution, solution_at
 from forward_grid_mapper.core.trajectory.poses import Floats, compose, relative, rms_after_alignment
 from forward_grid_mapper.core.trajectory.refinement import Refiner, _Attempt, _Drive
+from forward_grid_mapper.core.trajectory.relocating import LEAST_RECOGNISED
 from forward_grid_mapper.core.trajectory.scan_matching import BLOCK, FIRST, TRUSTS, scan_matched
 from forward_grid_mapper.core.trajectory.scans import Scans
 from forward_grid_mapper.core.trajectory.windows import Odometry, cut
@@ -260,6 +261,13 @@ def test_places_seen_before_are_named_where_there_are_any(bent, scans, matched, 
     found = Refiner(Parameters())._at_any_angle(drive_of, by_walls(scans, recording, odometry), 0.15)
     assert not found.right_angles
     assert ('with places seen before' in found.reason) == again
+    # none of the places is recognised
+    assert found.reason.endswith(
+        '; 0% of the way through places seen before is recognised: the drive may be bent as a whole'
+    )
+    monkeypatch.setattr(refinement, 'recognised_part', lambda *rest: LEAST_RECOGNISED)
+    found = Refiner(Parameters())._at_any_angle(drive_of, by_walls(scans, recording, odometry), 0.15)
+    assert 'bent as a whole' not in found.reason
 
 
 def by_walls(scans: Scans, recording: Recording, odometry: Odometry) -> _Attempt:
