@@ -83,7 +83,7 @@ setup(
         ],
         'test': [
             'pytest>=7.2,<10',
-            'pytest-xdist>=3.3,<4',
+            'pytest-xdist>=3.7,<4',
             'pytest-timeout>=2.1,<3',
             'hypothesis>=6.80,<7',
             'pillow>=9.2,<14',

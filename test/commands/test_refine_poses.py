@@ -29,6 +29,8 @@ from forward_grid_mapper.simulation.drive import Recording, drive
 from forward_grid_mapper.simulation.sonar import NOISY, sonar_ring
 from forward_grid_mapper.simulation.world import building_tour, building_world
 
+pytestmark = pytest.mark.drives
+
 REFINED = FILES | {'trajectory.tum', 'odometry.tum', 'odometry_calibration.yaml'}
 
 

@@ -24,6 +24,8 @@ from forward_grid_mapper.simulation.drive import Recording, drive
 from forward_grid_mapper.simulation.sonar import NOISY, front_array, sonar_ring
 from forward_grid_mapper.simulation.world import Floorplan, World, building_tour, building_world
 
+pytestmark = pytest.mark.drives
+
 KINK = math.radians(25.0)
 PIVOT = np.array([16.0, 5.0])
 LENGTH, HALF = 13.0, 1.0

@@ -24,6 +24,8 @@ from forward_grid_mapper.simulation.drive import drive
 from forward_grid_mapper.simulation.sonar import NOISY, sonar_ring
 from forward_grid_mapper.simulation.world import building_tour, building_world
 
+pytestmark = pytest.mark.drives
+
 KNOWN = 10.0
 """Metres of the drive whose trajectory is given."""
 

@@ -24,6 +24,8 @@ from forward_grid_mapper.simulation.drive import Recording, drive
 from forward_grid_mapper.simulation.sonar import NOISY, sonar_ring
 from forward_grid_mapper.simulation.world import building_tour, building_world
 
+pytestmark = pytest.mark.drives
+
 
 def moved(readings: Readings, before: Odometry, after: Odometry) -> Readings:
     """Readings of a drive as other odometry places them."""

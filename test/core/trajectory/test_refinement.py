@@ -26,6 +26,8 @@ from forward_grid_mapper.simulation.drive import Recording, drive
 from forward_grid_mapper.simulation.sonar import NOISY, front_array, sonar_ring
 from forward_grid_mapper.simulation.world import building_tour, building_world
 
+pytestmark = pytest.mark.drives
+
 TOUR = building_tour()[:20]
 
 

@@ -32,6 +32,8 @@ from forward_grid_mapper.core.trajectory.solving import Solver
 from forward_grid_mapper.simulation.sonar import sonar_ring
 from forward_grid_mapper.simulation.world import building_tour
 
+pytestmark = pytest.mark.drives
+
 OFF = np.array([3.2, -1.4, math.radians(3.0)])
 """By how much the way back is off."""
 

@@ -26,6 +26,8 @@ from forward_grid_mapper.simulation.drive import drive
 from forward_grid_mapper.simulation.sonar import NOISY, sonar_ring
 from forward_grid_mapper.simulation.world import building_tour, building_world
 
+pytestmark = pytest.mark.drives
+
 MODEL = Parameters().model
 NOTHING = UNKNOWN * MODEL.p_hit
 APART = 0.6
