@@ -1,4 +1,9 @@
-"""The trajectory that matches alone say, whatever the directions of walls: scan matching, then blocks and places."""
+"""The trajectory that matches alone say, whatever the directions of walls: scan matching, then blocks and places.
+
+Where it is bent, maps of places are bent as well, and few are recognised. So the pose graph is made anew from what was
+found, and blocks are matched and places looked for again, as long as the map of the whole drive explains its readings
+better than before.
+"""
 
 from __future__ import annotations
 
@@ -6,20 +11,22 @@ import math
 from collections.abc import Callable
 from typing import NamedTuple
 
-from .judging import held_out_nearby, seen_again
 from .loops import Loop
 from .odometry_model import CALIBRATION, sensitivity
 from .passes import Progress
 from .pose_graph import solution_at
-from .poses import Floats, relative
+from .poses import Floats, relative, rms_after_alignment
 from .relocating import LEAST_RECOGNISED, recognised_part
 from .scan_matching import TRUSTS, scan_matched
 from .scans import Scans
-from .solving import MatchSolver
+from .solving import SETTLED, MatchSolver
 from .windows import Odometry
 
-LEFT_BY_SCANS = math.radians(3.0)
-"""By how much the yaw strays after scan matching, radians a √metre."""
+LEFT = math.radians(3.0)
+"""By how much the yaw strays after scan matching, and after each round, radians a √metre."""
+
+ROUNDS = 4
+"""Times that the pose graph is made from what was found before, at the most."""
 
 
 class Matched(NamedTuple):
@@ -30,14 +37,20 @@ class Matched(NamedTuple):
     nodes : float64, shape (K, 3)
     loops : list of Loop
         Places seen before that it rests on.
+    value : float
+        `Scans.objective` of the nodes.
+    part : float
+        Of the blocks that lie where the robot was before, those that are recognised.
     """
 
     nodes: Floats
     loops: list[Loop]
+    value: float
+    part: float
 
 
 def matched(odometry: Odometry, scans: Scans, say: Callable[[str], Progress], noise: float = 0.0) -> Matched | None:
-    """Return the nodes that matches alone say; None if scan matching foresees nothing better.
+    """Return where a drive is by matches alone; None if no map along it explains its readings better than odometry's.
 
     Parameters
     ----------
@@ -48,20 +61,32 @@ def matched(odometry: Odometry, scans: Scans, say: Callable[[str], Progress], no
     noise : float
         By how much the yaw of odometry strays, radians a √metre; 0 if nobody knows.
     """
-    windows, best = scans.windows, None
-    change = sensitivity(odometry, windows)
-    left = min(LEFT_BY_SCANS, noise or LEFT_BY_SCANS)
+    best, value = None, scans.objective(scans.windows.node)
     for trust in TRUSTS:
-        own = trust._replace(yaw=noise or trust.yaw)
-        start = scan_matched(scans, own, say('scan matching'))
-        if held_out_nearby(scans, windows.node, start).mean <= 0.0:
-            continue
-        solver = MatchSolver(windows, scans, say, relative(start[:-1], start[1:]), left, change)
-        solution, loops = solver.with_matches(solution_at(start, len(CALIBRATION)))
-        found = Matched(solution.nodes, loops)
-        if best is None or seen_again(scans, best.nodes, found.nodes).mean > 0.0:
-            best = found
-        # a drive that fits together hardly gains from another trial
-        if recognised_part(scans, best.nodes, best.loops) >= LEAST_RECOGNISED:
+        start = scan_matched(scans, trust._replace(yaw=noise or trust.yaw), say('scan matching'))
+        found = _in_rounds(odometry, scans, say, start, min(LEFT, noise or LEFT), value)
+        if found is not None:
+            best, value = found, found.value
+        # a drive that fits together hardly gains from another trial, nor does one whose odometry is right
+        if best is None or best.part >= LEAST_RECOGNISED:
+            break
+    return best
+
+
+def _in_rounds(
+    odometry: Odometry, scans: Scans, say: Callable[[str], Progress], start: Floats, noise: float, least: float
+) -> Matched | None:
+    """Return the best of what is found by matching again and again from what was found; None if it is not better."""
+    change, nodes = sensitivity(odometry, scans.windows), start
+    best = None
+    for _ in range(ROUNDS):
+        solver = MatchSolver(scans.windows, scans, say, relative(nodes[:-1], nodes[1:]), noise, change)
+        solution, loops = solver.with_matches(solution_at(nodes, len(CALIBRATION)))
+        before, nodes = nodes, solution.nodes
+        found = Matched(nodes, loops, scans.objective(nodes), recognised_part(scans, nodes, loops))
+        if found.value <= least:
+            break
+        best, least = found, found.value
+        if found.part >= LEAST_RECOGNISED or rms_after_alignment(before, nodes) < SETTLED:
             break
     return best

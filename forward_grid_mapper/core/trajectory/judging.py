@@ -47,12 +47,6 @@ def over_the_drive(scans: Scans, before: Floats, after: Floats, watch: Progress)
     return gain(one, foreseen(scans, after, blocks, SPAN))
 
 
-def held_out_nearby(scans: Scans, before: Floats, after: Floats) -> Gain:
-    """Return by how much what was held out is foreseen better on maps of the metres around it."""
-    blocks = held_out_blocks(scans, len(before))
-    return gain(foreseen(scans, before, blocks, SPAN), foreseen(scans, after, blocks, SPAN))
-
-
 def seen_again(scans: Scans, before: Floats, after: Floats) -> Gain:
     """Return by how much what was held out is foreseen better on maps of all times that the robot came by."""
     # it is the only proof, so all that was held out has a say

@@ -18,7 +18,8 @@ from ..common.parameters import ModelParameters, Parameters
 from ..common.readings import Readings
 from ..evidence.evidence import NO_INCIDENCE_LIMIT, Evidence
 from ..maps.traversed import traversed_cells
-from ..search.search import Search
+from ..runtime.memory import memory_for_pairs
+from ..search.search import Search, SearchResult
 from ..sensor.cone_table import grid_of
 from ..sensor.density import hit_probability
 from .poses import Floats
@@ -36,6 +37,10 @@ MODEL = {'p_hit': 0.7, 'p_rand': 0.4, 'p_lost': 0.42, 'min_incidence_angle': NO_
 """The sensor model of matches, whatever that of the maps is. With it the errors that matches state are the real ones;
 that of the maps lets a reading say less, since a wall must not hang on one. All surfaces have one incidence angle: with
 angles of their own, which take away what readings say, trajectories are a little worse."""
+
+
+OF_LOCAL_MAPS = 1e9
+"""Bytes that pairs of a local map may take: more than they do."""
 
 
 class LocalMap(NamedTuple):
@@ -95,13 +100,31 @@ def local_map(readings: Readings, parameters: Parameters, stop: NDArray[np.uint8
     Cancelled
         If `stop` was set.
     """
-    model = parameters.model
-    grid = grid_of(readings, model, parameters.grid)
-    evidence = Evidence(grid, model, 1e9, 1, stop)
+    grid, evidence, traversed, _ = _searched(readings, parameters, stop, OF_LOCAL_MAPS)
+    return soft_map(evidence, grid, traversed, parameters.model)
+
+
+def objective_of(readings: Readings, parameters: Parameters, stop: NDArray[np.uint8]) -> float:
+    """Return J of readings, nats: what the search maximises, at the map that it finds.
+
+    Raises
+    ------
+    Cancelled
+        If `stop` was set.
+    """
+    _, evidence, _, found = _searched(readings, parameters, stop, memory_for_pairs(parameters))
+    return evidence.tempered_log_likelihood + found.log_prior
+
+
+def _searched(
+    readings: Readings, parameters: Parameters, stop: NDArray[np.uint8], memory: float
+) -> tuple[Grid, Evidence, NDArray[np.bool_], SearchResult]:
+    """Return the grid of readings, what they say there, the cells that sensors were moved over, and the search."""
+    grid = grid_of(readings, parameters.model, parameters.grid)
+    evidence = Evidence(grid, parameters.model, memory, 1, stop)
     evidence.extend(readings)
     traversed = traversed_cells(readings, grid)
-    Search(evidence, parameters.search, traversed.ravel()).run()
-    return soft_map(evidence, grid, traversed, model)
+    return grid, evidence, traversed, Search(evidence, parameters.search, traversed.ravel()).run()
 
 
 def soft_map(evidence: Evidence, grid: Grid, traversed: NDArray[np.bool_], model: ModelParameters) -> LocalMap:

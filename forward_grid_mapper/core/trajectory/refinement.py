@@ -234,16 +234,15 @@ class Refiner:
         moved, turned = differences(odometry, trajectory)
         if better.sigmas < LEAST_SIGMAS or moved < least_moved:
             return _stays(by_walls.refinement)
-        if by_walls.refinement.accepted and seen_again(scans, by_walls.nodes, nodes).mean <= 0.0:
+        if by_walls.refinement.accepted and scans.objective(by_walls.nodes) >= found.value:
             return by_walls.refinement
-        part = recognised_part(scans, nodes, found.loops)
         again = 'with places seen before, ' if came_back(scans, nodes) else ''
         named = dict.fromkeys(CALIBRATION, 0.0) | {
             name: told.value for name, told in of_yaw(odometry, trajectory).items() if told.sigma <= MOST[name]
         }
         return Refinement(
             True,
-            f'walls are not taken to stand at right angles; {again}{_said(better)}{_doubt(part)}',
+            f'walls are not taken to stand at right angles; {again}{_said(better)}{_doubt(found.part)}',
             replaced(readings, odometry, trajectory),
             trajectory,
             named,

@@ -60,7 +60,7 @@ class Trust(NamedTuple):
     yaw: float
 
 
-TRUSTS = (Trust(0.5, math.radians(5.5)), Trust(0.3, math.radians(4.0)))
+TRUSTS = (Trust(0.3, math.radians(4.0)), Trust(0.5, math.radians(5.5)))
 """What is tried: chance leads each astray in other places."""
 
 

@@ -8,9 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..common.parameters import Parameters
+from ..common.readings import Readings
 from ..sensor.density import hit_probability
 from .likelihood import Scan, make_scan
-from .local_map import UNKNOWN, LocalMap, at_poses, local_map
+from .local_map import UNKNOWN, LocalMap, at_poses, local_map, objective_of
 from .poses import Floats, compose, relative
 from .windows import Windows, corrected
 
@@ -78,13 +79,28 @@ class Scans:
         most : int
             Readings that it is made from at most.
         """
-        w, known = self.windows, len(nodes)
         if self.count[members].sum() < FEWEST_ON_MAP:
             return None
-        which = np.concatenate([np.arange(w.first[k], w.first[k + 1]) for k in members if not self.held_out[k]])
+        which = self._readings_of(members)
         if len(which) > most:
             # sensors take turns, so every so-manieth reading may be of a few of them only
             which = np.sort(np.random.default_rng(len(which)).choice(which, most, replace=False))
+        return local_map(self._placed(which, nodes, origin), self._parameters, self._stop)
+
+    def objective(self, nodes: Floats) -> float:
+        """Return J of the whole drive along nodes, shape (K, 3), nats: `local_map.objective_of` all its readings.
+
+        Those of windows that are held out have no say.
+        """
+        which = self._readings_of(np.arange(len(self.windows)))
+        return objective_of(self._placed(which, nodes, np.zeros(3)), self._parameters, self._stop)
+
+    def _readings_of(self, members: NDArray[np.int64]) -> NDArray[np.int64]:
+        first = self.windows.first
+        return np.concatenate([np.arange(first[k], first[k + 1]) for k in members if not self.held_out[k]])
+
+    def _placed(self, which: NDArray[np.int64], nodes: Floats, origin: Floats) -> Readings:
+        """Return some readings where the nodes of the first windows have them, in the frame `origin`."""
+        w, known = self.windows, len(nodes)
         robot = corrected(w.progress[which], w.robot[which], w.node_progress[:known], w.node[:known], nodes)
-        placed = relative(origin, compose(robot, w.mount[which]))
-        return local_map(at_poses(w.readings.select(which), placed), self._parameters, self._stop)
+        return at_poses(w.readings.select(which), relative(origin, compose(robot, w.mount[which])))

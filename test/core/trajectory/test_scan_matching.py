@@ -11,6 +11,7 @@ import pytest
 
 from forward_grid_mapper.core.common.errors import Cancelled
 from forward_grid_mapper.core.common.parameters import Parameters
+from forward_grid_mapper.core.mapping import Mapper
 from forward_grid_mapper.core.trajectory import any_angle, refinement, scan_matching
 from forward_grid_mapper.core.trajectory.any_angle import Matched
 from forward_grid_mapper.core.trajectory.holding_out import Gain, held_out
@@ -29,6 +30,8 @@ from forward_grid_mapper.simulation.drift import LEVELS, odometry_of, with_drift
 from forward_grid_mapper.simulation.drive import Recording, drive
 from forward_grid_mapper.simulation.sonar import NOISY, sonar_ring
 from forward_grid_mapper.simulation.world import Floorplan, World, building_tour, building_world
+
+pytestmark = pytest.mark.drives
 
 TRUST = TRUSTS[0]
 
@@ -202,60 +205,106 @@ def test_what_readings_do_not_speak_for_is_left(bent, monkeypatch) -> None:
     left = Refiner(Parameters()).run(recording.readings, odometry)
     assert not left.accepted and left.trajectory is odometry
     assert left.reason == refinement.NO_WALLS + refinement.NOR_MATCHES
-    # where scan matching foresees nothing better, nothing is matched any more
-    monkeypatch.setattr(any_angle, 'scan_matched', lambda scans, trust, watch: scans.windows.node)
-    monkeypatch.setattr(any_angle, 'MatchSolver', None)
-    assert not Refiner(Parameters()).run(recording.readings, odometry).accepted
 
 
 class Trials:
-    """A solver in whose place the drive is put by a metre more with each trial, and what is asked of it."""
+    """A solver that puts the second half of a drive a metre farther with each round, and what it is asked.
 
-    def __init__(self, monkeypatch, parts: list[float], gains: list[float]) -> None:
-        self.count = 0
-        monkeypatch.setattr(any_angle, 'MatchSolver', lambda *rest: self)
+    Parameters
+    ----------
+    said : list of float, float
+        The part of the places that each round recognises, and how well it explains all readings.
+    far : float
+        Metres by which a round moves what it was given.
+    """
+
+    def __init__(self, monkeypatch, said: list[tuple[float, float]], far: float = 1.0) -> None:
+        self.asked: list[tuple[Floats, float]] = []
+        self._far = far
+        monkeypatch.setattr(any_angle, 'MatchSolver', self._solver)
         monkeypatch.setattr(any_angle, 'scan_matched', lambda scans, trust, watch: scans.windows.node)
-        monkeypatch.setattr(any_angle, 'held_out_nearby', lambda *rest: Gain(0.1, 0.01))
-        monkeypatch.setattr(any_angle, 'recognised_part', lambda *rest: parts.pop(0))
-        monkeypatch.setattr(any_angle, 'seen_again', lambda *rest: Gain(gains.pop(0), 0.01))
+        monkeypatch.setattr(Scans, 'objective', lambda *rest: said[len(self.asked) - 1][1] if self.asked else 0.0)
+        monkeypatch.setattr(any_angle, 'recognised_part', lambda *rest: said[len(self.asked) - 1][0])
+
+    def _solver(self, windows, scans, say, motion: Floats, noise: float, change) -> Trials:
+        self.asked.append((motion, noise))
+        return self
 
     def with_matches(self, solution: Solution) -> tuple[Solution, list]:
-        self.count += 1
-        moved = solution.nodes + np.array([self.count, 0.0, 0.0])
-        return solution_at(moved, 4), []
+        nodes = solution.nodes.copy()
+        np.testing.assert_array_equal(self.asked[-1][0], relative(nodes[:-1], nodes[1:]))
+        nodes[len(nodes) // 2 :, 0] += self._far
+        return solution_at(nodes, 4), []
 
 
 @pytest.mark.parametrize(
-    ('parts', 'gains', 'trials', 'best'),
-    [([0.9], [], 1, 1), ([0.5, 0.5], [0.1], 2, 2), ([0.5, 0.5], [-0.1], 2, 1)],
+    ('said', 'rounds'),
+    [
+        ([(0.9, 1.0)], 1),
+        ([(0.5, 1.0), (0.9, 2.0)], 2),
+        # where a round explains readings no better another trust is tried
+        ([(0.5, 1.0), (0.5, 0.5), (0.9, 3.0)], 1),
+        ([(0.5, 1.0), (0.5, 2.0), (0.9, 1.5), (0.9, 1.0)], 2),
+        ([(0.5, 1.0), (0.5, 1.0), (0.9, 0.5)], 1),
+        ([(0.5, 1.0 + k) for k in range(2 * any_angle.ROUNDS)], any_angle.ROUNDS),
+    ],
 )
-def test_another_trust_is_tried_where_places_are_not_recognised(
-    bent, scans, monkeypatch, parts, gains, trials, best
+def test_rounds_go_on_while_places_are_not_recognised_and_readings_explained_better(
+    bent, scans, monkeypatch, said: list[tuple[float, float]], rounds: int
 ) -> None:
-    asked = Trials(monkeypatch, parts, gains)
+    trials = Trials(monkeypatch, said)
     found = any_angle.matched(bent[1], scans, lambda stage: quietly)
     assert found is not None
-    assert asked.count == trials
-    np.testing.assert_allclose(found.nodes[:, 0] - scans.windows.node[:, 0], best)
+    assert len(trials.asked) == len(said)
+    assert found.value == max(value for _, value in said)
+    assert found.nodes[-1, 0] - scans.windows.node[-1, 0] == pytest.approx(rounds)
+
+
+def test_where_no_map_explains_readings_better_than_that_of_odometry_nothing_more_is_tried(
+    bent, scans, monkeypatch
+) -> None:
+    trials = Trials(monkeypatch, [(0.5, -1.0)])
+    assert any_angle.matched(bent[1], scans, lambda stage: quietly) is None
+    assert len(trials.asked) == 1
+
+
+def test_a_round_that_moves_nothing_is_the_last(bent, scans, monkeypatch) -> None:
+    trials = Trials(monkeypatch, [(0.5, 1.0), (0.5, 2.0)], far=0.01)
+    assert any_angle.matched(bent[1], scans, lambda stage: quietly) is not None
+    assert len(trials.asked) == len(TRUSTS)
 
 
 def test_a_noise_of_odometry_that_is_told_is_the_one_that_is_taken(bent, scans, monkeypatch) -> None:
-    trusts, left = [], []
-    Trials(monkeypatch, [0.5, 0.5, 0.5, 0.5], [0.1, 0.1])
-    trials = any_angle.MatchSolver
-    monkeypatch.setattr(any_angle, 'MatchSolver', lambda *rest: left.append(rest[4]) or trials())
+    trusts: list[scan_matching.Trust] = []
+    trials = Trials(monkeypatch, [(0.5, 1.0 + k) for k in range(4)], far=0.0)
     monkeypatch.setattr(any_angle, 'scan_matched', lambda scans, trust, _: trusts.append(trust) or scans.windows.node)
     for noise in (0.0, 0.01):
         any_angle.matched(bent[1], scans, lambda stage: quietly, noise)
     assert trusts == [*TRUSTS, *(trust._replace(yaw=0.01) for trust in TRUSTS)]
-    assert left == [any_angle.LEFT_BY_SCANS] * 2 + [0.01] * 2
+    assert [noise for _, noise in trials.asked] == [any_angle.LEFT] * 2 + [0.01] * 2
+
+
+def test_a_drive_is_explained_better_where_it_was_than_where_odometry_has_it(exact, bent, scans) -> None:
+    windows, true = scans.windows, odometry_of(exact).at(scans.windows.node_stamp)
+    right = scans.objective(true)
+    assert right > scans.objective(windows.node) + 0.05 * len(windows.readings)
+    moved = compose(np.array([3.0, -2.0, 0.0]), true)
+    assert scans.objective(moved) == pytest.approx(right, rel=0.02)
+
+
+def test_a_drive_is_explained_by_the_map_of_its_readings_but_for_those_held_out(scans) -> None:
+    windows = scans.windows
+    kept = np.flatnonzero(~np.repeat(scans.held_out, np.diff(windows.first)))
+    maps = Mapper(for_matching(Parameters())).run(windows.readings.select(kept))
+    assert scans.objective(windows.node) == pytest.approx(maps.statistics['searched_objective'], rel=1e-3)
 
 
 @pytest.mark.parametrize('again', [True, False])
 def test_places_seen_before_are_named_where_there_are_any(bent, scans, matched, monkeypatch, again: bool) -> None:
     recording, odometry = bent
     monkeypatch.setattr(refinement, 'seen_again', lambda *rest: Gain(0.1, 0.01))
-    monkeypatch.setattr(refinement, 'matched', lambda *rest: Matched(matched, []))
+    told = Matched(matched, [], np.inf, 0.0)
+    monkeypatch.setattr(refinement, 'matched', lambda *rest: told)
     monkeypatch.setattr(refinement, 'came_back', lambda *rest: again)
     drive_of = _Drive(recording.readings, odometry, scans.windows, scans)
     found = Refiner(Parameters())._at_any_angle(drive_of, by_walls(scans, recording, odometry), 0.15)
@@ -265,7 +314,7 @@ def test_places_seen_before_are_named_where_there_are_any(bent, scans, matched, 
     assert found.reason.endswith(
         '; 0% of the way through places seen before is recognised: the drive may be bent as a whole'
     )
-    monkeypatch.setattr(refinement, 'recognised_part', lambda *rest: LEAST_RECOGNISED)
+    told = told._replace(part=LEAST_RECOGNISED)
     found = Refiner(Parameters())._at_any_angle(drive_of, by_walls(scans, recording, odometry), 0.15)
     assert 'bent as a whole' not in found.reason
 
@@ -276,16 +325,15 @@ def by_walls(scans: Scans, recording: Recording, odometry: Odometry) -> _Attempt
     return _Attempt(found, scans.windows.node)
 
 
-@pytest.mark.parametrize('better', [0.1, -0.1])
-def test_of_two_trajectories_the_one_that_foresees_better_is_taken(
+@pytest.mark.parametrize('better', [1.0, -1.0])
+def test_of_two_trajectories_the_one_whose_map_explains_readings_better_is_taken(
     bent, scans, matched, monkeypatch, better: float
 ) -> None:
     recording, odometry = bent
     attempt = by_walls(scans, recording, odometry)
-    # than odometry, than walls
-    gains = [Gain(0.1, 0.01), Gain(better, 0.2)]
-    monkeypatch.setattr(refinement, 'seen_again', lambda *rest: gains.pop(0))
-    monkeypatch.setattr(refinement, 'matched', lambda *rest: Matched(matched, []))
+    value = scans.objective(attempt.nodes) + better
+    monkeypatch.setattr(refinement, 'seen_again', lambda *rest: Gain(0.1, 0.01))
+    monkeypatch.setattr(refinement, 'matched', lambda *rest: Matched(matched, [], value, 1.0))
     found = Refiner(Parameters())._at_any_angle(
         _Drive(recording.readings, odometry, scans.windows, scans), attempt, 0.15
     )
