@@ -88,7 +88,7 @@ def test_a_command_runs_where_its_caller_is(caller: Caller) -> None:
 
 def test_tests_run_in_the_checkout(caller: Caller) -> None:
     assert caller.run('test', '-k', 'one').returncode == 0
-    assert caller.asked[-1] == f'{ROOT}|-m pytest -n 2 --dist loadfile -k one'
+    assert caller.asked[-1] == f'{ROOT}|-m pytest -n 2 --dist loadfile --no-loadscope-reorder -k one'
 
 
 def test_a_python_without_venv_is_named_with_the_remedy_and_leaves_nothing(caller: Caller) -> None:
