@@ -61,7 +61,7 @@ class Trust(NamedTuple):
 
 
 TRUSTS = (Trust(0.3, math.radians(4.0)), Trust(0.5, math.radians(5.5)))
-"""What is tried: chance leads each astray in other places."""
+"""What is tried, in this order: chance leads each astray in other places."""
 
 
 def scan_matched(scans: Scans, trust: Trust, watch: Progress) -> Floats:
