@@ -17,18 +17,14 @@ from .core.mapping import Mapper, Watch
 from .core.maps.map_set import MapSet
 from .core.messages.extrinsics import Mount
 from .core.messages.message_types import NANOSECONDS, OdometryMessage, Pose2, RangeMessage
+from .core.messages.mounts import FARTHEST, TURN
 from .core.messages.pose_association import PoseAssociator
-from .core.messages.rep117 import ODOMETRY_REASONS, REASONS
+from .core.messages.rep117 import ODOMETRY_REASONS, REASONS, rejection_warnings
 from .files.pose_files import poses_from_csv, poses_from_tum
 from .files.quality_warning import data_warnings
 from .files.results import write_results
 
 __all__ = ['Sonar', 'SonarMaps', 'make_maps', 'poses_from_csv', 'poses_from_tum']
-
-TURN = 2.0 * math.pi
-
-MANY = 0.2
-"""Part of the ranges whose rejection for one reason is worth a warning."""
 
 
 @dataclass(frozen=True)
@@ -65,6 +61,10 @@ class Sonar:
             raise InputError(f'{self}: a number is wanted: {error}') from None
         if abs(self.yaw) > TURN:
             raise InputError(f'yaw = {self.yaw:g} rad is more than a turn; did you mean radians({self.yaw:g})?')
+        if math.hypot(self.x, self.y) > FARTHEST:
+            raise InputError(
+                f'x = {self.x:g} m and y = {self.y:g} m are more than {FARTHEST:g} m from the middle of the robot'
+            )
         if abs(self.pitch) > math.pi / 2:
             raise InputError(
                 f'pitch = {self.pitch:g} rad is beyond straight down; did you mean radians({self.pitch:g})?'
@@ -235,10 +235,11 @@ def make_maps(
             f'{stamps.min() / 1e9:.3f} … {stamps.max() / 1e9:.3f} s'
         )
     maps = Mapper(chosen).run(associator.readings, watch)
-    before = [*_told_of_poses(associator), *associator.limits.warnings()]
-    for reason, count in associator.rejected.items():
-        if count > MANY * len(values):
-            before.append(f'{count} of {len(values)} ranges were rejected as {reason}: {REASONS[reason]}')
+    before = [
+        *_told_of_poses(associator),
+        *associator.limits.warnings(),
+        *rejection_warnings(associator.rejected, len(values), 'ranges'),
+    ]
     judged = tuple(data_warnings(maps, {'extrinsics': mounted}))
     path = np.array(associator.path, np.float64).reshape(-1, 2)
     rejected = dict(associator.rejected)

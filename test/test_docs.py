@@ -23,6 +23,7 @@ ALLOWED = {
     'odometry.tum': 'a file that process_bag writes',
     'trajectory_1.tum': 'a file that process_bag writes',
     'odometry_calibration.yaml': 'a file that process_bag writes',
+    'maps.mcap_bag': 'a folder that process_bag --bag writes',
     'reference.tum': 'a file that simulate writes',
     'evo_ape tum': 'a command of evo',
     'mode: raw': 'a line of map_server files',

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import itertools
 import math
 import sys
 from collections import Counter
@@ -26,6 +27,7 @@ from .options import add_json_option
 COMMAND = 'explain'
 STATES = {1: 'occupied', 0: 'free', -1: 'not observed'}
 SHOWN = 5
+COUNTS = ('-n', '--readings')
 
 FARTHEST = 1e9
 """Metres; no map reaches so far, and numbers of cells stay whole."""
@@ -217,8 +219,17 @@ def _what_decides(maps: MapArchive, found: CellEvidence, state: int) -> str:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; return its exit code."""
-    given = sys.argv[1:] if arguments is None else arguments
-    return run(parser(), explain, [_positional(part) for word in given for part in _parted(word)])
+    given, made = sys.argv[1:] if arguments is None else arguments, parser()
+    words = [word for before, word in itertools.pairwise(('', *given)) if before not in COUNTS and _is_one(word)]
+    place = words[1:]
+    if len(place) == 2 and (comma := next((word for word in place if ',' in word), '')):
+        made.error(f'{comma} has a comma; write numbers with a point: {comma.replace(",", ".")}')
+    return run(made, explain, [_positional(part) for word in given for part in _parted(word)])
+
+
+def _is_one(word: str) -> bool:
+    """Whether a word is an argument, not an option."""
+    return not word.startswith('-') or word[1:2].isdigit() or word[1:2] == '.'
 
 
 def _parted(word: str) -> list[str]:

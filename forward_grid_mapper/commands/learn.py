@@ -31,6 +31,7 @@ from .options import (
     chosen_parameters,
     chosen_part,
     chosen_poses,
+    not_empty,
 )
 
 COMMAND = 'learn'
@@ -47,7 +48,11 @@ def parser() -> argparse.ArgumentParser:
     )
     made.add_bags('one or more: ROS 2 bag folder, single .mcap or .db3 file, ROS 1 .bag, journal, or folder of bags')
     made.add_argument(
-        '-o', '--output', metavar='FILE', help='new parameter YAML, for process_bag --params and for the node'
+        '-o',
+        '--output',
+        type=not_empty,
+        metavar='FILE',
+        help='new parameter YAML, for process_bag --params and for the node',
     )
     add_bag_options(made)
     add_part_options(made)
@@ -115,8 +120,11 @@ def learn(options: argparse.Namespace) -> int:
         bags = ', '.join(readable(Path(word)) for word in options.bags)
         write_new_file(output, parameter_file_text(found, extrinsics, ros, bags))
         if not options.quiet and not options.json:
-            print(f'\nthe parameters are in {output}; compare the maps with and without them:')
-            print(f'  {_mapping(options, output)}')
+            if found.accepted:
+                print(f'\nthe parameters are in {output}; compare the maps with and without them:')
+                print(f'  {_mapping(options, output)}')
+            else:
+                print(f'\nthe parameters are in {output}: nothing was learned, so they are those from the start')
     return 0
 
 

@@ -20,6 +20,13 @@ from ..recordings.drive import Part
 from ..recordings.given_poses import GivenPoses, read_given_poses
 
 
+def not_empty(text: str) -> str:
+    """Return what an option is given, for argparse; a shell's variable may have been empty."""
+    if not text.strip():
+        raise argparse.ArgumentTypeError('the name is empty')
+    return text
+
+
 def add_json_option(parser: argparse.ArgumentParser) -> None:
     """Add `--json`."""
     parser.add_argument(

@@ -42,6 +42,7 @@ from .options import (
     chosen_parameters,
     chosen_part,
     chosen_poses,
+    not_empty,
 )
 
 SMALLEST_TILE = 1.0
@@ -63,7 +64,9 @@ def parser() -> argparse.ArgumentParser:
         'ROS 2 bag folder, single .mcap or .db3 file, ROS 1 .bag, journal of the node, folder of bags, or a pattern '
         "such as 'monday_*'"
     )
-    made.add_argument('-o', '--output', metavar='DIR', help='new folder for the results (default: BAG_maps)')
+    made.add_argument(
+        '-o', '--output', type=not_empty, metavar='DIR', help='new folder for the results (default: BAG_maps)'
+    )
     add_bag_options(made)
     add_part_options(made)
     made.add_argument(
@@ -95,7 +98,7 @@ def parser() -> argparse.ArgumentParser:
     made.add_argument(
         '--rerun', action='store_true', help='also write the drive for the viewer Rerun, which plays it (drive.rrd)'
     )
-    made.add_argument('-q', '--quiet', action='store_true', help='print nothing but errors and the folder')
+    made.add_argument('-q', '--quiet', action='store_true', help='print nothing but warnings, errors and the folder')
     add_json_option(made)
     add_show_option(made, 'the report')
     add_mapping_options(made)

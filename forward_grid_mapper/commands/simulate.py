@@ -26,6 +26,7 @@ from ..simulation.drift import LEVELS, with_drift
 from ..simulation.drive import BASE_FRAME, Recording, corridor_drive, door_drive
 from ..simulation.sonar import NOISE_FREE, NOISY, SonarArray, front_array, sonar_ring
 from .console import Ticker, run
+from .options import not_empty
 
 COMMAND = 'simulate'
 REFERENCE = 'reference.tum'
@@ -57,7 +58,9 @@ def parser() -> argparse.ArgumentParser:
         help="door: a robot passes an open door (the paper's Fig. 4); corridor: 64 m with six doors, a smooth wall "
         'and a person walking behind the robot (Fig. 6); campus: many drives through many buildings',
     )
-    made.add_argument('-o', '--output', required=True, metavar='DIR', help='new folder for the recording')
+    made.add_argument(
+        '-o', '--output', type=not_empty, required=True, metavar='DIR', help='new folder for the recording'
+    )
     made.add_argument('--seen', type=int, metavar='N', help='door: sweeps taken in front of it (default 3)')
     made.add_argument('--passes', type=int, metavar='N', help='corridor: times along it (default 1)')
     made.add_argument('--drives', type=int, metavar='N', help='campus: drives (default 4)')

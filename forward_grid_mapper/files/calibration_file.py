@@ -28,7 +28,7 @@ HOW = {
     'turn_scale': 'multiply every turn that is measured by this, or divide the distance of the wheels by it',
     'bias': 'degrees to add to the yaw for each metre driven forwards (to the left is positive); of a robot with two '
     'wheels, b metres apart, the right one is larger than the left one by this times b times 0.0175',
-    'heading': 'degrees to the left of where it is said to look, into which the robot drives; the odometry frame, or '
+    'heading': 'degrees to the left of its heading at which the robot drives; the odometry frame, or '
     'the mounting of the sensors on it, is turned by so much',
 }
 

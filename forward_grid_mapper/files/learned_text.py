@@ -122,7 +122,11 @@ def parameter_file_text(
     source : str
         What they were learned from, for a comment.
     """
-    lines = [f'# Learned from {" ".join(source.split())}, together with the map:' if source else '# Learned:']
+    where = f' from {" ".join(source.split())}' if source else ''
+    if learned.accepted:
+        lines = [f'# Learned{where}, together with the map:']
+    else:
+        lines = [f'# Nothing was learned{where}; these are the values from the start:']
     for name in LEARNED:
         estimate = learned.estimates.get(name)
         value = getattr(learned.parameters.model, name)

@@ -50,6 +50,15 @@ def expanded(path: Path | str) -> Path:
         raise OutputError(f'{readable(path)}: whose home is {Path(path).parts[0]}? There is no such user.') from None
 
 
+def unwritable(folder: Path | str) -> str:
+    """Return why nothing can be written in a folder, which need not exist yet; empty if it seems possible."""
+    path = expanded(folder).absolute()
+    there = next(parent for parent in (path, *path.parents) if parent.exists())
+    if not there.is_dir():
+        return f'{readable(there)} is no folder'
+    return '' if os.access(there, os.W_OK | os.X_OK) else f'{readable(there)} may not be written to'
+
+
 @contextmanager
 def output_errors(path: Path) -> Iterator[None]:
     """Turn an `OSError` from writing `path` into an `OutputError`.

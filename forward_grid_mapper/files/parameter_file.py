@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import math
 import re
 from collections.abc import Hashable, Iterator
@@ -13,11 +14,15 @@ import yaml
 from ..core.common.errors import ParameterError
 from ..core.common.former_parameters import DEPRECATED
 from ..core.common.parameter import Parameter
-from ..core.common.parameters import find
+from ..core.common.parameters import LOG, find
 from ..core.messages.message_types import Pose2
+from ..core.messages.mounts import TURN, mount_of
 from .small_text import read_text
 
 NODE_NAME = 'forward_grid_mapper'
+
+LIKE = 0.85
+"""Likeness (`difflib`) from which on the name of a section is taken for a misspelt `NODE_NAME`."""
 
 # Parameters that ROS itself declares on every node.
 _ROS_OWN = re.compile(r'use_sim_time|start_type_description_service|qos_overrides\..+')
@@ -46,7 +51,8 @@ def load_parameters(path: Path | str) -> ParameterFile:
     """Read a ROS 2 parameter YAML, or a flat mapping of names to values.
 
     Names may be nested or dotted. In a ROS file the sections `/**` and `forward_grid_mapper` (in any namespace) count,
-    the latter first; a section of another name counts if it is the only one, as for a node that was renamed.
+    the latter first; a section of another name counts if it is the only one, as for a node that was renamed, with a
+    warning in the log; one whose name looks misspelt does not.
 
     Raises
     ------
@@ -99,21 +105,24 @@ def parse_sensor(text: str) -> tuple[str, Pose2]:
     Raises
     ------
     ParameterError
-        If the text has another form or a number is not finite.
+        If the text has another form or a number is not finite, or can only be of another unit.
     """
     frame, _, numbers = (part.strip() for part in text.rpartition('='))
     parts = numbers.split(',')
     degrees = parts[-1].strip().endswith('deg')
     parts[-1] = parts[-1].strip().removesuffix('deg')
     try:
-        pose = _pose(frame, [float(part) for part in parts])
-    except (ValueError, ParameterError):
-        pose = None
-    if pose is None or not frame:
+        x, y, yaw = (float(part) for part in parts)
+    except ValueError:
+        x = y = yaw = math.nan
+    if not frame or not all(map(math.isfinite, (x, y, yaw))):
         raise ParameterError(
-            f'{text!r} is not of the form frame=x,y,yaw, such as sonar_left=0.1,0.15,1.57 or sonar_left=0.1,0.15,90deg'
+            f'{text!r} is not of the form frame=x,y,yaw, such as sonar_left=0.1,0.15,1.57 or '
+            'sonar_left=0.1,0.15,90deg: three numbers with points and no other unit than deg'
         )
-    return frame, pose._replace(yaw=math.radians(pose.yaw)) if degrees else pose
+    if not degrees and TURN < abs(yaw) <= 360.0:
+        raise ParameterError(f'{text!r}: a yaw of {yaw:g} rad is more than a full turn; is it {frame}={numbers}deg?')
+    return frame, mount_of(frame, [x, y, math.radians(yaw) if degrees else yaw])
 
 
 class _Loader(yaml.SafeLoader):
@@ -152,10 +161,15 @@ def _sections(document: Any) -> list[dict[str, Any]]:
         return [document]
     wildcards = [s for name, s in found.items() if name.strip('/') in ('*', '**')]
     own = [s for name, s in found.items() if name.rpartition('/')[2] == NODE_NAME]
-    chosen = wildcards + own or (list(found.values()) if len(found) == 1 else [])
-    if not chosen:
+    if chosen := wildcards + own:
+        return chosen
+    if len(found) > 1:
         raise ParameterError(f'it has no section for {NODE_NAME} or /**; there are: {", ".join(found)}')
-    return chosen
+    ((name, only),) = found.items()
+    if difflib.get_close_matches(name.rpartition('/')[2], [NODE_NAME], cutoff=LIKE):
+        raise ParameterError(f'the section {name} is of another node; did you mean {NODE_NAME}?')
+    LOG.warning('parameters of %s are taken, which a node with the name %s does not read', name, NODE_NAME)
+    return [only]
 
 
 def _ros_sections(document: dict[Any, Any], prefix: str) -> Iterator[tuple[str, Any]]:
@@ -164,6 +178,8 @@ def _ros_sections(document: dict[Any, Any], prefix: str) -> Iterator[tuple[str, 
             if 'ros__parameters' in value:
                 yield f'{prefix}{key}', value['ros__parameters']
             else:
+                if misspelt := [name for name in value if str(name).replace('_', '') == 'rosparameters']:
+                    raise ParameterError(f'{misspelt[0]}: did you mean ros__parameters, with two underscores?')
                 yield from _ros_sections(value, f'{prefix}{key}/')
 
 
@@ -185,22 +201,14 @@ def _sort_out(flat: dict[str, Any]) -> ParameterFile:
     result = ParameterFile({}, {}, {})
     for name, value in flat.items():
         if extrinsic := _MOUNT.fullmatch(name):
-            result.extrinsics[extrinsic['frame']] = _pose(name, value)
+            result.extrinsics[extrinsic['frame']] = mount_of(name, value)
         elif _ROS_OWN.fullmatch(name):
             result.node[name] = value
-        elif name.partition('.')[0] == 'sensors':
+        elif name.partition('.')[0] in ('sensors', 'sensor'):
             raise ParameterError(f'{name}: sensors are given as sensors.<frame_id>.pose: [x, y, yaw]')
         else:
             result.values[name] = value if name in DEPRECATED else find(name).check(value)
     return result
-
-
-def _pose(name: str, value: Any) -> Pose2:
-    numbers = value if isinstance(value, list) else []
-    good = [float(v) for v in numbers if isinstance(v, (int, float)) and not isinstance(v, bool) and math.isfinite(v)]
-    if len(good) != 3 or len(numbers) != 3:
-        raise ParameterError(f'{name}: {value!r} is not [x, y, yaw], three finite numbers (metres, radians)')
-    return Pose2(*good)
 
 
 def _typed(row: Parameter, text: str) -> Any:

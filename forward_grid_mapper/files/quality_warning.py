@@ -66,7 +66,7 @@ def quality_warning(maps: MapSet) -> str:
         return ''
     return (
         f'{unexplained} of {count} readings are most likely random measurements: the map does not fit what was '
-        f'measured; are the poses of the sensors, odometry and the field of view right?'
+        f'measured; are the poses of the sensors, odometry, the field of view and changed parameters right?'
     )
 
 

@@ -229,7 +229,8 @@ def _parameters(data: dict[str, Any]) -> Iterator[str]:
     yield 'Parameters that differ from the defaults'
     width = max(map(len, changed))
     for name, row in changed.items():
-        yield f'  {name:<{width}}  {row["value"]}  (default {row["default"]})'
+        value = f'{row["value"]:.6g}' if isinstance(row['value'], float) else row['value']
+        yield f'  {name:<{width}}  {value}  (default {row["default"]})'
 
 
 def _line(label: str, text: object) -> Iterator[str]:

@@ -85,14 +85,14 @@ def told_words(told: Mapping[str, Told]) -> str:
 
 
 _EXACT = {
-    'scale': 'ways are measured right',
-    'heading': 'the robot drives where it is said to look',
+    'scale': 'distances are measured right',
+    'heading': 'the robot drives along its heading',
     'bias': 'going straight is measured as going straight',
     'turn_scale': 'turns are measured right',
 }
 _ASKED = {
-    'scale': 'whether ways are measured too long',
-    'heading': 'whether the robot drives where it is said to look',
+    'scale': 'whether distances are measured too long',
+    'heading': 'whether the robot drives along its heading',
     'bias': 'whether going straight is measured as turning',
     'turn_scale': 'whether turns are measured too large',
 }
@@ -105,7 +105,7 @@ def calibration_words(calibration: Mapping[str, float]) -> str:
     scale, turn_scale = -calibration.get('scale', 0.0), -calibration.get('turn_scale', 0.0)
     bias, heading = -calibration.get('bias', 0.0), calibration.get('heading', 0.0)
     if abs(scale) >= LEAST_SCALE:
-        words.append(f'ways are measured {abs(scale):.1%} too {"long" if scale > 0 else "short"}')
+        words.append(f'distances are measured {abs(scale):.1%} too {"long" if scale > 0 else "short"}')
     if abs(bias) >= LEAST_ANGLE:
         side = 'left' if bias > 0 else 'right'
         words.append(f'going straight is measured as turning {math.degrees(abs(bias)):.1f}° a metre to the {side}')
@@ -113,5 +113,5 @@ def calibration_words(calibration: Mapping[str, float]) -> str:
         words.append(f'turns are measured {abs(turn_scale):.1%} too {"large" if turn_scale > 0 else "small"}')
     if abs(heading) >= LEAST_ANGLE:
         side = 'left' if heading > 0 else 'right'
-        words.append(f'the robot drives {math.degrees(abs(heading)):.1f}° to the {side} of where it is said to look')
+        words.append(f'the robot drives {math.degrees(abs(heading)):.1f}° to the {side} of its heading')
     return '; '.join(words).replace('%', ' %')

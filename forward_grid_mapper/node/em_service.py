@@ -17,6 +17,7 @@ from ..core.maps.map_set import MapSet
 from ..core.messages.message_types import Pose2
 from ..core.messages.pose_association import PoseAssociator
 from ..core.messages.reading_buffer import bounded
+from ..core.messages.rep117 import REASONS
 from ..core.trajectory.recovering import recovered
 from ..core.trajectory.windows import Odometry
 from ..files.quality_warning import quality_warning
@@ -254,6 +255,8 @@ class EmService:
                 outcome.maps, outcome.message = None, 'EM was cancelled by reset'
             elif outcome.maps is None and run.asked:
                 outcome.message = 'EM was cancelled by cancel_em'
+            elif outcome.maps is None and not len(taken[0][1]):
+                outcome.message = self._nothing()
             elif outcome.maps is None and run.then:
                 outcome.message = 'the run that was begun after some way gave way to run_em'
             self._finish(outcome, taken[0][0])
@@ -300,6 +303,17 @@ class EmService:
         if generation == self._publishers.generation:
             self._trajectory.adopt(mapper.found if isinstance(mapper, RefiningMapper) else None, count)
             self._show(maps, generation)
+
+    def _nothing(self) -> str:
+        """Return why there is no reading to map."""
+        received, rejected = self._associator.received, self._associator.rejected
+        topics = ', '.join(self._parameters().node.range_topics)
+        if not received:
+            return f'there is nothing to map: no Range message has come on {topics} since the start or reset'
+        if not rejected:
+            return f'there is nothing to map: {received} readings have come, and wait for their poses'
+        reason, count = max(rejected.items(), key=lambda row: row[1])
+        return f'there is nothing to map: {count} of {received} readings were rejected as {reason}: {REASONS[reason]}'
 
     def _wait_for_kernels(self, stop: Callable[[], bool]) -> None:
         self._kernels.wait('EM', stop)

@@ -93,7 +93,7 @@ class Following:
             return {}
         said = f'{follower.windows} windows, {follower.places} places recognised'
         if follower.kept:
-            said += '; the correction is kept, since readings are foreseen worse where it is followed'
+            said += '; the correction is kept, since readings are predicted worse where it is followed'
         return {'followed since the latest run': f'{said}; ended: {follower.obstacle}' if follower.obstacle else said}
 
     def _take(self, follower: Follower) -> None:

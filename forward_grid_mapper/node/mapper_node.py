@@ -19,6 +19,8 @@ from ..core.maps.log_odds_map import LogOddsMap
 from ..core.messages.message_types import NANOSECONDS
 from ..core.messages.pose_association import PoseAssociator
 from ..core.messages.reading_buffer import bounded
+from ..core.messages.rep117 import rejection_warnings
+from ..files.output_folder import unwritable
 from . import ros_parameters
 from .background import Inbox, Worker
 from .complaints import of_ros
@@ -98,6 +100,8 @@ class MapperNode(ManagedNode):
         self._begin_anew()
         node, log = self.parameters.node, self.get_logger()
         odometry = self._resolved('odom_topic', node.odom_topic)
+        if why := unwritable(node.save_directory):
+            log.warning(f'save_maps will fail: {why}; set save_directory to a folder that can be written')
         if not node.range_topics:
             raise MapperError('range_topics is empty; give it the name of a topic of sensor_msgs/Range, or several')
         if odometry in [self._resolved('range_topics', topic) for topic in node.range_topics]:
@@ -385,7 +389,11 @@ class MapperNode(ManagedNode):
                 'rejected': dict(associator.rejected),
                 'lost': self.intake.lost,
             },
-            'warnings': [*associator.limits.warnings(), *self.intake.loss_note()],
+            'warnings': [
+                *associator.limits.warnings(),
+                *self.intake.loss_note(),
+                *rejection_warnings(associator.rejected, associator.received),
+            ],
         }
         path, odometry = list(associator.path), associator.odometry
         return Account(source, len(associator.buffer), path, odometry, node.save_directory, f'Maps of {name}')

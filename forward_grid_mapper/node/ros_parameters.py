@@ -16,6 +16,7 @@ from ..core.common.former_parameters import DEPRECATED, RENAMED, deprecation
 from ..core.common.parameter import Parameter
 from ..core.common.parameters import TABLE, Parameters
 from ..core.messages.message_types import Pose2
+from ..core.messages.mounts import mount_of
 
 ROS_OWN = ('use_sim_time', 'start_type_description_service', 'qos_overrides')
 NAMES = {row.name for row in TABLE}
@@ -106,11 +107,7 @@ def _extrinsics(given: dict[str, RosParameter]) -> dict[str, Pose2]:
     extrinsics = {}
     for name, parameter in given.items():
         if name.startswith('sensors.') and name.endswith('.pose'):
-            value = parameter.value
-            numbers = list(value) if isinstance(value, (list, tuple)) or hasattr(value, 'typecode') else []
-            if len(numbers) != 3 or not all(isinstance(v, (int, float)) and math.isfinite(v) for v in numbers):
-                raise ParameterError(f'{name}: {value!r} is not [x, y, yaw], three finite numbers (metres, radians)')
-            extrinsics[name[len('sensors.') : -len('.pose')]] = Pose2(*(float(v) for v in numbers))
+            extrinsics[name[len('sensors.') : -len('.pose')]] = mount_of(name, parameter.value)
     return extrinsics
 
 

@@ -16,7 +16,7 @@ from ..core.messages.extrinsics import STEEP
 from ..core.messages.message_batch import batch_of
 from ..core.messages.message_types import NANOSECONDS, Pose2
 from ..core.messages.pose_association import PoseAssociator
-from ..core.messages.rep117 import ODOMETRY_REASONS, REASONS
+from ..core.messages.rep117 import ODOMETRY_REASONS, REASONS, rejection_warnings
 from ..files.journal import drive_file
 from ..files.output_folder import readable
 from .drive import WHOLE, Drive, LogOddsMapOfAll, Part, Spans, length_of, thinning_note
@@ -205,11 +205,8 @@ def _warnings(bag: Bag, associator: PoseAssociator, lookup: Extrinsics) -> list[
         warnings.append(
             f'{count} of {associator.odometry_received} odometry messages were rejected: {ODOMETRY_REASONS[reason]}'
         )
-    for reason, count in associator.rejected.items():
-        told = reason == 'unknown_extrinsics' or (reason == STEEP and lookup.steep)
-        if count > 0.2 * associator.received and not told:
-            warnings.append(f'{count} of {associator.received} readings were rejected as {reason}: {REASONS[reason]}')
-    return warnings
+    told = {'unknown_extrinsics', STEEP} if lookup.steep else {'unknown_extrinsics'}
+    return warnings + rejection_warnings(associator.rejected, associator.received, known=told)
 
 
 def _base_frame(bag: Bag) -> str:

@@ -7,6 +7,7 @@ import math
 import os
 import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -165,6 +166,20 @@ def test_a_pipe_is_not_waited_for(maps: Path, tmp_path: Path, name: str, capsys:
     os.mkfifo(tmp_path / name)
     assert code_of(explain.main, tmp_path, 0, 0) == 1
     assert f'{name} is no file' in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ('words', 'right'),
+    [
+        (('3,5', '-0.4'), '3.5'),
+        (('3.5', '-0,4'), '-0.4'),
+        (('-n', 2, '3,5', '0'), '3.5'),
+        (('3,5', '0,4', '-n', '-3'), '3.5'),
+    ],
+)
+def test_a_decimal_comma_is_named(maps: Path, words: Any, right: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert code_of(explain.main, maps, *words) == 2
+    assert f'write numbers with a point: {right}\n' in capsys.readouterr().err
 
 
 def test_a_place_may_have_a_comma(maps: Path, capsys: pytest.CaptureFixture[str]) -> None:

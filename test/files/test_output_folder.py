@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from forward_grid_mapper.core.common.errors import OutputError
-from forward_grid_mapper.files.output_folder import free_name, output_errors, output_folder, told_apart
+from forward_grid_mapper.files.output_folder import free_name, output_errors, output_folder, told_apart, unwritable
 
 
 def test_paths_are_told_apart_by_their_ends() -> None:
@@ -109,6 +109,14 @@ def test_a_forbidden_parent_is_told_for_real(tmp_path: Path) -> None:
     with pytest.raises(OutputError, match='no permission'):
         fill(tmp_path / 'maps')
     tmp_path.chmod(0o700)
+
+
+def test_a_folder_that_cannot_be_written_is_known_before(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / 'file').touch()
+    assert unwritable(tmp_path) == unwritable(tmp_path / 'new' / 'newer') == ''
+    assert unwritable(tmp_path / 'file' / 'new') == f'{tmp_path / "file"} is no folder'
+    monkeypatch.setattr(os, 'access', lambda path, mode: path != tmp_path)
+    assert unwritable(tmp_path / 'new') == f'{tmp_path} may not be written to'
 
 
 def test_output_errors_name_the_file() -> None:

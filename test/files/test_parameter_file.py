@@ -90,6 +90,13 @@ def test_forms_of_a_file(tmp_path: Path, text: str) -> None:
     )
 
 
+def test_parameters_of_another_node_are_warned_of(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    assert load(tmp_path, 'slam_toolbox: {ros__parameters: {resolution: 0.05}}').values == {'resolution': 0.05}
+    assert caplog.messages == [
+        'parameters of slam_toolbox are taken, which a node with the name forward_grid_mapper does not read'
+    ]
+
+
 @pytest.mark.parametrize('text', ['', '# nothing', '/**:\n  ros__parameters:\n', '{}'])
 def test_files_without_values(tmp_path: Path, text: str) -> None:
     assert load(tmp_path, text) == ParameterFile({}, {}, {})
@@ -127,6 +134,11 @@ def test_parameters_of_ros_itself_pass(tmp_path: Path) -> None:
         ('sensors.a.pose: [0, true, 1]', 'three finite numbers'),
         ('sensors.a.pose: "0, 0, 0"', 'three finite numbers'),
         ('sensors.a.position: [0, 0, 0]', r'sensors\.<frame_id>\.pose'),
+        ('sensor.a.pose: [0, 0, 0]', r'sensors\.<frame_id>\.pose'),
+        ('sensors.a.pose: [0, 0, 90]', 'more than a full turn'),
+        ('forward_grid_maper: {ros__parameters: {p_hit: 0.5}}', 'did you mean forward_grid_mapper'),
+        ('/robot/forward_gridmapper: {ros__parameters: {p_hit: 0.5}}', 'did you mean forward_grid_mapper'),
+        ('/**: {ros_parameters: {p_hit: 0.5}}', 'ros_parameters: did you mean ros__parameters'),
         ('sensors: [a]', r'sensors\.<frame_id>\.pose'),
         ('- p_hit', 'names with values'),
         ('/**: {ros__parameters: [1]}', 'names with values'),
@@ -195,9 +207,25 @@ def test_sensors(text: str, expected: tuple[str, Pose2]) -> None:
     assert parse_sensor(text) == expected
 
 
-@pytest.mark.parametrize('text', ['left', '=1,2,3', 'left=1,2', 'left=1,2,3,4', 'left=1,2,inf', 'left=a,b,c', 'left='])
+@pytest.mark.parametrize(
+    'text',
+    ['left', '=1,2,3', 'left=1,2', 'left=1,2,3,4', 'left=1,2,inf', 'left=a,b,c', 'left=', 'left=1,2,90degrees'],
+)
 def test_bad_sensors(text: str) -> None:
     with pytest.raises(ParameterError, match='form frame=x,y,yaw'):
+        parse_sensor(text)
+
+
+@pytest.mark.parametrize(
+    ('text', 'message'),
+    [
+        ('left=0.1,0.2,90', 'is it left=0.1,0.2,90deg'),
+        ('left=0.1,0.2,1e4', 'more than a full turn'),
+        ('left=15,12,90deg', 'x and y are in metres'),
+    ],
+)
+def test_sensors_in_other_units(text: str, message: str) -> None:
+    with pytest.raises(ParameterError, match=message):
         parse_sensor(text)
 
 

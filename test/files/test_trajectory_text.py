@@ -24,8 +24,8 @@ def test_tum_lines_hold_stamp_position_and_quaternion() -> None:
 def test_the_calibration_is_told_in_words() -> None:
     words = calibration_words({'scale': 0.012, 'heading': 0.0, 'bias': -math.radians(0.5), 'turn_scale': -0.02})
     assert words == (
-        'ways are measured 1.2 % too short; going straight is measured as turning 0.5° a metre to the left; turns are '
-        'measured 2.0 % too large'
+        'distances are measured 1.2 % too short; going straight is measured as turning 0.5° a metre to the left; '
+        'turns are measured 2.0 % too large'
     )
     assert calibration_words({'scale': 0.001}) == ''
     assert '1.0° to the right of' in calibration_words({'heading': -math.radians(1.0)})
@@ -34,7 +34,7 @@ def test_the_calibration_is_told_in_words() -> None:
 def test_the_report_says_what_became_of_the_trajectory() -> None:
     refined = {
         'refined': True,
-        'reason': 'readings are foreseen better',
+        'reason': 'readings are predicted better',
         'odometry_off_m': 5.432,
         'odometry_off_deg': 16.0,
         'places_recognised': 1,
@@ -44,7 +44,7 @@ def test_the_report_says_what_became_of_the_trajectory() -> None:
     assert 'off by 5.43 m and 16.0°' in text
     assert '1 place recognised' in text
     assert 'Wheels' in text and 'measure before you set it' in text
-    refined |= {'told': {}, 'odometry': 'the drive does not tell whether ways are measured too long'}
+    refined |= {'told': {}, 'odometry': 'the drive does not tell whether distances are measured too long'}
     assert 'measure before' not in report_text({'input': {'trajectory': refined}})
     left = report_text({'input': {'trajectory': {'refined': False, 'reason': 'the drive is short'}}})
     assert "odometry's, not refined: the drive is short" in left

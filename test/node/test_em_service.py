@@ -15,6 +15,7 @@ pytest.importorskip('rclpy', reason='the services are those of rclpy')
 
 from em_robot import BEFORE, GRID, PROGRESS, SO_FAR, EmRobot
 
+from forward_grid_mapper.core.common.errors import InputError
 from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.node import em_service
 
@@ -382,3 +383,24 @@ def test_closing_cancels_the_run(held: EmRobot) -> None:
     search = held.begun()
     held.em.close(10.0)
     assert search.cancelled
+
+
+@pytest.mark.parametrize(
+    ('received', 'rejected', 'said'),
+    [
+        (0, {}, 'no Range message has come on sonar since'),
+        (7, {}, '7 readings have come, and wait for their poses'),
+        (9, {'nan_range': 2, 'below_min_range': 7}, '7 of 9 readings were rejected as below_min_range: the range is'),
+    ],
+)
+def test_why_there_is_nothing_to_map(
+    make: Callable[..., EmRobot], received: int, rejected: dict[str, int], said: str
+) -> None:
+    robot = make(count=0, range_topics=('sonar',))
+    robot.error = InputError('there is no reading to map')
+    robot.associator.received = received
+    robot.associator.rejected.update(rejected)
+    answer = robot.run_em()
+    robot.settle()
+    ((success, message),) = answer.sent
+    assert not success and message.startswith('there is nothing to map: ') and said in message

@@ -198,7 +198,7 @@ def test_services_during_em_and_reset(start: Any, robot: Robot) -> None:
     robot.until(lambda: robot.maps['ml_map'][-1].info.width == 1, what='an empty map')
     empty = robot.call('run_em')
     assert not empty.success
-    assert 'no reading' in empty.message
+    assert 'no Range message has come on /sonar' in empty.message
     save = robot.call('save_maps')
     assert not save.success
     # a run that is under way does not keep the node from ending
@@ -253,8 +253,9 @@ def test_one_topic_for_ranges_and_odometry_is_an_error(start: Any) -> None:
 
 
 def test_misspelt_parameters_are_named(start: Any) -> None:
-    node = start('-p', 'p_hitt:=0.5')
+    node = start('-p', 'p_hitt:=0.5', '-p', 'save_directory:=/proc/version/maps')
     assert 'did you mean p_hit' in node.output
+    assert 'save_maps will fail: /proc/version is no folder' in node.output
 
 
 def test_trouble_shows_in_diagnostics_and_passes(start: Any, robot: Robot) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Container, Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -16,11 +17,12 @@ from .message_types import RangeMessage
 REASONS = {
     'nan_range': 'the range is not a number',
     'too_near': 'the range is -inf, or less than a millimetre: something too near to measure, or a dead sensor',
-    'below_min_range': 'the range is below min_range',
+    'below_min_range': 'the range is below min_range; a driver that means "no echo" should send +inf (REP 117), not 0',
     'over_range': 'no echo, and over_range is "discard"',
     'bad_limits': 'min_range or max_range is negative or not finite, or max_range is not above min_range, or below a '
     'millimetre',
-    'bad_field_of_view': 'the field of view is not between 0 and 180 degrees; parameter field_of_view overrides it',
+    'bad_field_of_view': 'the field of view is not between 0 and pi radians (15 degrees are 0.26); the parameter '
+    'field_of_view overrides it: field_of_view=15deg on a command line',
     'empty_frame_id': 'the header has no frame_id, so the sensor is unknown',
     'long_frame_id': 'the frame_id has more than 255 characters',
     'unprintable_frame_id': 'the frame_id has characters that cannot be printed',
@@ -41,6 +43,10 @@ REASONS = {
     'paused': 'the mapper was paused',
 }
 """Why a reading is rejected, in words."""
+
+
+MANY = 0.2
+"""Part of the readings whose rejection for one reason is worth a warning."""
 
 
 ODOMETRY_REASONS = {
@@ -109,6 +115,17 @@ def measure(message: RangeMessage, parameters: AssociationParameters) -> Measure
             return 'over_range'
         z = z_max
     return Measurement(message, z, z_max, angle / 2, sigma)
+
+
+def rejection_warnings(
+    rejected: Mapping[str, int], received: int, what: str = 'readings', known: Container[str] = ()
+) -> list[str]:
+    """Return a warning for each reason, other than known ones, for which many of the readings were rejected."""
+    return [
+        f'{count} of {received} {what} were rejected as {reason}: {REASONS[reason]}'
+        for reason, count in rejected.items()
+        if count > MANY * received and reason not in known
+    ]
 
 
 class Measurements(NamedTuple):

@@ -72,7 +72,7 @@ def grid_of(
         If there are no readings, or the grid would exceed `max_cells`.
     """
     if not len(readings):
-        raise InputError('no reading was accepted, so there is nothing to map; the counts of rejected readings say why')
+        raise InputError('there are no readings, so there is nothing to map')
     reach = reach_of(readings, effective_sigma(readings, model, grid.resolution))
     reach = reach + model.surface_offset * grid.resolution
     reach = np.maximum(reach, readings.z + beyond if beyond else 0.0)

@@ -70,7 +70,7 @@ def foreseen(scans: Scans, nodes: Floats, blocks: list[NDArray[np.int64]], span:
 
 
 class Gain(NamedTuple):
-    """By how much readings are foreseen better: mean and standard error in nats a reading."""
+    """By how much readings are predicted better: mean and standard error in nats a reading."""
 
     mean: float
     error: float

@@ -66,7 +66,7 @@ def chosen(scans: Scans, first: Floats, *others: Floats) -> Floats:
 
 
 def turned_right(scans: Scans, nodes: Floats) -> bool:
-    """Return whether readings are foreseen better where nodes turn within a few metres as odometry does not.
+    """Return whether readings are predicted better where nodes turn within a few metres as odometry does not.
 
     So it is, too, where there are too few such turns to tell. A robot that goes around a corner which is not square
     looks as if its odometry were off by as much.

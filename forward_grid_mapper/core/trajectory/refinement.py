@@ -337,7 +337,7 @@ def _lost(drive: _Drive, certainty: float) -> _Attempt:
 
 
 def _said(better: Gain) -> str:
-    return f'readings are foreseen {better.mean:+.3f} ± {better.error:.3f} nats a reading better than with odometry'
+    return f'readings are predicted {better.mean:+.3f} ± {better.error:.3f} nats a reading better than with odometry'
 
 
 def _doubt(part: float) -> str:

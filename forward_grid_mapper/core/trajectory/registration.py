@@ -56,7 +56,7 @@ class Registration(NamedTuple):
     begin : float64, shape (3,)
         The pose of its begin, on the map; as it was if nothing better was found.
     gain : Gain
-        By how much its readings are foreseen better.
+        By how much its readings are predicted better.
     """
 
     begin: Floats

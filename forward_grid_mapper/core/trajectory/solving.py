@@ -136,7 +136,7 @@ class MatchSolver:
     def _elsewhere(
         self, blocks: NDArray[np.int64], matches: Edges, loops: list[Loop], solution: Solution, usual: float
     ) -> tuple[Solution, list[Loop]]:
-        """Return the solution with some blocks in another place, if their readings are foreseen better there."""
+        """Return the solution with some blocks in another place, if their readings are predicted better there."""
         scans, nodes = self._scans, solution.nodes
         stretch = windows_of(blocks, len(nodes))
         moved = displaced(scans, nodes, stretch)

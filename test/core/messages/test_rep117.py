@@ -8,7 +8,7 @@ import pytest
 
 from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.messages.message_types import RangeMessage
-from forward_grid_mapper.core.messages.rep117 import LONGEST_NAME, NEAREST, Measurement, measure
+from forward_grid_mapper.core.messages.rep117 import LONGEST_NAME, NEAREST, Measurement, measure, rejection_warnings
 
 PLAIN = RangeMessage(7, 'sonar', 1.0, 0.1, 4.0, 0.3)
 
@@ -23,6 +23,12 @@ def refused(message: RangeMessage, **values: object) -> str:
     made = measure(message, Parameters.from_flat(values).association)
     assert isinstance(made, str)
     return made
+
+
+def test_reasons_that_took_many_readings_are_worth_a_warning() -> None:
+    rejected = {'below_min_range': 21, 'nan_range': 20, 'unknown_extrinsics': 50}
+    (told,) = rejection_warnings(rejected, 100, 'ranges', known={'unknown_extrinsics'})
+    assert told.startswith('21 of 100 ranges were rejected as below_min_range') and 'send +inf' in told
 
 
 def test_what_a_plain_message_says() -> None:

@@ -73,8 +73,8 @@ def test_drift_is_taken_out(tour, bent, outcome) -> None:
 
 def test_what_speaks_for_it_is_named(small, monkeypatch, outcome, small_outcome) -> None:
     for found in (outcome, small_outcome):
-        assert found.reason.startswith(('readings are foreseen', 'that walls stand at right angles'))
-    # no readings are foreseen so much better, and nothing was seen before, so the walls have the word
+        assert found.reason.startswith(('readings are predicted', 'that walls stand at right angles'))
+    # no readings are predicted so much better, and nothing was seen before, so the walls have the word
     monkeypatch.setattr(refinement, 'LEAST_SIGMAS', 1e9)
     monkeypatch.setattr(refinement, 'came_back', lambda *rest: False)
     assert 'that walls stand at right angles is likelier by' in Refiner(Parameters()).run(*small).reason
@@ -90,7 +90,7 @@ def test_places_seen_before_prove_what_nothing_nearby_does(tour, bent, monkeypat
     monkeypatch.setattr(refinement, 'over_the_drive', lambda *rest: Gain(-0.05, 0.01))
     found, true = Refiner(Parameters()).run(*bent), odometry_of(tour).pose
     assert found.accepted
-    assert found.reason.startswith('with places seen before, readings are foreseen +')
+    assert found.reason.startswith('with places seen before, readings are predicted +')
     assert rms_after_alignment(found.trajectory.pose, true) < 0.2
     # the same without such places, and without walls that say that the yaw is off
     monkeypatch.setattr(refinement, 'seen_again', lambda *rest: Gain(0.0, 0.01))
@@ -102,15 +102,15 @@ def test_places_seen_before_prove_what_nothing_nearby_does(tour, bent, monkeypat
 
 
 def test_walls_are_no_proof_where_places_seen_before_say_nothing(bent, monkeypatch) -> None:
-    # walls that stand askew tell a yaw that is off, and readings are foreseen about as well
+    # walls that stand askew tell a yaw that is off, and readings are predicted about as well
     monkeypatch.setattr(refinement, 'matched', no_matches)
     monkeypatch.setattr(refinement, 'over_the_drive', lambda *rest: Gain(0.001, 0.01))
     monkeypatch.setattr(refinement, 'seen_again', lambda *rest: Gain(0.001, 0.01))
     left = Refiner(Parameters()).run(*bent)
     assert not left.accepted
-    assert left.reason.startswith('with places seen before, readings are foreseen +')
+    assert left.reason.startswith('with places seen before, readings are predicted +')
     assert 'not enough to tell' in left.reason
-    # where the robot came to no place twice, walls are proof, unless readings are foreseen worse
+    # where the robot came to no place twice, walls are proof, unless readings are predicted worse
     monkeypatch.setattr(refinement, 'came_back', lambda *rest: False)
     found = Refiner(Parameters()).run(*bent)
     assert found.accepted
@@ -118,7 +118,7 @@ def test_walls_are_no_proof_where_places_seen_before_say_nothing(bent, monkeypat
     monkeypatch.setattr(refinement, 'seen_again', lambda *rest: Gain(-0.02, 0.01))
     worse = Refiner(Parameters()).run(*bent)
     assert not worse.accepted
-    assert worse.reason.startswith('readings are foreseen -')
+    assert worse.reason.startswith('readings are predicted -')
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,40 @@
+"""Poses of sensors on the robot: numbers that can only be of other units are refused."""
+
+from __future__ import annotations
+
+import array
+import math
+
+import numpy as np
+import pytest
+
+from forward_grid_mapper.core.common.errors import ParameterError
+from forward_grid_mapper.core.messages.message_types import Pose2
+from forward_grid_mapper.core.messages.mounts import FARTHEST, TURN, mount_of
+
+
+@pytest.mark.parametrize('form', [list, tuple, np.array, lambda values: array.array('d', values)])
+def test_forms_of_three_numbers(form: type) -> None:
+    assert mount_of('left', form([0.1, -0.2, 1.5])) == Pose2(0.1, -0.2, 1.5)
+
+
+def test_the_limits_are_admitted() -> None:
+    assert mount_of('left', [FARTHEST, 0, float(np.float32(-TURN))]).x == FARTHEST
+
+
+@pytest.mark.parametrize(
+    ('values', 'message'),
+    [
+        ([0.1, 0.2, 90], r'left: a yaw of 90 is in radians, .*; 90 degrees are 1\.5708'),
+        ([0.1, 0.2, -6.3], 'more than a full turn'),
+        ([8, 8, 0], r'left: the sensor would be 11\.3 m away .* in metres'),
+        ([0.1, 0.2], 'three finite numbers'),
+        ([0.1, 0.2, True], 'three finite numbers'),
+        ([0.1, 0.2, math.nan], 'three finite numbers'),
+        ('0.1, 0.2, 1.5', 'three finite numbers'),
+        (None, 'three finite numbers'),
+    ],
+)
+def test_what_is_refused(values: object, message: str) -> None:
+    with pytest.raises(ParameterError, match=message):
+        mount_of('left', values)
