@@ -120,10 +120,11 @@ def only_if_foreseen(
         return dataclasses.replace(found, foresight=seen)
     at_first, at_learned = seen.gains
     why = (
-        f'the learned values are refused: readings that had no part in learning do not speak for their map. At the '
-        f'values from the start it gains {at_first:+.3f} ± {seen.error_at_first:.3f} nats a reading over the map of '
-        f'these values, at the learned ones {at_learned:+.3f} ± {seen.error_at_learned:.3f}; both must be more than '
-        f'{SURE:g} standard error. The values from the start are kept; --keep-going hands out the learned ones'
+        f'the learned values are refused, and the values from the start are kept: the map of the learned values does '
+        f'not predict readings that were held out better than the map of the values from the start. Its gain, with the '
+        f'standard error, is {at_first:+.3f} ± {seen.error_at_first:.3f} nats a reading by the first model and '
+        f'{at_learned:+.3f} ± {seen.error_at_learned:.3f} by the learned one; both must be larger than {SURE:g} '
+        f'standard error. --keep-going writes the learned values all the same'
     )
     return dataclasses.replace(
         found,

@@ -202,6 +202,8 @@ def _sort_out(flat: dict[str, Any]) -> ParameterFile:
     for name, value in flat.items():
         if extrinsic := _MOUNT.fullmatch(name):
             result.extrinsics[extrinsic['frame']] = mount_of(name, value)
+            if len({isinstance(number, int) for number in value}) > 1:
+                LOG.warning('%s: write each number of %s with a point; ROS refuses lists of both kinds', name, value)
         elif _ROS_OWN.fullmatch(name):
             result.node[name] = value
         elif name.partition('.')[0] in ('sensors', 'sensor'):

@@ -137,7 +137,7 @@ def read_drives(
 def unreadable(errors: Sequence[tuple[Path, MapperError]], count: int) -> MapperError:
     """Return the error about those of `count` drives that cannot be mapped."""
     lines = [
-        f'\n  {readable(path)}: {error}' if readable(path) not in str(error) else f'\n  {error}'
+        '\n  ' + (f'{readable(path)}: ' * (readable(path) not in str(error)) + str(error)).replace('\n', '\n    ')
         for path, error in errors[:MOST_ERRORS]
     ]
     more = f'\n  and {len(errors) - MOST_ERRORS} more' if len(errors) > MOST_ERRORS else ''

@@ -14,6 +14,7 @@ import pytest
 from drive_samples import FILES, Tape, arrays_in, assert_same_maps, code_of, mapped, refusal, report_in, write_tape
 
 from forward_grid_mapper.commands import learn, process_bag
+from forward_grid_mapper.core.common.errors import InputError
 from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.common.readings import Readings, in_canonical_order
 from forward_grid_mapper.core.mapping import Mapper
@@ -25,7 +26,7 @@ from forward_grid_mapper.files.map_archive import read_npz
 from forward_grid_mapper.files.panels import paths_of
 from forward_grid_mapper.files.reading_archive import read_readings
 from forward_grid_mapper.recordings.drive import Part
-from forward_grid_mapper.recordings.drives import Drives, read_drives
+from forward_grid_mapper.recordings.drives import Drives, read_drives, unreadable
 from forward_grid_mapper.simulation import drive as drives_of_robots
 from forward_grid_mapper.simulation.drive import door_drive
 from forward_grid_mapper.simulation.sonar import NOISY, front_array
@@ -346,6 +347,16 @@ def test_every_drive_that_cannot_be_mapped_is_named(
     said = refusal(capsys, tmp_path, days / 'day_0', absent, silent, '-o', tmp_path / 'maps')
     assert said.startswith('2 of 3 drives cannot be mapped; leave them out')
     assert f'{absent} does not exist' in said and f'{silent}: The bag has no sensor_msgs/Range' in said
+
+
+def test_lines_of_one_drive_are_told_from_other_drives() -> None:
+    errors = [(Path('a'), InputError('choose one:\n  /odom\n  /odom_2')), (Path('b'), InputError('b is empty'))]
+    assert str(unreadable(errors, 3)).splitlines()[1:] == [
+        '  a: choose one:',
+        '      /odom',
+        '      /odom_2',
+        '  b is empty',
+    ]
 
 
 def test_a_pattern_that_fits_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -90,6 +90,14 @@ def test_forms_of_a_file(tmp_path: Path, text: str) -> None:
     )
 
 
+@pytest.mark.parametrize(('pose', 'told'), [('[0, 0.5, 1]', 1), ('[0, 1, 1]', 0), ('[0.0, 0.5, 1e-1]', 0)])
+def test_lists_that_ros_refuses_are_warned_of(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, pose: str, told: int
+) -> None:
+    assert load(tmp_path, f'sensors.a.pose: {pose}').extrinsics['a'].x == 0.0
+    assert ['each number of [0, 0.5, 1] with a point' in message for message in caplog.messages] == [True] * told
+
+
 def test_parameters_of_another_node_are_warned_of(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     assert load(tmp_path, 'slam_toolbox: {ros__parameters: {resolution: 0.05}}').values == {'resolution': 0.05}
     assert caplog.messages == [
