@@ -5,7 +5,7 @@ from __future__ import annotations
 import queue
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from typing import Any
 
@@ -82,6 +82,8 @@ class EmService:
     sensors : SensorWatch
     online : OnlineWorker or None
         Gives the map to start from, and takes what was found.
+    range_topics : sequence of str
+        Full names, for what is said where nothing has come.
     extrinsics : callable
         Returns the poses of the sensors that are fixed to the robot, by frame.
     mounts : callable
@@ -105,6 +107,7 @@ class EmService:
         self.wrong_input: list[str] = []
         self.sensors = SensorWatch()
         self.online: OnlineWorker | None = None
+        self.range_topics: Sequence[str] = ()
         self.extrinsics: Callable[[], Mapping[str, Pose2]] = dict
         self.mounts: Callable[[], Mapping[str, Pose2]] = dict
         self._parameters, self._associator, self._publishers = parameters, associator, publishers
@@ -307,8 +310,8 @@ class EmService:
     def _nothing(self) -> str:
         """Return why there is no reading to map."""
         received, rejected = self._associator.received, self._associator.rejected
-        topics = ', '.join(self._parameters().node.range_topics)
         if not received:
+            topics = ', '.join(self.range_topics)
             return f'there is nothing to map: no Range message has come on {topics} since the start or reset'
         if not rejected:
             return f'there is nothing to map: {received} readings have come, and wait for their poses'

@@ -100,11 +100,12 @@ class MapperNode(ManagedNode):
         self._begin_anew()
         node, log = self.parameters.node, self.get_logger()
         odometry = self._resolved('odom_topic', node.odom_topic)
+        ranges = [self._resolved('range_topics', topic) for topic in node.range_topics]
         if why := unwritable(node.save_directory):
             log.warning(f'save_maps will fail: {why}; set save_directory to a folder that can be written')
         if not node.range_topics:
             raise MapperError('range_topics is empty; give it the name of a topic of sensor_msgs/Range, or several')
-        if odometry in [self._resolved('range_topics', topic) for topic in node.range_topics]:
+        if odometry in ranges:
             raise MapperError(f'{odometry} cannot be a topic of Range and of odometry: set range_topics or odom_topic')
         transforms = Transforms.of(self)
         extrinsics = Extrinsics(self._given_extrinsics, transforms)
@@ -126,6 +127,7 @@ class MapperNode(ManagedNode):
         self.em = EmService(lambda: self.parameters, self.associator, trajectory, self.maps, inbox, kernels, log)
         trajectory.refine = lambda: self.mapping and self.em.run_by_itself()
         self._extrinsics = extrinsics
+        self.em.range_topics = ranges
         self.em.extrinsics, self.em.mounts = lambda: extrinsics.fixed, lambda: extrinsics.known
         self.online = self.em.online = self._online_worker(kernels) if node.online else None
         self.saver = Saver(self.em, self.live, self._account, log)
@@ -374,6 +376,7 @@ class MapperNode(ManagedNode):
         """Return what a report says of the node."""
         associator, node, name = self.associator, self.parameters.node, self.get_fully_qualified_name()
         self._feed()
+        rejections = rejection_warnings(associator.rejected, associator.received)
         source = {
             'node': name,
             'range_topics': [self.resolve_topic_name(topic) for topic in node.range_topics],
@@ -389,11 +392,7 @@ class MapperNode(ManagedNode):
                 'rejected': dict(associator.rejected),
                 'lost': self.intake.lost,
             },
-            'warnings': [
-                *associator.limits.warnings(),
-                *self.intake.loss_note(),
-                *rejection_warnings(associator.rejected, associator.received),
-            ],
+            'warnings': [*associator.limits.warnings(), *self.intake.loss_note(), *rejections],
         }
         path, odometry = list(associator.path), associator.odometry
         return Account(source, len(associator.buffer), path, odometry, node.save_directory, f'Maps of {name}')

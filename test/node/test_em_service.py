@@ -388,7 +388,7 @@ def test_closing_cancels_the_run(held: EmRobot) -> None:
 @pytest.mark.parametrize(
     ('received', 'rejected', 'said'),
     [
-        (0, {}, 'no Range message has come on sonar since'),
+        (0, {}, 'no Range message has come on /sonar, /left since'),
         (7, {}, '7 readings have come, and wait for their poses'),
         (9, {'nan_range': 2, 'below_min_range': 7}, '7 of 9 readings were rejected as below_min_range: the range is'),
     ],
@@ -396,7 +396,8 @@ def test_closing_cancels_the_run(held: EmRobot) -> None:
 def test_why_there_is_nothing_to_map(
     make: Callable[..., EmRobot], received: int, rejected: dict[str, int], said: str
 ) -> None:
-    robot = make(count=0, range_topics=('sonar',))
+    robot = make(count=0)
+    robot.em.range_topics = ['/sonar', '/left']
     robot.error = InputError('there is no reading to map')
     robot.associator.received = received
     robot.associator.rejected.update(rejected)

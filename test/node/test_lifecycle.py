@@ -99,7 +99,7 @@ def test_a_manager_starts_pauses_and_ends_it(start: Any, robot: Robot, manager: 
     robot.until(lambda: robot.diagnostics.get('readings', {}).get('message') == 'inactive: nothing is received')
     assert robot.range_out.get_subscription_count() == 0
     node.wait_for('kernels of the EM are ready')
-    assert 'no reading' in robot.call('run_em').message
+    assert 'no Range message has come on /sonar' in robot.call('run_em').message
     assert manager.change(Transition.TRANSITION_ACTIVATE)
     robot.meet()
     robot.play(circle(0, 300))

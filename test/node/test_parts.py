@@ -320,6 +320,16 @@ def test_the_share_of_rejected_readings_shows_with_its_reason(inside: Callable[.
     assert robot.status('readings')['level'] == OK
 
 
+def test_the_report_warns_where_many_readings_were_rejected(inside: Callable[..., Inside]) -> None:
+    robot = inside().start()
+    robot.drive(0, 20)
+    for k in range(10):
+        robot.range(100.5, value=0.01 + 0.001 * k)
+    saved = robot.call(robot.node.saver.save_maps)[1]
+    warnings = json.loads((Path(saved.split(', ')[0]).parent / 'report.json').read_text())['warnings']
+    assert any(each.startswith('10 of 30 readings were rejected as below_min_range') for each in warnings)
+
+
 class Gate:
     """Holds up a function until it is opened."""
 
