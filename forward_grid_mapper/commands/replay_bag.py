@@ -30,8 +30,9 @@ def parser() -> argparse.ArgumentParser:
     made = BagParser(
         COMMAND,
         description="Replay a recorded drive to the mapper: publishes a bag's Range, Odometry and static transforms, "
-        'with their own stamps and in their order, once somebody listens to all of them.',
-        epilog='example: replay_bag MY_BAG --rate 2 --clock; what follows --ros-args goes to ROS',
+        'with their own stamps and in their order, once somebody listens to all of them. What follows --ros-args goes '
+        'to ROS.',
+        epilog='example: replay_bag MY_BAG --rate 2 --clock',
     )
     made.add_bag('ROS 2 bag folder, single .mcap or .db3 file, or ROS 1 .bag')
     made.add_argument('--rate', type=_positive, default=1.0, metavar='R', help='times as fast as recorded (default 1)')

@@ -7,6 +7,7 @@ import importlib
 import math
 from collections.abc import Callable
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 from drive_samples import code_of, mapped, tape, write_tape
@@ -219,3 +220,11 @@ def test_every_command_tells_its_version(name: str, capsys: pytest.CaptureFixtur
     main = importlib.import_module(f'forward_grid_mapper.{COMMANDS[name][0]}').main
     assert code_of(main, '--version') == 0
     assert capsys.readouterr().out == f'{name} of forward_grid_mapper {__version__}\n'
+
+
+@pytest.mark.parametrize('command', [process_bag, learn, demo, experiment])
+def test_an_output_without_a_name_is_refused(command: ModuleType, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ['door'] if command is experiment else [] if command is demo else ['MY_BAG']
+    with pytest.raises(SystemExit):
+        command.parser().parse_args([*words, '-o', ''])
+    assert '-o/--output: the name is empty' in capsys.readouterr().err

@@ -228,6 +228,7 @@ def test_bad_sensors(text: str) -> None:
     ('text', 'message'),
     [
         ('left=0.1,0.2,90', 'is it left=0.1,0.2,90deg'),
+        ('left=0.1,0.2,-90', 'is it left=0.1,0.2,-90deg'),
         ('left=0.1,0.2,1e4', 'more than a full turn'),
         ('left=15,12,90deg', 'x and y are in metres'),
     ],
