@@ -146,7 +146,8 @@ def demo(options: argparse.Namespace) -> int:
         with output_errors(folder):
             (folder / 'scores.txt').write_text(table + '\n', encoding='utf-8')
     print(f'EM {"offline" if options.offline else "in the node"}: {summary}\n\n{table}\n')
-    print('F1, precision and recall are of walls; false dots are occupied cells in free space: docs/quality.md\n')
+    print('F1, precision and recall are of walls; false dots are occupied cells in free space: docs/quality.md')
+    print('a door is as wide as its free cells: its frame may take a cell on each side\n')
     print(f'the picture is {output / "demo.png"}; the maps as for Nav2 and their report are in {output / "maps"}')
     if options.show:
         show(output / 'demo.png')
