@@ -43,7 +43,9 @@ def parser() -> argparse.ArgumentParser:
         'and a building of ours',
     )
     made.add_argument('-o', '--output', type=not_empty, metavar='DIR', help='new folder (default: experiment_WHICH)')
-    made.add_argument('--seeds', type=int, default=5, metavar='N', help='noises to average over (default 5)')
+    made.add_argument(
+        '--seeds', type=int, default=5, metavar='N', help='seeds of the noise to average over (default 5)'
+    )
     add_show_option(made, 'the figure')
     add_mapping_options(made)
     return made

@@ -131,7 +131,7 @@ def door(options: argparse.Namespace, parameters: Parameters, ticker: Ticker) ->
     """Return table and figure of the experiment with a door that is seen n times."""
     lines = [
         'A 0.6 m door seen by n sweeps; F1 with one cell of tolerance, the open width of the door in metres',
-        f'(smallest - largest over {options.seeds} noises), and how many readings the map attributes to chance.',
+        f'(smallest - largest over {options.seeds} seeds), and how many readings the map attributes to chance.',
         f'The standard map has the best gains of {len(GAINS)}.',
         '',
         f'{"":18s}{"forward map":>16s}{"chance":>8s}{"as in the paper":>18s}{"chance":>8s}{"standard, best F1":>20s}'
@@ -181,7 +181,7 @@ def passer_by(options: argparse.Namespace, parameters: Parameters, ticker: Ticke
     }
     lines = [
         f'A corridor with {count} narrow open doors, two on either side, and a person who walks by;',
-        f'smallest numbers of open doors and widths in metres of {options.seeds} noises. Chance is how many',
+        f'smallest numbers of open doors and widths in metres of {options.seeds} seeds. Chance is how many',
         'readings are attributed to it.',
         '',
         f'{"":26s}{"F1":>7s}{"doors open":>12s}  {"widths":18s}{"false dots":>12s}{"chance":>10s}',
@@ -227,7 +227,7 @@ def corridor(options: argparse.Namespace, parameters: Parameters, ticker: Ticker
     }
     both = [o for o in tried if fewest_doors(o) == 6 and wall(o) >= 0.5]
     lines = [
-        f'A corridor of 62 m with six doors and 18 m of smooth wall, 12 000 readings, {options.seeds} noises '
+        f'A corridor of 62 m with six doors and 18 m of smooth wall, 12 000 readings, {options.seeds} seeds '
         f'(standard map: 2).',
         '',
         f'{"":26s}{"F1":>7s}{"doors open":>12s}{"smooth wall":>13s}{"false dots":>12s}{"coverage":>10s}{"gap":>5s}',

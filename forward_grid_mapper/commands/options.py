@@ -115,7 +115,7 @@ def add_topic_options(
         nargs='+',
         action='extend',
         metavar='TOPIC',
-        help='Range topics, parted by spaces or commas; may be repeated (default: all in the bag)',
+        help='Range topics, separated by spaces or commas; may be repeated (default: all in the bag)',
     )
     parser.add_argument('--odom-topic', metavar='TOPIC', help=odometry)
 

@@ -288,14 +288,14 @@ def _quality_warnings(rounds: list[Round], accepted: int, converged: bool) -> li
             f'{len(last.lost)} stretches that the first map shows are gone, the longest from ({x0:.1f}, {y0:.1f}) to '
             f'({x1:.1f}, {y1:.1f}); {echoes} of their echoes count as random measurements now, and of all echoes '
             f'{last.unexplained} instead of {start.unexplained}; {basin}; '
-            + ('they are handed out all the same' if accepted == len(rounds) - 1 else f'its values are refused, {kept}')
+            + ('they are written all the same' if accepted == len(rounds) - 1 else f'its values are refused, {kept}')
         )
     for number, this in enumerate(rounds):
         drop = this.log_likelihood_before - this.log_likelihood
         if drop > LIKELIHOOD_DROP * this.readings:
             warnings.append(
                 f'round {number}: the search ended in a map that is {drop:.0f} nats less likely than the one before, '
-                f'at the same values; it went into another basin'
+                f'at the same values; it ended in another local maximum'
             )
     if accepted and not converged and accepted == len(rounds) - 1:
         warnings.append(f'the values had not come to rest after {accepted} rounds; try more with --rounds')

@@ -52,7 +52,10 @@ def expanded(path: Path | str) -> Path:
 
 def unwritable(folder: Path | str) -> str:
     """Return why nothing can be written in a folder, which need not exist yet; empty if it seems possible."""
-    path = expanded(folder).absolute()
+    try:
+        path = expanded(folder).absolute()
+    except OutputError as error:
+        return str(error)
     there = next(parent for parent in (path, *path.parents) if parent.exists())
     if not there.is_dir():
         return f'{readable(there)} is no folder'

@@ -64,7 +64,7 @@ class Panel(NamedTuple):
 class Picture(NamedTuple):
     """What is drawn. `view` is the box shown; points are in metres; `overlay` is the panel that bears them.
 
-    `path_xy` is parted by rows of NaN where there are several drives, whose names are `drives`. `odometry_xy` is the
+    `path_xy` is separated by rows of NaN where there are several drives, whose names are `drives`. `odometry_xy` is the
     path that odometry gives, where it is another one than `path_xy`.
     """
 

@@ -66,7 +66,7 @@ def poses_from_tum(path: Path | str) -> Poses:
 
 
 def poses_from_csv(path: Path | str) -> Poses:
-    """Read poses from a CSV file whose first line names its columns, parted by commas or semicolons.
+    """Read poses from a CSV file whose first line names its columns, separated by commas or semicolons.
 
     Wanted are a stamp in seconds (`stamp`, or `stamp_ns` in nanoseconds), `x`, `y`, and `yaw` in radians (`yaw_deg` in
     degrees) or `qx`, `qy`, `qz`, `qw`; `NAMES` has what else they may be called. Other columns are left alone.
@@ -149,5 +149,5 @@ def _yaw(path: Path | str, number: int, quaternion: Sequence[float]) -> float:
     x, y, z, w = quaternion
     yaw = yaw_of(x, y, z, w)
     if yaw is None:
-        raise InputError(f'{path}, line {number}: the quaternion is not normalised, or the robot stands on end')
+        raise InputError(f'{path}, line {number}: the quaternion is not normalised, or the robot is tilted too far')
     return yaw

@@ -63,7 +63,7 @@ def test_they_are_handed_out_on_request() -> None:
     learned = learn_jointly(corridor(1).readings, Parameters().varied(PLAIN), 2, keep_going=True)
     assert learned.accepted == 2
     assert learned.parameters.model == learned.rounds[2].model
-    assert 'handed out all the same' in walls_of(learned)[0]
+    assert 'written all the same' in walls_of(learned)[0]
     assert smooth_recall(learned.maps, corridor(1)) < 0.5
 
 
@@ -100,13 +100,13 @@ def test_a_search_that_ends_in_another_basin_is_called_so(monkeypatch: pytest.Mo
 
     readings = corridor(0).readings
     fair = learn_jointly(readings, Parameters(), 1, keep_going=True)
-    assert not any('another basin' in warning for warning in fair.warnings)
+    assert not any('another local maximum' in warning for warning in fair.warnings)
     monkeypatch.setattr(joint_learning, 'Mapper', SecondEndsPoorly)
     learned = learn_jointly(readings, Parameters(), 1, keep_going=True)
     last = learned.rounds[1]
     drop = last.log_likelihood_before - last.log_likelihood
     assert drop > LIKELIHOOD_DROP * len(readings)
-    (warning,) = (warning for warning in learned.warnings if 'another basin' in warning)
+    (warning,) = (warning for warning in learned.warnings if 'another local maximum' in warning)
     assert 'round 1' in warning and f'{drop:.0f} nats' in warning
     # of both maps the likelihood is that of the forward model with the values and the normals of the new one
     forward = learned.maps.forward_model()

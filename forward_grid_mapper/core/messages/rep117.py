@@ -50,7 +50,7 @@ MANY = 0.2
 
 
 ODOMETRY_REASONS = {
-    'bad_pose': 'the pose is not finite, absurdly far away or on end, or its quaternion is not normalised',
+    'bad_pose': 'the pose is not finite, absurdly far away or tilted too far, or its quaternion is not normalised',
     'long_frame_id': 'the frame_id or child_frame_id has more than 255 characters',
     'unprintable_frame_id': 'the frame_id or child_frame_id has characters that cannot be printed',
     'other_frame': 'the frame_id or child_frame_id is not that of the first odometry message; reset takes the new',
