@@ -56,7 +56,8 @@ def unwritable(folder: Path | str) -> str:
         path = expanded(folder).absolute()
     except OutputError as error:
         return str(error)
-    there = next(parent for parent in (path, *path.parents) if parent.exists())
+    # parents of a folder that may not be looked into are no error
+    there = next(parent for parent in (path, *path.parents) if os.access(parent, os.F_OK))
     if not there.is_dir():
         return f'{readable(there)} is no folder'
     return '' if os.access(there, os.W_OK | os.X_OK) else f'{readable(there)} may not be written to'

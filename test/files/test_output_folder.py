@@ -116,7 +116,10 @@ def test_a_folder_that_cannot_be_written_is_known_before(tmp_path: Path, monkeyp
     assert unwritable(tmp_path) == unwritable(tmp_path / 'new' / 'newer') == ''
     assert 'no such user' in unwritable('~nobody_of_this_name/maps')
     assert unwritable(tmp_path / 'file' / 'new') == f'{tmp_path / "file"} is no folder'
-    monkeypatch.setattr(os, 'access', lambda path, mode: path != tmp_path)
+    there = os.access
+    monkeypatch.setattr(
+        os, 'access', lambda path, mode: there(path, mode) and (path, mode) != (tmp_path, os.W_OK | os.X_OK)
+    )
     assert unwritable(tmp_path / 'new') == f'{tmp_path} may not be written to'
 
 
