@@ -63,7 +63,8 @@ class Sonar:
             raise InputError(f'yaw = {self.yaw:g} rad is more than a turn; did you mean radians({self.yaw:g})?')
         if math.hypot(self.x, self.y) > FARTHEST:
             raise InputError(
-                f'x = {self.x:g} m and y = {self.y:g} m are more than {FARTHEST:g} m from the middle of the robot'
+                f'x = {self.x:g} m and y = {self.y:g} m are more than {FARTHEST:g} m from the middle of the robot; '
+                'both are in metres'
             )
         if abs(self.pitch) > math.pi / 2:
             raise InputError(

@@ -154,6 +154,8 @@ def test_units_are_checked() -> None:
         Sonar(0.0, 0.0, 0.0, 30.0, 3.0)
     with pytest.raises(InputError, match=re.escape('did you mean radians(90)?')):
         Sonar(0.0, 0.0, 90.0, 0.5, 3.0)
+    with pytest.raises(InputError, match='from the middle of the robot; both are in metres'):
+        Sonar(15.0, 12.0, 0.0, 0.5, 3.0)
     with pytest.raises(InputError, match='a number is wanted'):
         Sonar('a', 0.0, 0.0, 0.5, 3.0)
     with pytest.raises(InputError, match='leave no range'):

@@ -82,7 +82,7 @@ def through_node(folder: Path, bag: Path, recording: Recording, options: argpars
         node.call('reset')
         ticker.say(f'replaying the bag to the node, {options.rate:g} times as fast as it was recorded')
         node.run('replay_bag', str(bag), '--rate', str(options.rate), '--quiet')
-        ticker.say('running EM; the first time on a machine its code is compiled before, for about a minute')
+        ticker.say('running EM; at the first start its code is compiled first, which takes about a minute')
         answer = node.call('run_em')
         ticker.say('saving the maps')
         node.call('save_maps')

@@ -56,7 +56,7 @@ def unwritable(folder: Path | str) -> str:
         path = expanded(folder).absolute()
     except OutputError as error:
         return str(error)
-    # parents of a folder that may not be looked into are no error
+    # Path.exists raises where a parent may not be searched
     there = next(parent for parent in (path, *path.parents) if os.access(parent, os.F_OK))
     if not there.is_dir():
         return f'{readable(there)} is no folder'

@@ -177,9 +177,8 @@ class MapperNode(ManagedNode):
         """Take messages from here on; they are mapped as soon as it can be."""
         self.intake.subscribe()
         node = self.parameters.node
-        topics = ', '.join(self.resolve_topic_name(topic) for topic in node.range_topics)
         self.get_logger().info(
-            f'listening: Range from {topics} ({node.range_reliability}), odometry from '
+            f'listening: Range from {", ".join(self.em.range_topics)} ({node.range_reliability}), odometry from '
             f'{self.resolve_topic_name(node.odom_topic)}, sensor poses from {self._poses_from}'
         )
 
@@ -379,7 +378,7 @@ class MapperNode(ManagedNode):
         rejections = rejection_warnings(associator.rejected, associator.received)
         source = {
             'node': name,
-            'range_topics': [self.resolve_topic_name(topic) for topic in node.range_topics],
+            'range_topics': list(self.em.range_topics),
             'odom_topic': self.resolve_topic_name(node.odom_topic),
             'odom_frame': associator.map_frame,
             'map_frame': self.trajectory.frame,

@@ -14,7 +14,7 @@ from drive_samples import code_of, mapped, tape, write_tape
 
 from forward_grid_mapper import __version__
 from forward_grid_mapper.__main__ import COMMANDS
-from forward_grid_mapper.commands import demo, experiment, learn, process_bag, replay_bag
+from forward_grid_mapper.commands import demo, experiment, learn, process_bag, replay_bag, simulate
 from forward_grid_mapper.commands.options import chosen_parameters, chosen_part
 from forward_grid_mapper.core.common.errors import ParameterError
 from forward_grid_mapper.core.common.parameters import TABLE
@@ -222,9 +222,9 @@ def test_every_command_tells_its_version(name: str, capsys: pytest.CaptureFixtur
     assert capsys.readouterr().out == f'{name} of forward_grid_mapper {__version__}\n'
 
 
-@pytest.mark.parametrize('command', [process_bag, learn, demo, experiment])
+@pytest.mark.parametrize('command', [process_bag, learn, demo, experiment, simulate])
 def test_an_output_without_a_name_is_refused(command: ModuleType, capsys: pytest.CaptureFixture[str]) -> None:
-    words = ['door'] if command is experiment else [] if command is demo else ['MY_BAG']
+    words = {experiment: ['door'], simulate: ['door'], demo: []}.get(command, ['MY_BAG'])
     with pytest.raises(SystemExit):
         command.parser().parse_args([*words, '-o', ''])
     assert '-o/--output: the name is empty' in capsys.readouterr().err
