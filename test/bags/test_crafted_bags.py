@@ -221,6 +221,7 @@ def test_40_kb_of_blank_lines_in_a_definition(tmp_path: Path) -> None:
 # ---- metadata
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('filling', ['\n', ' \n', 'relative_file_paths:\n', '  - x\n', '-\n'])
 def test_40_kb_of_nothing_in_the_metadata(tmp_path: Path, filling: str) -> None:
     bag = write_sample(tmp_path, 'mcap')

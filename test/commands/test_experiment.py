@@ -96,6 +96,7 @@ def test_the_obstacle_beside_the_cone_changes_nothing(monkeypatch: pytest.Monkey
     assert (moved.y != without.y).any()
 
 
+@pytest.mark.slow
 def test_parameters_count(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     tables = []
     for name, options in (('a', ()), ('b', ('--set', 'p_hit=0.3', '--set', 'sigma=0.3'))):
@@ -150,6 +151,7 @@ def test_demo(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Ca
     assert (tmp_path / 'demo_output_2' / 'maps' / 'maps.png').is_file()
 
 
+@pytest.mark.slow
 def test_demo_through_the_node(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip('rclpy', reason='the demo replays to the node over DDS')
     assert code_of(demo.main, '--seen', 1, '--rate', 20, '-o', tmp_path / 'out') == 0

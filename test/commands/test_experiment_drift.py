@@ -51,6 +51,7 @@ def test_alignment_takes_a_rigid_motion_back() -> None:
     assert back[:, :2] == pytest.approx(true[:, :2])
 
 
+@pytest.mark.slow
 def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     tour = building_tour()[:10]
     short = {'building': lambda seed: drive(building_world(), tour, 0.15, sonar_ring(16), NOISY, seed)}

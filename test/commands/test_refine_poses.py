@@ -29,8 +29,6 @@ from forward_grid_mapper.simulation.drive import Recording, drive
 from forward_grid_mapper.simulation.sonar import NOISY, sonar_ring
 from forward_grid_mapper.simulation.world import building_tour, building_world
 
-pytestmark = pytest.mark.drives
-
 REFINED = FILES | {'trajectory.tum', 'odometry.tum', 'odometry_calibration.yaml'}
 
 
@@ -147,6 +145,7 @@ def days(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     return {'bags': bags, 'true': [true for _, true in drives], 'maps': folder / 'maps'}
 
 
+@pytest.mark.slow
 def test_each_of_several_drives_is_judged_for_itself(days: dict[str, Any]) -> None:
     report = report_in(days['maps'])
     told = [drive['trajectory'] for drive in report['drives']]
@@ -189,6 +188,7 @@ def test_drives_that_all_stay_make_the_same_maps(days: dict[str, Any], tmp_path:
 # ---- journals
 
 
+@pytest.mark.slow
 def test_a_journal_is_refined_as_the_bag_is(tmp_path: Path, kept: Kept) -> None:
     sensors = [f'--sensor={frame}={x},{y},{yaw}' for frame, (x, y, yaw) in kept.bent.extrinsics]
     of_journal = mapped(kept.journal, tmp_path / 'journal', '--refine-poses', '-q', *sensors)

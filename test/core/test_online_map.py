@@ -347,6 +347,7 @@ def kept_of(online: OnlineMap) -> Kept:
     return Kept([*arrays, online._traversed[window].copy()], dict(online._kept), (online.taken, online._count))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('case', ['first', 'more', 'grown', 'refined', 'many'])
 def test_a_call_that_finds_no_memory_takes_nothing_or_all(monkeypatch: pytest.MonkeyPatch, case: str) -> None:
     monkeypatch.setattr(online_map, 'REFINE_LEAST', 60)

@@ -506,6 +506,7 @@ def killed_again_and_again(folder: Path, times: int, seed: int) -> float:
     return worst
 
 
+@pytest.mark.slow
 def test_kill_at_any_moment_loses_less_than_a_second(tmp_path: Path) -> None:
     writers = 2
     with ThreadPoolExecutor(writers) as pool:

@@ -50,6 +50,7 @@ def memory(process: NodeProcess, key: str) -> int:
     return int(next(line for line in text.splitlines() if line.startswith(key)).split()[1]) * 1024
 
 
+@pytest.mark.slow
 def test_callers_that_die_or_come_all_at_once(start: Any, robot: Robot, domain: int, tmp_path: Path) -> None:
     folder = journal_of(tmp_path / 'journal', corridor_drive(0).readings)
     start(*OPTIONS, '-p', f'journal:={folder}', '-p', 'resolution:=0.04')
@@ -72,6 +73,7 @@ def test_callers_that_die_or_come_all_at_once(start: Any, robot: Robot, domain: 
     assert robot.call('run_em').success
 
 
+@pytest.mark.slow
 def test_memory_that_runs_out_fails_the_call_and_nothing_else(start: Any, robot: Robot, tmp_path: Path) -> None:
     readings = corridor_drive(0).readings.select(slice(None, 4000))
     folder = journal_of(tmp_path / 'journal', readings)
@@ -108,6 +110,7 @@ def test_a_node_that_is_stopped_for_a_while_catches_up(start: Any, robot: Robot)
     assert robot.call('run_em').success
 
 
+@pytest.mark.slow
 def test_a_subscriber_that_never_reads_stops_nobody(start: Any, robot: Robot, domain: int) -> None:
     start(*OPTIONS)
     robot.meet()
@@ -128,6 +131,7 @@ def test_a_subscriber_that_never_reads_stops_nobody(start: Any, robot: Robot, do
         assert line_of(listener) == 'a map\n'
 
 
+@pytest.mark.slow
 def test_publishers_that_go_and_come_back(start: Any, domain: int) -> None:
     start(*OPTIONS)
     watcher = Robot(domain)

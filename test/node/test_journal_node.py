@@ -44,6 +44,7 @@ def until_accepted(robot: Robot, count: int) -> None:
     robot.until(lambda: robot.diagnostics['journal']['readings to be written'] == '0')
 
 
+@pytest.mark.slow
 def test_a_node_that_is_killed_goes_on_where_it_was(
     start: Any, domain: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -22,6 +22,7 @@ FEWER = 200
 """Of the services that are made as one of those with many."""
 
 
+@pytest.mark.slow
 def test_two_thousand_calls_at_once_are_all_answered(start: Any, robot: Robot) -> None:
     start(*OPTIONS)
     robot.meet()
@@ -46,6 +47,7 @@ def test_two_thousand_calls_at_once_are_all_answered(start: Any, robot: Robot) -
     assert robot.call('run_em').success
 
 
+@pytest.mark.slow
 def test_what_the_middleware_drops_is_counted_and_warned_of(start: Any, robot: Robot) -> None:
     """The middleware keeps 2000 messages for a node that is stopped."""
     node = start(*OPTIONS)
@@ -70,6 +72,7 @@ def test_what_the_middleware_drops_is_counted_and_warned_of(start: Any, robot: R
     node.wait_for('were lost before this node could take them', 20.0)
 
 
+@pytest.mark.slow
 def test_a_first_start_loses_nothing_and_shows_the_live_map_first(start: Any, robot: Robot, tmp_path: Path) -> None:
     node = start(*OPTIONS, ready=False, NUMBA_CACHE_DIR=str(tmp_path / 'cache'))
     robot.meet()

@@ -127,6 +127,7 @@ def replay(start: Any, robot: Robot, path: Path, tmp_path: Path, odom_topic: str
     compare(robot, path, tmp_path / 'offline', *(['--odom-topic', odom_topic] if odom_topic else []))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('name', ['office_a', 'office_b'])
 def test_node_and_offline_agree_on_real_recordings(
     start: Any, robot: Robot, shared: Path, tmp_path: Path, name: str

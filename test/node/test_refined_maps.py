@@ -36,6 +36,7 @@ def folder_of(answer: Any) -> Path:
     return Path(answer.message.split(', ')[0]).parent
 
 
+@pytest.mark.slow
 def test_the_maps_of_a_bent_drive_are_those_of_the_offline_tool(
     start: Callable[..., Any], robot: Any, tmp_path: Path
 ) -> None:

@@ -13,6 +13,7 @@ from robot import Robot
 from sensor_msgs.msg import Range
 
 
+@pytest.mark.slow
 def test_a_publisher_that_does_not_fit_and_a_namesake(start: Any, robot: Robot) -> None:
     options = ('-p', 'range_reliability:=reliable', '-p', 'odom_reliability:=reliable')
     node = start(*options)

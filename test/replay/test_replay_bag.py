@@ -51,6 +51,7 @@ def test_a_best_effort_listener_hears_everything(dds: Wire, tmp_path: Path) -> N
     assert {message.header.frame_id for message in listener.on('/sonar_1')} == {'sonar_1'}
 
 
+@pytest.mark.slow
 def test_a_real_drive_arrives_whole(dds: Wire, shared: Path) -> None:
     bag = shared / 'data' / 'office_a' / 'bag'
     options = ('--odom-topic', '/odom', '--rate', 60)
@@ -89,6 +90,7 @@ def test_the_clock_follows_the_bag_and_ticks_between_messages(dds: Wire, tmp_pat
     assert max(b - a for a, b in pairwise(times)) < 0.95 * NANOSECONDS
 
 
+@pytest.mark.slow
 def test_it_plays_as_often_as_asked(dds: Wire, tmp_path: Path) -> None:
     bag = write_bag(tmp_path, count=10)
     listener = dds.listen({**SENSORS, '/clock': CLOCK})
@@ -122,6 +124,7 @@ def test_without_listeners_it_names_the_topics(dds: Wire, tmp_path: Path) -> Non
     assert '--remap' in err
 
 
+@pytest.mark.slow
 def test_with_listeners_that_do_not_fit_it_says_why(dds: Wire, tmp_path: Path) -> None:
     listener = dds.listen({'/robot/odom': ODOMETRY, '/sonar': RANGE})
     replay = dds.replay(write_bag(tmp_path), '--wait', 8, '--best-effort')

@@ -61,6 +61,7 @@ def steps(readings: Readings) -> dict[str, tuple[list[Step], Step]]:
     return {'first': ([], first), 'more': ([first], more), 'grow': ([first, more], grow)}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('memory', [np.inf, 3000.0])
 @pytest.mark.parametrize('name', ['first', 'more', 'grow'])
 @pytest.mark.parametrize('renewable', [True, False])

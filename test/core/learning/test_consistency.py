@@ -172,12 +172,14 @@ def drives() -> Iterator[tuple[str, Callable[[], Recording]]]:
 DRIVES = dict(drives())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('name', sorted(DRIVES))
 def test_no_alarm_in_the_simulated_worlds(name: str) -> None:
     recording = DRIVES[name]()
     assert consistency_warnings(recording.readings, dict(recording.extrinsics)) == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('odometry', ['/odom', '/odom_corrected'])
 @pytest.mark.parametrize('name', ['office_a', 'office_b', 'building_a', 'building_b', 'building_c'])
 def test_no_alarm_on_the_recordings(shared: Path, name: str, odometry: str) -> None:
@@ -216,6 +218,7 @@ def test_a_robot_that_stands_is_no_fault() -> None:
     assert told(Messages(office().extrinsics, odometry, ranges)) == []
 
 
+@pytest.mark.slow
 def test_the_cost_depends_on_neither_length_nor_range() -> None:
     """Each bound is a multiple of what it takes, in processor time."""
     recording = building_drive(0, 1, NOISY, True, front_array())

@@ -178,6 +178,7 @@ def test_wrong_input_is_warned_of(name: str) -> None:
     assert len(warnings) == 1, f'one cause, one warning: {warnings}'
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('noise', [NOISY, NOISE_FREE])
 @pytest.mark.parametrize('sonars', [front_array, sonar_ring])
 def test_no_alarm_in_the_simulated_worlds(noise: object, sonars: Callable[[], SonarArray]) -> None:

@@ -33,7 +33,7 @@ PAPER = {'live_directions': 1, 'live_echo_width': 1000.0}
 @pytest.mark.parametrize('directions', [1, 2, 3, 4, 7])
 @pytest.mark.parametrize('width', [0.1, 1000.0])
 def test_log_odds_are_those_of_the_twin(arc: tuple[float, float], directions: int, width: float) -> None:
-    readings = random_readings(np.random.default_rng(directions), AREA, 80)
+    readings = random_readings(np.random.default_rng(directions), AREA, 40)
     parameters = Parameters().varied({'live_directions': directions, 'live_echo_width': width})
     live = LogOddsMap(parameters, arc)
     live.add(readings)

@@ -16,6 +16,7 @@ from forward_grid_mapper.simulation.drive import corridor_drive, door_drive
 from forward_grid_mapper.simulation.sonar import NOISY
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('threads', [1, 2, 16])
 @pytest.mark.parametrize('resolution', [0.1, 0.02])
 def test_what_a_run_takes_is_what_it_is_said_to_take(

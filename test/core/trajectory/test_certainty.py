@@ -17,8 +17,6 @@ from forward_grid_mapper.simulation.drive import Recording, drive
 from forward_grid_mapper.simulation.sonar import NOISY, front_array
 from forward_grid_mapper.simulation.world import building_tour, building_world
 
-pytestmark = pytest.mark.drives
-
 STOP = np.zeros(1, np.uint8)
 
 

@@ -24,8 +24,6 @@ from forward_grid_mapper.simulation.drive import drive
 from forward_grid_mapper.simulation.sonar import NOISY, sonar_ring
 from forward_grid_mapper.simulation.world import building_tour, building_world
 
-pytestmark = pytest.mark.drives
-
 KNOWN = 10.0
 """Metres of the drive whose trajectory is given."""
 
@@ -117,7 +115,7 @@ def test_what_was_found_as_a_whole_stays_and_nothing_is_left_out(sample: Sample,
     assert np.hypot(*np.diff(path[:, :2], axis=0).T).max() < 0.1, 'no jumps'
 
 
-@pytest.mark.parametrize('every', [1, 7, 150])
+@pytest.mark.parametrize('every', [pytest.param(1, marks=pytest.mark.slow), 7, 150])
 def test_portions_do_not_matter(sample: Sample, followed: Follower, every: int) -> None:
     stamps = sample.odometry.stamp[sample.known :: every]
     follower, changes = follower_of(sample), 0
@@ -251,6 +249,7 @@ def test_a_map_that_is_turned_is_followed_alike(sample: Sample, followed: Follow
     assert np.abs(back - followed.correction.trajectory.pose[:, :2]).max() < 0.1
 
 
+@pytest.mark.slow
 def test_places_are_recognised_in_what_was_mapped_before(sample: Sample, monkeypatch: pytest.MonkeyPatch) -> None:
     """The robot turns around and drives back, and nothing but places tells that the wheels are said to be too small."""
     there, path = replaced_by_truth(sample), sample.true

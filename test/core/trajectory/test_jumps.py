@@ -24,8 +24,6 @@ from forward_grid_mapper.simulation.drive import Recording, drive
 from forward_grid_mapper.simulation.sonar import NOISY, sonar_ring
 from forward_grid_mapper.simulation.world import building_tour, building_world
 
-pytestmark = pytest.mark.drives
-
 
 def moved(readings: Readings, before: Odometry, after: Odometry) -> Readings:
     """Readings of a drive as other odometry places them."""
@@ -152,6 +150,7 @@ def test_missing_messages_are_no_reason_to_move_exact_odometry(exact: Recording)
     assert found.readings is readings and found.trajectory is odometry
 
 
+@pytest.mark.slow
 def test_a_robot_that_was_carried_away_is_told_of(exact: Recording, bent: tuple[Readings, Odometry]) -> None:
     readings, odometry = bent
     other = drive(building_world(), building_tour()[12:20], 0.15, sonar_ring(16), NOISY, seed=5)
@@ -175,6 +174,7 @@ def test_a_robot_that_was_carried_away_is_told_of(exact: Recording, bent: tuple[
     assert np.hypot(*(after.pose[0] - before.pose[-1])[:2]) > 30.0
 
 
+@pytest.mark.slow
 def test_a_few_readings_after_a_jump_are_not_enough(bent: tuple[Readings, Odometry]) -> None:
     readings, odometry = begun_anew(*bent, 0.98)
     found = Refiner(Parameters()).run(readings, odometry)
@@ -189,6 +189,7 @@ def test_a_few_readings_after_a_jump_are_not_enough(bent: tuple[Readings, Odomet
     ), 'as odometry has it'
 
 
+@pytest.mark.slow
 def test_a_few_messages_before_a_jump_do_not_matter(exact: Recording, bent: tuple[Readings, Odometry]) -> None:
     readings, odometry = begun_anew(*bent, 0.01, (30.0, 0.0, 0.0))
     found = Refiner(Parameters()).run(readings, odometry)
@@ -197,6 +198,7 @@ def test_a_few_messages_before_a_jump_do_not_matter(exact: Recording, bent: tupl
     assert off(exact, found.trajectory.between(int(odometry.stamp[first]), int(odometry.stamp[-1]))) < 0.2
 
 
+@pytest.mark.slow
 def test_a_simulated_robot_may_turn_at_once(exact: Recording, bent: tuple[Readings, Odometry]) -> None:
     _, true = turning_at_once(exact.readings, odometry_of(exact), odometry_of(exact))
     readings, odometry = turning_at_once(*bent, odometry_of(exact))
@@ -207,6 +209,7 @@ def test_a_simulated_robot_may_turn_at_once(exact: Recording, bent: tuple[Readin
     assert rms_after_alignment(found.trajectory.pose, true.pose) < 0.2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('at_once', [False, True])
 def test_a_yaw_that_begins_anew_is_told_from_turns(
     exact: Recording, bent: tuple[Readings, Odometry], at_once: bool
@@ -251,6 +254,7 @@ def test_odometry_that_always_jumps_is_refused(bent: tuple[Readings, Odometry]) 
     assert left.readings is readings
 
 
+@pytest.mark.slow
 def test_odometry_may_begin_anew_again_and_again(exact: Recording, bent: tuple[Readings, Odometry]) -> None:
     readings, odometry = begun_anew(*begun_anew(*bent, 0.4), 0.7)
     assert len(jumps(odometry)) == 2
@@ -260,6 +264,7 @@ def test_odometry_may_begin_anew_again_and_again(exact: Recording, bent: tuple[R
     assert off(exact, found.trajectory) < 0.2
 
 
+@pytest.mark.slow
 def test_odometry_that_jumps_back_is_where_it_was(exact: Recording) -> None:
     readings, true = exact.readings, odometry_of(exact)
     first, second = (int(part * len(true.stamp)) for part in (0.4, 0.6))
@@ -271,6 +276,7 @@ def test_odometry_that_jumps_back_is_where_it_was(exact: Recording) -> None:
     assert off(exact, found.trajectory) < 0.1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('count', [1, 3])
 def test_poses_that_odometry_jumps_to_and_back_are_left_out(
     exact: Recording, bent: tuple[Readings, Odometry], count: int

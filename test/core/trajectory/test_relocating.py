@@ -32,8 +32,6 @@ from forward_grid_mapper.core.trajectory.solving import Solver
 from forward_grid_mapper.simulation.sonar import sonar_ring
 from forward_grid_mapper.simulation.world import building_tour
 
-pytestmark = pytest.mark.drives
-
 OFF = np.array([3.2, -1.4, math.radians(3.0)])
 """By how much the way back is off."""
 
@@ -74,6 +72,7 @@ def test_a_stretch_is_found_farther_off_than_single_blocks_are_looked_for(there_
     assert displaced(scans, true, stretch) is None
 
 
+@pytest.mark.slow
 def test_what_was_led_astray_is_put_where_it_belongs(there_and_back) -> None:
     true, first = there_and_back.windows.node, turning(there_and_back)
     solver = Solver(*there_and_back, quietly)
@@ -159,7 +158,7 @@ def test_a_doubt_lies_in_the_middle_of_where_certainty_falls() -> None:
     assert doubts(at, np.linspace(1.0, 1.0 - DOUBTFUL / 2, 20)) == ()
 
 
-@pytest.mark.parametrize('lost', [0, 1])
+@pytest.mark.parametrize('lost', [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_a_right_angle_that_was_lost_is_found_again(there_and_back, lost) -> None:
     odometry, windows, scans, heading = there_and_back
     node, true = turning(there_and_back) - 6, windows.node
@@ -176,6 +175,7 @@ def test_a_right_angle_that_was_lost_is_found_again(there_and_back, lost) -> Non
     assert (found.solver is solver) == (lost == 0)
 
 
+@pytest.mark.slow
 def test_without_a_revisit_a_doubt_stays(there_and_back) -> None:
     odometry, windows, scans, heading = there_and_back
     solvers: list[Solver] = []

@@ -26,8 +26,6 @@ from forward_grid_mapper.simulation.drive import drive
 from forward_grid_mapper.simulation.sonar import NOISY, sonar_ring
 from forward_grid_mapper.simulation.world import building_tour, building_world
 
-pytestmark = pytest.mark.drives
-
 MODEL = Parameters().model
 NOTHING = UNKNOWN * MODEL.p_hit
 APART = 0.6
@@ -74,6 +72,7 @@ def second(found: Searched) -> float:
 SIGMA, REACH = np.array([1.0, 1.0, math.radians(8.0)]), np.array([2.1, 2.1, math.radians(15.0)])
 
 
+@pytest.mark.slow
 def test_a_large_search_finds_what_asking_all_finds(places) -> None:
     for around, scan, true in places:
         guess = compose(true, np.array([0.7, -0.5, math.radians(6.0)]))
