@@ -278,7 +278,7 @@ def _foot(figure: Figure, picture: Picture) -> None:
     if len(picture.odometry_xy):
         handles.append(Line2D([], [], color=BEFORE, linewidth=1.3, linestyle=(0, (4, 2)), label='by odometry'))
     if count := len(picture.unexplained_xy):
-        label = f'unexplained reading ({count:,})'
+        label = f'random measurement ({count:,})'
         handles.append(Line2D([], [], linestyle='none', marker='o', markersize=4, color=DOT, mew=0, label=label))
     named = _named(picture)
     _row(figure, handles, 0.48 if named else 0.38)

@@ -195,7 +195,7 @@ def _result(data: dict[str, Any]) -> Iterator[str]:
         yield from _line('Objective', f'{objective:,.1f} nats{before}')
     if (unexplained := result.get('unexplained')) is not None:
         share = _share(unexplained, readings)
-        yield from _line('Unexplained', f'{unexplained:,} readings ({share}) are most likely random measurements')
+        yield from _line('Random', f'{unexplained:,} readings ({share}) are most likely random measurements')
     work = [f'{statistics[key]:,} {key}' for key in ('pairs', 'iterations', 'flips', 'shifts') if statistics.get(key)]
     if (converged := statistics.get('converged')) is not None:
         work.append('converged' if converged else 'NOT converged: max_iterations was reached')
