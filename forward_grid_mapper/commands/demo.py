@@ -119,7 +119,9 @@ def demo(options: argparse.Namespace) -> int:
     chosen_parameters(options)
     output = Path(options.output) if options.output else free_name(Path.cwd(), 'demo_output')
     if not options.offline and not ros_is_here():
-        raise MapperError('ROS 2 is not there: source its setup.bash, pip install .[ros], or use --offline')
+        raise MapperError(
+            'ROS 2 is not installed, or not sourced: source its setup.bash, pip install .[ros], or use --offline'
+        )
     if not 0.1 <= options.rate <= 100:
         raise ParameterError('--rate must lie between 0.1 and 100')
     fill_in(options, {'door': WORLD_OPTIONS['door'], 'corridor': {}})

@@ -71,7 +71,7 @@ def experiment(options: argparse.Namespace) -> int:
     print(table)
     print(f'\ntable and figure are in {output}')
     if options.show:
-        show(output / 'figure.png')
+        show(min(output.glob('figure*.png')))
     return 0
 
 

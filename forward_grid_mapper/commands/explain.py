@@ -205,7 +205,7 @@ def _what_decides(maps: MapArchive, found: CellEvidence, state: int) -> str:
         return f'{few}; {behind}' if blocked else few
     if (total > 0) != (state == 1):
         return (
-            'by itself it would be the other way: it belongs to a wall that is closed, drawn out or removed as a whole'
+            'by itself it would be the other way: it belongs to a wall that is closed, extended or removed as a whole'
         )
     against = found.nats[(found.nats < 0) if state == 1 else (found.nats > 0)]
     typical = float(np.abs(against).max(initial=0.0))

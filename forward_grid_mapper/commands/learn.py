@@ -1,4 +1,4 @@
-"""`learn`: p_hit, p_rand, p_lost and σ from a recorded drive, with standard errors and warnings_."""
+"""`learn`: p_hit, p_rand, p_lost and σ from a recorded drive, with standard errors and warnings."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ def learn(options: argparse.Namespace) -> int:
         if os.path.lexists(output):
             raise OutputError(f'{output} exists; choose another file with --output, or remove it first')
         if not output.parent.is_dir():
-            raise OutputError(f'{output.parent} is no folder; make it first, or choose another with --output')
+            raise OutputError(f'{output.parent} is not a folder; make it first, or choose another with --output')
     part, poses = chosen_part(options), chosen_poses(options)
     with Ticker(options.quiet) as ticker:
         drives = read_drives(
@@ -100,18 +100,18 @@ def learn(options: argparse.Namespace) -> int:
         if not options.keep_going:
             found = only_if_foreseen(found, drives.readings, parameters, options.rounds, ticker.mapping)
         suspects = health_warning(sensor_health(found.maps))
-    warnings_ = (
+    warnings = (
         *drives.source['warnings'],
         *ignored,
         *reading_warnings(found.maps.readings, drives.source, parameters),
         *found.warnings,
         *filter(None, [suspects]),
     )
-    found = dataclasses.replace(found, warnings=warnings_)
+    found = dataclasses.replace(found, warnings=warnings)
     if options.json:
         print(json_text({'file': output and readable(output), **learned_data(found)}), end='')
     elif options.quiet:
-        for warning in warnings_:
+        for warning in warnings:
             print(f'{COMMAND}: warning: {warning}', file=sys.stderr)
     else:
         print(learned_text(found), end='')

@@ -23,7 +23,7 @@ _HOW = (
     'Standard errors: observed information of the readings given the map, and the scatter of 30 blocks of time where '
     'that is larger; 95 % intervals. Both are conditional on the map: that the map was made from the same readings is '
     'not in them. Such a map fits its readings too well: p_rand and sigma come out too low or, with a prior that '
-    'makes cells dear, p_hit too high, by many standard errors.'
+    'makes cells expensive, p_hit too high, by many standard errors.'
 )
 
 

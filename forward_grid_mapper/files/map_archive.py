@@ -72,7 +72,7 @@ def read_npz(path: Path | str) -> MapArchive:
     path = Path(path)
     if path.exists() and not path.is_file():
         # a pipe would be waited for
-        raise InputError(f'{path} is no file')
+        raise InputError(f'{path} is not a file')
     try:
         with path.open('rb') as file, np.load(file, allow_pickle=False) as data:
             ml = data['ml_map']

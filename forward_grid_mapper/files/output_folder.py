@@ -47,7 +47,7 @@ def expanded(path: Path | str) -> Path:
     try:
         return Path(path).expanduser()
     except RuntimeError:
-        raise OutputError(f'{readable(path)}: whose home is {Path(path).parts[0]}? There is no such user.') from None
+        raise OutputError(f'{readable(path)}: there is no user {Path(path).parts[0][1:]}') from None
 
 
 def unwritable(folder: Path | str) -> str:
@@ -59,7 +59,7 @@ def unwritable(folder: Path | str) -> str:
     # Path.exists raises where a parent may not be searched
     there = next(parent for parent in (path, *path.parents) if os.access(parent, os.F_OK))
     if not there.is_dir():
-        return f'{readable(there)} is no folder'
+        return f'{readable(there)} is not a folder'
     return '' if os.access(there, os.W_OK | os.X_OK) else f'{readable(there)} may not be written to'
 
 
@@ -83,7 +83,7 @@ def output_folder(path: Path | str) -> Iterator[Path]:
     """Give a temporary folder to write into, which takes the name `path` when the block succeeds.
 
     Nothing appears under the final name before, and the temporary folder is removed if the block fails. Missing
-    parents are made. An empty folder that exists already is filled, not replaced: it may be a extrinsic point or the
+    parents are made. An empty folder that exists already is filled, not replaced: it may be a mount point or the
     shell's working directory.
 
     Parameters

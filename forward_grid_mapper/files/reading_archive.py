@@ -63,7 +63,7 @@ def read_readings(path: Path | str, maps: MapArchive) -> ReadingArchive:
     path = Path(path)
     if path.exists() and not path.is_file():
         # a pipe would be waited for
-        raise InputError(f'{path} is no file')
+        raise InputError(f'{path} is not a file')
     try:
         with path.open('rb') as file, np.load(file, allow_pickle=False) as data:
             names = tuple(str(name) for name in data['sensor_names'])

@@ -25,5 +25,5 @@ def read_text(path: Path, error: type[MapperError]) -> str:
     with path.open('rb') as file:
         content = file.read(MOST + 1)
     if len(content) > MOST:
-        raise error(f'{path} has more than {MOST:,} bytes; it is no file of this kind')
+        raise error(f'{path} has more than {MOST:,} bytes; it is not a file of this kind')
     return content.decode('utf-8')

@@ -124,6 +124,12 @@ class Worker:
         if thread is not None and thread.is_alive():
             thread.join(seconds)
 
+    def finish(self) -> None:
+        """End once the piece that is being done is done; may be called by that piece."""
+        with self._wake:
+            self._closed = True
+            self._wake.notify()
+
     def _start(self) -> None:
         assert self._thread is not None
         try:

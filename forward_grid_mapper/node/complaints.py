@@ -41,11 +41,11 @@ def of_arguments(left: Sequence[str]) -> str:
             return f'a topic, or a name of the node, is given as --ros-args -r {word}'
         if given:
             near = _nearest(name, (*parameters, *TOPICS))
-            return f'{word} means nothing{near}; parameters come as --ros-args -p NAME:=VALUE'
+            return f'{word} is not a known option{near}; parameters come as --ros-args -p NAME:=VALUE'
     for word in left:
         if word in ROS_OPTIONS:
             return f'{word} comes after --ros-args: --ros-args {" ".join(left)}'
-    return f'{" ".join(left)} means nothing{_nearest(left[0], OPTIONS)}; ROS options come after --ros-args'
+    return f'{" ".join(left)} is not known{_nearest(left[0], OPTIONS)}; ROS options come after --ros-args'
 
 
 def of_ros_arguments(text: str) -> str:
@@ -71,11 +71,12 @@ def of_ros(error: BaseException) -> str:
     text = _INIT.sub('', ' '.join(filter(None, (line.strip() for line in lines))))
     if found := _RULE.search(text):
         return (
-            f'-r {found["rule"]} is no rule: it takes -r OLD:=NEW, such as -r sonar:=/my/sonar, -r __node:=my_mapper '
-            'or -r __ns:=/robot1; names have letters, digits, _ and /, and no part begins with a digit'
+            f'-r {found["rule"]} is not a valid rule: it takes -r OLD:=NEW, such as -r sonar:=/my/sonar, '
+            '-r __node:=my_mapper or -r __ns:=/robot1; names have letters, digits, _ and /, and no part begins with a '
+            'digit'
         )
     if found := _PARAMETER.search(text):
-        return f'-p {found["rule"]} is no parameter: it takes -p NAME:=VALUE, such as -p resolution:=0.05'
+        return f'-p {found["rule"]} is not a valid parameter: it takes -p NAME:=VALUE, such as -p resolution:=0.05'
     if found := _FILE.search(text):
         return f'--params-file {found["file"]}: {found["why"]}'
     if 'PARAMETER_NOT_SET' in text:

@@ -10,6 +10,7 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 
 from ..core.common.grid import Grid
+from ..core.messages.message_types import NANOSECONDS
 from ..core.messages.pose_association import PoseAssociator
 from ..core.messages.rep117 import ODOMETRY_REASONS, REASONS
 from .em import Run
@@ -89,6 +90,8 @@ class Health:
         refused = sum(associator.odometry_rejected.values())
         silent_odometry = self._silence('odometry', associator.odometry_received - refused)
         refused_now, self._refused = refused - self._refused, refused
+        stamp = associator.odometry_stamp or 0
+        stuck = self._silence('stamp of odometry', stamp)
         silent_ranges = self._silence('range', received)
         if not intake.listening:
             return DiagnosticStatus.OK, 'inactive: nothing is received'
@@ -101,6 +104,11 @@ class Health:
             return DiagnosticStatus.WARN, map_frame
         if silent_odometry > SILENCE:
             return DiagnosticStatus.WARN, f'no odometry for {silent_odometry:.0f} s{_and_no_pose(associator)}'
+        if stuck > SILENCE and (intake.waiting or new_rejected):
+            return DiagnosticStatus.WARN, (
+                f'odometry comes, but its stamp has been {stamp / NANOSECONDS:.3f} s for {stuck:.0f} s, so that no '
+                'reading gets a pose; have its driver fill in header.stamp'
+            )
         if silent_ranges > SILENCE:
             return DiagnosticStatus.WARN, f'no Range for {silent_ranges:.0f} s{_and_no_pose(associator)}'
         if associator.unknown_frames and new_rejected:
@@ -112,11 +120,13 @@ class Health:
         bound = associator.parameters.max_readings
         if bound and NEARLY * bound < len(associator.buffer) <= bound:
             return DiagnosticStatus.WARN, (
-                f'{len(associator.buffer)} readings, and max_readings is {bound}: the oldest go where there are many'
+                f'{len(associator.buffer)} readings, and max_readings is {bound}: where readings are densest, the '
+                'oldest are removed'
             )
         return DiagnosticStatus.OK, 'mapping'
 
     def _silence(self, stream: str, count: int) -> float:
+        """Return for how many seconds a number has not changed."""
         now = time.monotonic()
         last, since = self._last.get(stream, (0, self._begin))
         if count != last:

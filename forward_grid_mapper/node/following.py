@@ -45,22 +45,24 @@ class Following:
         self.follower, self._busy, self._seen = follower, False, None
         self._say()
 
-    def offer(self, at: Pose2, readings: Readings, odometry: tuple[NDArray[np.int64], NDArray[np.float64]]) -> None:
+    def offer(
+        self, at: Pose2, drive: Callable[[], tuple[Readings, tuple[NDArray[np.int64], NDArray[np.float64]]]]
+    ) -> None:
         """Have what there is by now followed, unless the thread is busy, or the robot has not moved; called often.
 
         Parameters
         ----------
         at : Pose2
             The newest pose of odometry.
-        readings : Readings
-            All that are held, as odometry placed them.
-        odometry : (int64, shape (M,), float64, shape (M, 3))
-            Stamps and poses.
+        drive : callable
+            Called where there is something to follow; returns all readings that are held, as odometry placed them, and
+            odometry: stamps, int64, shape (M,), and poses, float64, shape (M, 3).
         """
         follower = self.follower
         if follower is None or self._busy or follower.obstacle or at == self._seen:
             return
         self._busy, self._seen = True, at
+        readings, odometry = drive()
 
         def work() -> None:
             try:

@@ -25,6 +25,9 @@ MOST_HELD = 10_000
 LOOKUPS = 100
 """Transforms that one odometry message asks for at the most, so that a transform that comes late holds up nobody."""
 
+TILTED = Later('bad_pose')
+"""What the transform to the map frame is where it gives no pose on a floor."""
+
 STILL = 1e-3
 """Metres, or radians, by which the pose of a sensor may change for it to be fixed to the robot."""
 
@@ -182,6 +185,8 @@ class MapFrame:
             return ''
         way = f'from {self._map_frame} (map_frame) to {self._frame}'
         waiting = f'{len(self._held)} odometry messages wait for it, {self.dropped} were dropped'
+        if self._lack is TILTED:
+            return f"TF's transform {way} is tilted, not finite, or its quaternion is not normalised: {waiting}"
         if self._lack is LATE:
             return f"TF's transform {way} comes later than pose_timeout, or has stopped: {waiting}"
         return f'TF has no transform {way}: {waiting}; is a localiser running?'
@@ -209,11 +214,13 @@ class MapFrame:
             first = self._held[0]
             transform = self._transforms.lookup(self._map_frame, first.frame_id, first.stamp)
             pose = None if isinstance(transform, Later) else planar_pose(transform.translation, transform.rotation)
-            self._note(transform)
+            self._note(transform, pose is not None)
             if pose is not None and first.pose is not None:
                 ready.append(first._replace(frame_id=self._map_frame, pose=pose.compose(first.pose)))
             elif first.pose is None:
                 ready.append(first)
+            elif not isinstance(transform, Later):
+                self.dropped += 1
             elif message.stamp - first.stamp <= self.timeout * NANOSECONDS:
                 break
             else:
@@ -221,14 +228,14 @@ class MapFrame:
             self._held.popleft()
         return ready
 
-    def _note(self, transform: Any | Later) -> None:
-        """Remember since when there is no transform."""
-        if not isinstance(transform, Later):
-            self._lack = None
-        else:
+    def _note(self, transform: Any | Later, planar: bool) -> None:
+        """Remember since when there is no transform, or none that a robot on a floor can have."""
+        if isinstance(transform, Later) or not planar:
             if self._lack is None:
                 self._lacking = time.monotonic()
-            self._lack = transform
+            self._lack = transform if isinstance(transform, Later) else TILTED
+        else:
+            self._lack = None
 
 
 def _listen_to_volatile(buffer: Any, node: Any) -> None:

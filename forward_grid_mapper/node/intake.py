@@ -6,7 +6,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 from nav_msgs.msg import Odometry
 from rclpy.event_handler import SubscriptionEventCallbacks
@@ -25,6 +25,12 @@ QUEUE = 2000
 
 AT_ONCE = 200
 """Messages, or readings, after which the executor gets its turn: two milliseconds or so."""
+
+
+class _InMapFrame(NamedTuple):
+    """Odometry that has its pose in the map frame."""
+
+    message: OdometryMessage
 
 
 class Intake:
@@ -65,13 +71,14 @@ class Intake:
         self.paused = self._ready = False
         self.reliable = own.range_reliability == 'reliable'
         self.heard = Heard()
-        self._held: deque[tuple[RangeMessage | OdometryMessage, int, bool]] = deque()
+        self._held: deque[tuple[RangeMessage | OdometryMessage | _InMapFrame, int, bool]] = deque()
         self._ranges_held = self._refused = self._told_of = 0
         self._last_refused: RangeMessage | None = None
         self._next_warning = 0.0
         self._more = node.create_guard_condition(self.work)
         self._own = own
-        self._topics = list(dict.fromkeys(own.range_topics))
+        # a topic under two names is one
+        self._topics = list({node.resolve_topic_name(topic): topic for topic in own.range_topics}.values())
         self._subscribed: list[Any] = []
         self.subscriptions: dict[str, QoSProfile] = {}
         self.range_losses = [self._losses(topic) for topic in self._topics]
@@ -239,21 +246,23 @@ class Intake:
             self._last_refused = message
             self._refused += 1
 
-    def _take(self, message: RangeMessage | OdometryMessage, sent: int, paused: bool) -> None:
+    def _take(self, message: RangeMessage | OdometryMessage | _InMapFrame, sent: int, paused: bool) -> None:
         if isinstance(message, OdometryMessage):
-            self._take_odometry(message, sent)
+            converted = self._map_frame.convert(message)
+            # the others take turns with what waits
+            self._held.extendleft((_InMapFrame(other), sent, False) for other in reversed(converted[1:]))
+            if converted:
+                self._add_odometry(converted[0], sent)
+        elif isinstance(message, _InMapFrame):
+            self._add_odometry(message.message, sent)
         elif paused:
             self._associator.reject(message, 'paused')
         else:
             self._associator.add_range(message, sent)
 
-    def _take_odometry(self, message: OdometryMessage, sent: int) -> None:
+    def _add_odometry(self, message: OdometryMessage, sent: int) -> None:
         jumps = self._associator.time_jumps
-        converted = self._map_frame.convert(message)
-        for first in converted[:1]:
-            self._associator.add_odometry(first, sent)
-        # the others are messages like any that waits
-        self._held.extendleft((other, sent, False) for other in reversed(converted[1:]))
+        self._associator.add_odometry(message, sent)
         if self._associator.time_jumps != jumps:
             self._node.get_logger().warning('the clock jumped back: readings that waited were dropped, the map is kept')
 

@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
+from typing import ClassVar
 
 from ..core import warm_up
 from ..core.common.errors import Cancelled
@@ -22,9 +23,11 @@ class Kernels:
     ----------
     stage : str
         What is being compiled; empty when all is there.
-    working : bool
-        Whether its thread still compiles or imports, during which the interpreter must not be taken down.
+    at_work : set of Kernels
+        Those whose threads still compile or import, during which the interpreter must not be taken down.
     """
+
+    at_work: ClassVar[set[Kernels]] = set()
 
     def __init__(
         self, log: Callable[[str], object], error: Callable[[str], object], online: bool, refine: bool = False
@@ -37,13 +40,13 @@ class Kernels:
         self.worker = Worker('kernels', error, lasting=True)
         wanted = {'online map': online, 'trajectory': refine}
         self._steps = {name: step for name, step in warm_up.STEPS.items() if wanted.get(name, True)}
+        self._left = len(self._steps)
         self._done = {name: threading.Event() for name in self._steps}
         self.stage = next(iter(self._steps))
-        self.working = False
 
     def begin(self, ready: Callable[[], None]) -> None:
         """Begin to compile; `ready` is called, in another thread, when the live map has its kernels."""
-        self.working = True
+        self.at_work.add(self)
         self._log('preparing kernels; the first start compiles them, which takes half a minute and more')
         begin = time.monotonic()
         # the collector would go through all that the compiler made again and again, and keep the executor waiting
@@ -69,13 +72,16 @@ class Kernels:
 
     def _compile(self, name: str, ready: Callable[[], None], begin: float) -> None:
         self.stage = name
-        self._steps[name]()
-        self._log(f'kernels of the {name} are ready after {time.monotonic() - begin:.1f} s')
-        self._done[name].set()
-        if name == 'live map':
-            ready()
-        if all(done.is_set() for done in self._done.values()):
-            self._end()
+        try:
+            self._steps[name]()
+            self._log(f'kernels of the {name} are ready after {time.monotonic() - begin:.1f} s')
+            self._done[name].set()
+            if name == 'live map':
+                ready()
+        finally:
+            self._left -= 1
+            if not self._left:
+                self._end()
 
     def _give_up(self, ready: Callable[[], None]) -> None:
         """Let everybody go on: whoever needs a kernel compiles it, and says so if it fails."""
@@ -84,7 +90,6 @@ class Kernels:
             done.set()
         if first:
             ready()
-        self._end()
 
     def _end(self) -> None:
         self.stage = ''
@@ -95,4 +100,5 @@ class Kernels:
         # what is there by now stays; the collector need not look at it again
         gc.freeze()
         gc.enable()
-        self.working = False
+        self.at_work.discard(self)
+        self.worker.finish()

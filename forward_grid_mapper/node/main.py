@@ -79,7 +79,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         from rclpy.utilities import remove_ros_args
     except ImportError as error:
         print(
-            f"mapper: error: ROS 2 is not there ({error}): source its setup.bash, or pip install '.[ros]'",
+            f'mapper: error: ROS 2 is not installed, or not sourced ({error}): source its setup.bash, or pip install '
+            "'.[ros]'",
             file=sys.stderr,
         )
         return 1
@@ -87,6 +88,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     sys.setswitchinterval(0.0005)
     # numpy starts threads when it is imported, which must have the signals blocked
     from . import complaints
+    from .kernels import Kernels
     from .mapper_node import MapperNode
 
     if wrong := complaints.of_domain(os.environ):
@@ -134,7 +136,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if node is not None and node.failure:
         print(f'mapper: error: {node.failure}', file=sys.stderr)
         code = 1
-    if node is not None and node.kernels is not None and node.kernels.working:
+    if Kernels.at_work:
         # the compiler must not be at work when its libraries are unloaded
         sys.stdout.flush()
         sys.stderr.flush()

@@ -6,6 +6,7 @@ by workers (`background`), which hand their results back through an inbox.
 
 from __future__ import annotations
 
+import gc
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -79,8 +80,8 @@ class MapperNode(ManagedNode):
         self.failure = ''
         self.when_failed: Callable[[], object] = lambda: None
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self.kernels: Kernels | None = None
         self._begin_anew()
+        self._own = frozenset(vars(self))
 
     def _begin_anew(self) -> None:
         self._started = self.mapping = False
@@ -103,6 +104,9 @@ class MapperNode(ManagedNode):
         ranges = [self._resolved('range_topics', topic) for topic in node.range_topics]
         if why := unwritable(node.save_directory):
             log.warning(f'save_maps will fail: {why}; set save_directory to a folder that can be written')
+        for topic in {topic for topic in ranges if ranges.count(topic) > 1}:
+            log.warning(f'range_topics has {topic} {ranges.count(topic)} times; its readings are taken once')
+        ranges = list(dict.fromkeys(ranges))
         if not node.range_topics:
             raise MapperError('range_topics is empty; give it the name of a topic of sensor_msgs/Range, or several')
         if odometry in ranges:
@@ -171,7 +175,7 @@ class MapperNode(ManagedNode):
         try:
             return str(self.resolve_topic_name(topic))
         except Exception as error:  # a class of rclpy's C extension
-            raise MapperError(f'{parameter}: {topic!r} is no name of a topic: {of_ros(error)}') from None
+            raise MapperError(f'{parameter}: {topic!r} is not a valid topic name: {of_ros(error)}') from None
 
     def activate(self) -> None:
         """Take messages from here on; they are mapped as soon as it can be."""
@@ -191,16 +195,25 @@ class MapperNode(ManagedNode):
         """End what goes on in the background."""
         if self._started:
             self._started = self.mapping = False
+            # before what may take as long as `stopping.GRACE`
+            self.journal.close()
             self.em.close(2.0)
             if self.online:
                 self.online.close(2.0)
             if self.trajectory.following:
                 self.trajectory.following.close(2.0)
             self.live.worker.close(0.5)
-            self.journal.close()
         # kernels are compiled to the end, whoever needs them next
         for worker in self.workers[:-1]:
             worker.close(0.5)
+
+    def _undo(self) -> None:
+        super()._undo()
+        # readings and maps are forgotten; what refers to itself, too, which was taken for lasting (`Kernels`)
+        for name in vars(self).keys() - self._own - {'_own'}:
+            delattr(self, name)
+        gc.unfreeze()
+        gc.collect()
 
     # the start
 

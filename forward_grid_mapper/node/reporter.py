@@ -142,9 +142,15 @@ class Reporter:
                 if frame in self._extrinsics.unusable
                 else 'neither is known'
             )
+            base = self._associator.base_frame
+            way = (
+                f'publish the transform from {base}'
+                if base
+                else 'have odometry name the base frame as its child_frame_id, without which TF cannot be asked'
+            )
             self._node.get_logger().warning(
-                f'no pose on the robot for sensor {frame}: set sensors.{frame}.pose: [x, y, yaw], or publish the '
-                f'transform from {self._associator.base_frame or "the base frame"}; {why}; its readings are rejected'
+                f'no pose on the robot for sensor {frame}: set sensors.{frame}.pose: [x, y, yaw], or {way}; {why}; '
+                'its readings are rejected'
             )
         self._lost = unknown & self._reported
         for frame, counts in list(self._associator.rejected_by_frame.items()):

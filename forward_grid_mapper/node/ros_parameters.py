@@ -122,5 +122,5 @@ def _strangers(given: dict[str, RosParameter]) -> list[str]:
             continue
         near = difflib.get_close_matches(name, NAMES, n=1)
         hint = f'; did you mean {near[0]}?' if near else ''
-        warnings.append(f'parameter {name} means nothing to this node and is ignored{hint}')
+        warnings.append(f'parameter {name} is not known to this node and is ignored{hint}')
     return warnings

@@ -60,7 +60,7 @@ class _Jump(NamedTuple):
     def __str__(self) -> str:
         return (
             f'odometry jumped by {self.far:.1f} m: where the robot is on the map is not known until run_em has found '
-            f'it, and what it reads goes to a wrong place; where it was carried away, call reset'
+            f'it, and what it reads goes to a wrong place; where it was carried away (kidnapped), call reset'
         )
 
 
@@ -212,7 +212,7 @@ class Trajectory:
                 'moved at the end of the drive (m)': f'{self.correction.moved:.2f}',
                 'places recognised': refinement.loops,
                 'correction (x m, y m, yaw deg)': f'{x:.2f}, {y:.2f}, {math.degrees(yaw):.1f}',
-                'wheels': calibration_words(refinement.calibration) or 'nothing worth a word',
+                'wheels': calibration_words(refinement.calibration) or 'no systematic error found',
             }
         if self.following is not None:
             values |= self.following.values()
@@ -259,7 +259,7 @@ class Trajectory:
         before, self._at = self._at or (stamp, pose), (stamp, pose)
         self._count(before, stamp, pose)
         if self.following is not None and self._parameters.node.refine_poses:
-            self.following.offer(pose, self._associator.buffer.snapshot(), self._associator.record.snapshot())
+            self.following.offer(pose, lambda: (self._associator.buffer.snapshot(), self._associator.record.snapshot()))
         if self.driven - self._shown_at >= GROWS and not self._showing:
             self._show_path()
         every = self._parameters.node.refine_every

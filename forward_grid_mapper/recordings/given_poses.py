@@ -71,7 +71,7 @@ def read_given_poses(path: Path | str) -> GivenPoses:
 def _is_csv(path: Path) -> bool:
     if not path.is_file():
         raise InputError(
-            f'{readable(path)} is no file with poses' if path.exists() else f'{readable(path)} does not exist'
+            f'{readable(path)} is not a file with poses' if path.exists() else f'{readable(path)} does not exist'
         )
     with path.open(encoding='utf-8', errors='replace') as lines:
         first = next((line for line in lines if line.strip()), '')

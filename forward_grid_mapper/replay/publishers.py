@@ -58,7 +58,8 @@ class Publishers:
             from rclpy.signals import SignalHandlerOptions
         except ImportError as error:
             raise MapperError(
-                f"ROS 2 is not there ({error}): source its setup.bash, or pip install 'forward_grid_mapper[ros]'"
+                f'ROS 2 is not installed, or not sourced ({error}): source its setup.bash, or pip install '
+                "'forward_grid_mapper[ros]'"
             ) from error
         self._ros = rclpy
         try:
@@ -123,7 +124,9 @@ class Publishers:
             except RCLError as error:
                 # DDS waits for space in the history for a tenth of a second only
                 if time.monotonic() > deadline:
-                    raise InputError(f'subscribers of {topic} take nothing since {PATIENCE:.0f} s ({error})') from error
+                    raise InputError(
+                        f'subscribers of {topic} have taken nothing for {PATIENCE:.0f} s ({error})'
+                    ) from error
 
     def publish_latched(self, topic: str, **fields: Any) -> None:
         """Publish a message of these fields, which late subscribers get too."""
@@ -188,7 +191,7 @@ class Publishers:
         lines = [f'\n  {self._publishers[topic].topic_name}: {self._reason(topic)}' for topic in unheard]
         return (
             f'no subscriber after {seconds:g} s{"".join(lines)}\nStart it with the same ROS_DOMAIN_ID, rename topics '
-            f'with --remap OLD:=NEW, play fewer with --range-topics, or begin unheard with --wait 0'
+            f'with --remap OLD:=NEW, play fewer with --range-topics, or start without subscribers with --wait 0'
         )
 
     def _reason(self, topic: str) -> str:

@@ -165,7 +165,7 @@ def test_a_pipe_is_not_waited_for(maps: Path, tmp_path: Path, name: str, capsys:
     (tmp_path / name).unlink(missing_ok=True)
     os.mkfifo(tmp_path / name)
     assert code_of(explain.main, tmp_path, 0, 0) == 1
-    assert f'{name} is no file' in capsys.readouterr().err
+    assert f'{name} is not a file' in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

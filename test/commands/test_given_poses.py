@@ -125,7 +125,7 @@ def test_what_is_no_file_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[s
     bag = write_tape(tmp_path / 'bag', tape())
     options = (bag, '-o', tmp_path / 'maps', '--poses')
     assert 'absent does not exist' in refusal(capsys, tmp_path, *options, tmp_path / 'absent')
-    assert 'is no file with poses' in refusal(capsys, tmp_path, *options, tmp_path)
+    assert 'is not a file with poses' in refusal(capsys, tmp_path, *options, tmp_path)
     file = written(tmp_path / 'poses', 'csv')
     assert 'leave out --odom-topic' in refusal(capsys, tmp_path, *options, file, '--odom-topic', '/odom')
 

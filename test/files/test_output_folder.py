@@ -114,8 +114,8 @@ def test_a_forbidden_parent_is_told_for_real(tmp_path: Path) -> None:
 def test_a_folder_that_cannot_be_written_is_known_before(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / 'file').touch()
     assert unwritable(tmp_path) == unwritable(tmp_path / 'new' / 'newer') == ''
-    assert 'no such user' in unwritable('~nobody_of_this_name/maps')
-    assert unwritable(tmp_path / 'file' / 'new') == f'{tmp_path / "file"} is no folder'
+    assert 'there is no user' in unwritable('~nobody_of_this_name/maps')
+    assert unwritable(tmp_path / 'file' / 'new') == f'{tmp_path / "file"} is not a folder'
     there = os.access
     monkeypatch.setattr(
         os, 'access', lambda path, mode: there(path, mode) and (path, mode) != (tmp_path, os.W_OK | os.X_OK)

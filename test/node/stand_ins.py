@@ -86,13 +86,13 @@ SONAR = Pose2(0.1, 0.0, 0.0)
 class Taking:
     """An intake with its associator, and a robot that publishes to it."""
 
-    def __init__(self, at_once: int = AT_ONCE, **parameters: Any) -> None:
+    def __init__(self, at_once: int = AT_ONCE, map_frame: MapFrame | None = None, **parameters: Any) -> None:
         self.node = PlainNode()
         own = Parameters.from_flat(parameters)
         self.associator = PoseAssociator(lambda base, frame, stamp: SONAR, own, at_once=at_once)
         self.published: list[int] = []
-        map_frame = MapFrame('', Transforms(), 1.0)
-        self.intake = Intake(self.node, own, self.associator, map_frame, self.published.append)
+        frame = map_frame or MapFrame('', Transforms(), 1.0)
+        self.intake = Intake(self.node, own, self.associator, frame, self.published.append)
         self.sent = 0
 
     def odometry(self, seconds: float, x: float = 0.0, number: int | None = None, frame: str = 'odom') -> None:

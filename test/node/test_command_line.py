@@ -34,11 +34,11 @@ def refused(domain: int, *arguments: str, **changes: str) -> tuple[int, str]:
     [
         (['resolutoin:=0.1'], 2, 'did you mean resolution?'),
         (['--ros-args', '--parms-file', 'x.yaml'], 2, 'did you mean --params-file?'),
-        (['--ros-args', '-r', '__node:=1st'], 1, '-r __node:=1st is no rule'),
+        (['--ros-args', '-r', '__node:=1st'], 1, '-r __node:=1st is not a valid rule'),
         (['--ros-args', '-p', 'range_topics:=[]'], 1, 'a parameter has no value, or an empty list'),
-        (['--ros-args', '-p', 'odom_topic:="a b"'], 1, "odom_topic: 'a b' is no name of a topic"),
+        (['--ros-args', '-p', 'odom_topic:="a b"'], 1, "odom_topic: 'a b' is not a valid topic name"),
         (['--ros-args', '-r', '~/ml_map:=/map', '-r', '~/live_map:=/map'], 1, '/map can have one map only'),
-        (['--ros-args', '-p', 'journal:=~nobody_of_this_name/x'], 1, 'There is no such user'),
+        (['--ros-args', '-p', 'journal:=~nobody_of_this_name/x'], 1, 'there is no user nobody_of_this_name'),
     ],
 )
 def test_what_cannot_be_is_refused(domain: int, arguments: list[str], code: int, expected: str) -> None:
@@ -63,8 +63,8 @@ def test_domains_that_there_are(number: str) -> None:
 @pytest.mark.parametrize(
     ('arguments', 'expected'),
     [
-        (['--hlep'], '--hlep means nothing; did you mean --help?'),
-        (['bag.mcap'], 'bag.mcap means nothing; ROS options come after --ros-args'),
+        (['--hlep'], '--hlep is not known; did you mean --help?'),
+        (['bag.mcap'], 'bag.mcap is not known; ROS options come after --ros-args'),
         (['resolution:=0.1'], 'resolution is a parameter: --ros-args -p resolution:=0.1'),
         (['-p', 'resolution:=0.1'], 'resolution is a parameter: --ros-args -p resolution:=0.1'),
         (['odom:=/wheels'], '--ros-args -r odom:=/wheels'),
@@ -94,11 +94,11 @@ def test_options_that_ros_does_not_know(text: str, expected: str) -> None:
     [
         (
             "failed to initialize rcl: Couldn't parse remap rule: '-r foo'. Error: x, at /a/b.c:1, at /c/d.c:22",
-            '-r foo is no rule: it takes -r OLD:=NEW',
+            '-r foo is not a valid rule: it takes -r OLD:=NEW',
         ),
         (
             "failed to initialize rcl: Couldn't parse parameter override rule: '-p foo'. Error: x, at /a/b.c:1",
-            '-p foo is no parameter: it takes -p NAME:=VALUE',
+            '-p foo is not a valid parameter: it takes -p NAME:=VALUE',
         ),
         (
             "failed to initialize rcl: Couldn't parse params file: '--params-file x'. Error: cannot open, at /a/b.c:1",
@@ -118,7 +118,7 @@ def test_save_directory_of_a_user_who_is_not_there(domain: int, tmp_path: Path) 
         robot.drive(0, 10)
         success, message = robot.call(robot.node.saver.save_maps)
         assert not success
-        assert message == ('~nobody_of_this_name/maps: whose home is ~nobody_of_this_name? There is no such user.')
+        assert message == ('~nobody_of_this_name/maps: there is no user nobody_of_this_name')
         robot.set(save_directory=str(tmp_path / 'maps'))
         assert robot.call(robot.node.saver.save_maps)[0]
     finally:

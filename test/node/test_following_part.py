@@ -59,7 +59,7 @@ class Driving:
         return follower
 
     def offer(self, at: Pose2) -> None:
-        self.part.offer(at, READING, POSES)
+        self.part.offer(at, lambda: (READING, POSES))
 
     def settle(self) -> None:
         self.part.worker.ask(lambda: None)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -13,6 +14,7 @@ from rclpy.qos import ReliabilityPolicy
 from stand_ins import Taking
 
 from forward_grid_mapper.node import intake as module
+from forward_grid_mapper.node.frames import MapFrame, Transforms
 from forward_grid_mapper.node.intake import AT_ONCE, QUEUE
 from forward_grid_mapper.node.losses import LASTING
 
@@ -239,3 +241,47 @@ def test_odometry_that_waited_for_a_transform_comes_in_order(monkeypatch: pytest
     monkeypatch.setattr(robot.intake._map_frame, 'convert', convert_now)
     robot.odometry(104.0)
     assert robot.node.turn() and taken == [100.0, 101.0, 102.0, 103.0, 104.0]
+
+
+class Localiser:
+    """TF of a localiser that begins late; as tf2's buffer does, it forgets all when it is cleared."""
+
+    def __init__(self) -> None:
+        self.begin, self.end, self.cleared = 1 << 62, 0, 0
+
+    def clear(self) -> None:
+        self.cleared += 1
+        self.begin, self.end = 1 << 62, 0
+
+    def publish(self, stamp: int) -> None:
+        self.begin, self.end = min(self.begin, stamp), max(self.end, stamp)
+
+    def lookup_transform(self, target: str, source: str, time: Any) -> Any:
+        if not self.begin <= time.nanoseconds <= self.end:
+            raise ExtrapolationException
+        rotation, translation = SimpleNamespace(x=0.0, y=0.0, z=0.0, w=1.0), SimpleNamespace(x=5.0, y=0.0)
+        return SimpleNamespace(transform=SimpleNamespace(rotation=rotation, translation=translation))
+
+
+class ExtrapolationException(Exception):
+    """What tf2 raises outside of the times that it has."""
+
+
+def test_odometry_that_waited_for_the_map_frame_is_no_clock_that_jumped() -> None:
+    tf = Localiser()
+    robot = Taking(map_frame=MapFrame('map', Transforms(tf, ExtrapolationException), 2.0))
+    robot.intake.begin()
+    # the localiser begins after 1.5 s, when hundreds of messages wait, and its newest transform is 1 s ahead
+    for k in range(600):
+        robot.odometry(100.0 + 0.01 * k, 0.01 * k)
+        if k % 10 == 5:
+            robot.range(100.0 + 0.01 * k)
+        if k >= 150 and k % 10 == 0:
+            tf.publish(round((101.0 + 0.01 * k) * 1e9))
+        robot.node.turn()
+    assert tf.cleared == 0
+    assert robot.associator.map_frame == 'map'
+    # those of the first 2.5 s have no transform, or none before them
+    assert robot.associator.rejected.total() <= 26
+    assert len(robot.associator.buffer) >= 34
+    assert robot.associator.readings.x.min() > 5.0

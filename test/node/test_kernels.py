@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 import pytest
+from patience import PATIENCE
 
 from forward_grid_mapper.core import warm_up
 from forward_grid_mapper.core.common.errors import Cancelled
@@ -51,6 +52,15 @@ def compiling(monkeypatch: pytest.MonkeyPatch) -> Iterator[Compiling]:
     gc.unfreeze()
 
 
+def ended(kernels: Kernels) -> None:
+    """Wait until nothing is left to compile, and the thread has gone."""
+    for thread in threading.enumerate():
+        if thread.name == 'kernels':
+            thread.join(PATIENCE)
+    assert kernels not in Kernels.at_work and not kernels.worker.waiting
+    assert 'kernels' not in {thread.name for thread in threading.enumerate()}
+
+
 def test_the_live_map_has_its_kernels_first(compiling: Compiling) -> None:
     kernels = compiling.begin()
     assert not kernels.has('live map') and kernels.stage == 'live map' and not gc.isenabled()
@@ -63,9 +73,9 @@ def test_the_live_map_has_its_kernels_first(compiling: Compiling) -> None:
     for event in compiling.go_on.values():
         event.set()
     kernels.wait('EM')
-    kernels.worker.ask(lambda: None)
+    ended(kernels)
     assert compiling.ready == ['live map'] and compiling.done == list(warm_up.STEPS)
-    assert (kernels.stage, kernels.working, gc.isenabled()) == ('', False, True)
+    assert (kernels.stage, kernels in Kernels.at_work, gc.isenabled()) == ('', False, True)
 
 
 def test_what_is_not_wanted_is_left_out_and_not_waited_for(compiling: Compiling) -> None:
@@ -74,7 +84,7 @@ def test_what_is_not_wanted_is_left_out_and_not_waited_for(compiling: Compiling)
     kernels = compiling.begin(online=False, refine=False)
     kernels.wait('online map')
     kernels.wait('trajectory')
-    kernels.worker.ask(lambda: None)
+    ended(kernels)
     assert compiling.done == [name for name in warm_up.STEPS if name not in ('online map', 'trajectory')]
 
 
@@ -86,10 +96,10 @@ def test_a_step_that_fails_keeps_nobody_waiting(compiling: Compiling, failing: s
     kernels = compiling.begin()
     for name in warm_up.STEPS:
         kernels.wait(name)
-    kernels.worker.ask(lambda: None)
+    ended(kernels)
     assert len(compiling.ready) == 1
     assert any('there is not enough memory' in text for text in compiling.said)
-    assert kernels.worker.trouble and not kernels.working and gc.isenabled()
+    assert kernels.worker.trouble and kernels not in Kernels.at_work and gc.isenabled()
 
 
 def test_pictures_that_cannot_be_drawn_do_not_leave_the_collector_off(
@@ -102,5 +112,5 @@ def test_pictures_that_cannot_be_drawn_do_not_leave_the_collector_off(
     for event in compiling.go_on.values():
         event.set()
     kernels = compiling.begin()
-    kernels.worker.ask(lambda: None)
-    assert gc.isenabled() and not kernels.working and kernels.worker.trouble == ''
+    ended(kernels)
+    assert gc.isenabled() and kernels not in Kernels.at_work and kernels.worker.trouble == ''

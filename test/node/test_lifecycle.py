@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import gc
 import re
 import subprocess
 import sys
+import threading
+import weakref
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
@@ -20,10 +23,12 @@ from fault_samples import circle
 from inside import Inside
 from lifecycle_msgs.msg import State, Transition
 from lifecycle_msgs.srv import ChangeState, GetState
+from rclpy.lifecycle.node import TransitionCallbackReturn
 from robot import LATCHED, MAPS, Robot, environment
 from test_mapper_node import RELIABLE
 
 from forward_grid_mapper.core.common.parameters import find
+from forward_grid_mapper.node.kernels import Kernels
 
 OPTIONS = (*RELIABLE, '-p', 'sensors.sonar.pose:=[0.0, 0.0, 0.0]')
 WAITING = (*OPTIONS, '-p', 'autostart:=false')
@@ -225,6 +230,27 @@ def sockets() -> int:
         with suppress(OSError):
             found += str(descriptor.readlink()).startswith('socket:')
     return found
+
+
+def test_a_clean_up_leaves_neither_readings_nor_threads(inside: Callable[..., Inside]) -> None:
+    robot = inside()
+    node = robot.node
+    for _ in range(2):
+        robot.start()
+        robot.until(lambda: not Kernels.at_work)
+        parts = [weakref.ref(part) for part in (node.associator, node.associator.buffer, node.live, node.em, node.maps)]
+        assert node.trigger_deactivate() == node.trigger_cleanup() == TransitionCallbackReturn.SUCCESS
+        gc.collect()
+        assert [part() for part in parts] == [None] * len(parts)
+        assert not {thread.name for thread in threading.enumerate()} & {'kernels', 'live map', 'EM', 'readings'}
+
+
+def test_a_topic_under_two_names_is_taken_once(inside: Callable[..., Inside]) -> None:
+    robot = inside(range_topics=['sonar', '/sonar', 'other'])
+    robot.start()
+    assert sorted(topic for topic in robot.node.intake.subscriptions if topic != '/odom') == ['/other', '/sonar']
+    assert robot.node.em.range_topics == ['/sonar', '/other']
+    assert len(robot.node.intake.range_losses) == 2
 
 
 @pytest.mark.skipif(not Path('/proc/self/fd').is_dir(), reason='there is no /proc')

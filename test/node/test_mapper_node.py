@@ -256,7 +256,7 @@ def test_one_topic_for_ranges_and_odometry_is_an_error(start: Any) -> None:
 def test_misspelt_parameters_are_named(start: Any) -> None:
     node = start('-p', 'p_hitt:=0.5', '-p', 'save_directory:=/proc/version/maps')
     assert 'did you mean p_hit' in node.output
-    assert 'save_maps will fail: /proc/version is no folder' in node.output
+    assert 'save_maps will fail: /proc/version is not a folder' in node.output
 
 
 def test_trouble_shows_in_diagnostics_and_passes(start: Any, robot: Robot) -> None:

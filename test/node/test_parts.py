@@ -301,7 +301,10 @@ def test_a_tenth_of_max_readings_before_it_there_is_a_warning(inside: Callable[.
     robot.drive(89, 3)
     readings = robot.status('readings')
     assert readings['level'] == WARN
-    assert '92 readings, and max_readings is 100: the oldest go' in readings['message']
+    assert (
+        '92 readings, and max_readings is 100: where readings are densest, the oldest are removed'
+        in readings['message']
+    )
     robot.drive(92, 30)
     assert robot.status('readings')['readings kept to map from'] == '100 of at most 100'
 

@@ -57,8 +57,8 @@ class AssociationParameters:
     )
     max_readings: int = param(
         500_000,
-        'Readings that are kept to map from; of more, the oldest go where a sensor looked most often from one place '
-        'in one direction. 0 keeps all.',
+        'Readings that are kept to map from; of more, the oldest are removed where a sensor looked most often from one '
+        'place in one direction. 0 keeps all.',
         'readings',
         0,
         100_000_000,

@@ -30,7 +30,7 @@ JUMP = NANOSECONDS
 """Odometry older than the newest by more than this means that the clock jumped back, not that messages overtook."""
 
 RETRY = NANOSECONDS // 20
-"""How often, in message time, a pose that may still become known is asked for again."""
+"""How often, in message time or by the clock, a pose that may still become known is asked for again."""
 
 MOST_FRAMES = 1000
 """Sensor frames with counts of their own; whatever comes after them is counted as `OTHERS`."""
@@ -92,7 +92,7 @@ class PoseAssociator:
         clock : callable
             Returns seconds. A reading times out when `pose_timeout` has passed both by the stamps that came after it
             and by this clock: so neither a bag that is replayed fast nor a simulation that stands still loses any.
-            While odometry keeps coming, no reading times out that only overtook it.
+            While odometry's stamps go on, no reading times out that only overtook it.
         at_once : int
             Readings that one call places or rejects at the most, so that odometry that comes after a long silence
             holds up nobody; 0 is no bound.
@@ -119,7 +119,7 @@ class PoseAssociator:
         self._retrying = 0
         self._next_try = self._next_look = 0
         self._at_once = at_once or sys.maxsize
-        self._odometry_arrival = self._odometry_sent = 0.0
+        self._odometry_arrival = self._odometry_sent = self._next_try_by_clock = 0.0
         self.behind = self._other_frame = False
         self.settled = 0
 
@@ -127,6 +127,11 @@ class PoseAssociator:
     def waiting(self) -> int:
         """Number of readings that wait for odometry or for the pose of their sensor."""
         return len(self._waiting) + len(self._held)
+
+    @property
+    def odometry_stamp(self) -> int | None:
+        """The newest stamp of odometry, nanoseconds; None before the first."""
+        return self._history.newest
 
     @property
     def path(self) -> list[tuple[float, float]]:
@@ -189,6 +194,7 @@ class PoseAssociator:
         self._waiting.clear()
         self._held.clear()
         self._retrying, self.behind = 0, False
+        self._newest_range, self._next_try = None, 0
         self._path.clear()
         self.received = self.odometry_received = self.time_jumps = 0
         self._extent.clear()
@@ -216,8 +222,10 @@ class PoseAssociator:
         newest = self._history.newest
         if newest is not None and message.stamp < newest - JUMP:
             self._jump_back(newest)
+        newest = self._history.newest
         self._history.add(message.stamp, message.pose)
-        self._odometry_arrival = self._clock()
+        if self._history.newest != newest:
+            self._odometry_arrival = self._clock()
         self._odometry_sent = max(self._odometry_sent, sent)
         self._settle()
         if not self._patient:
@@ -312,14 +320,16 @@ class PoseAssociator:
             self._drop_the_future(newest, patience)
         if not ((self._waiting and self._waiting[0].stamp < limit) or self._held):
             return left
-        oldest = self._clock() - patience
-        # odometry that keeps coming is merely behind, or else `_drop_the_future` notices
+        clock = self._clock()
+        oldest = clock - patience
+        # odometry that goes on is merely behind, or else `_drop_the_future` notices
         waiting = self._waiting if newest is None or self._odometry_arrival < oldest else []
         while left and waiting and waiting[0].stamp < limit and waiting[0].arrival < oldest:
             self._reject(heapq.heappop(waiting).frame_id, 'no_odometry')
             left -= 1
-        if self._held and now >= self._next_try:
-            self._next_try = now + RETRY
+        # a stamp from the future must not end it
+        if self._held and (now >= self._next_try or clock >= self._next_try_by_clock):
+            self._next_try, self._next_try_by_clock = now + RETRY, clock + RETRY / NANOSECONDS
             self._retrying = len(self._held)
         while left and self._retrying:
             self._retrying -= 1
@@ -350,6 +360,8 @@ class PoseAssociator:
         if len(stay) < len(self._waiting):
             self._waiting = stay
             heapq.heapify(self._waiting)
+            # time goes on by the stamps that are left
+            self._newest_range, self._next_try = max((measured.stamp for measured in stay), default=None), 0
 
     def _settle_up_to(self, stamp: int, left: int = sys.maxsize) -> int:
         """Place the readings up to a stamp, `left` at the most; return how many more may be."""

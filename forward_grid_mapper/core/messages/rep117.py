@@ -20,21 +20,23 @@ REASONS = {
     'below_min_range': 'the range is below min_range; a driver that means "no echo" should send +inf (REP 117), not 0',
     'over_range': 'no echo, and over_range is "discard"',
     'bad_limits': 'min_range or max_range is negative or not finite, or max_range is not above min_range, or below a '
-    'millimetre',
+    'millimetre; the parameter max_range overrides it',
     'bad_field_of_view': 'the field of view is not between 0 and pi radians (15 degrees are 0.26); the parameter '
-    'field_of_view overrides it: field_of_view=15deg on a command line',
+    'field_of_view overrides it',
     'empty_frame_id': 'the header has no frame_id, so the sensor is unknown',
     'long_frame_id': 'the frame_id has more than 255 characters',
     'unprintable_frame_id': 'the frame_id has characters that cannot be printed',
-    'unknown_extrinsics': 'nothing says where this frame is on the robot: give --sensor, a YAML or a transform',
-    'late_transform': 'TF knows this frame, but its transform of the stamp did not come within pose_timeout',
+    'unknown_extrinsics': 'nothing says where this frame is on the robot: give sensors.<frame_id>.pose in a parameter '
+    'file, or its transform',
+    'late_transform': 'TF knows this frame, but no transform for the stamp arrived within pose_timeout',
     'steep_sensor': 'the sensor looks up or down, by more than 60° or straight so with a part of its cone',
     'before_odometry': 'the stamp is before the first odometry, or the message came minutes late',
     'after_odometry': 'the recording ended before odometry reached the stamp',
     'no_odometry': 'odometry, or its transform to map_frame, did not reach the stamp within pose_timeout',
     'pose_gap': 'odometry has a gap longer than max_pose_gap here',
     'pose_jump': 'odometry jumps here, faster than anything drives (are its poses in millimetres? They are in metres)',
-    'from_the_future': 'odometry went on for pose_timeout and is still before the stamp; is the sensor ahead?',
+    'from_the_future': 'odometry went on for pose_timeout and is still before the stamp; is the clock of the sensor '
+    'ahead?',
     'time_jump': 'the clock jumped back while the reading waited for its pose',
     'too_many_waiting': 'too many readings waited for odometry at once',
     'too_far_away': 'the map would have more than max_cells cells; are pose and max_range right?',

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from forward_grid_mapper.core.common.parameters import Parameters
-from forward_grid_mapper.core.messages.extrinsics import LATER
+from forward_grid_mapper.core.messages.extrinsics import LATER, Later
 from forward_grid_mapper.core.messages.message_types import NANOSECONDS, OdometryMessage, Pose2, RangeMessage
 from forward_grid_mapper.core.messages.pose_association import MOST_FRAMES, PoseAssociator
 from forward_grid_mapper.core.messages.pose_history import HISTORY
@@ -427,6 +427,38 @@ def test_one_stamp_from_the_future_costs_only_what_waits() -> None:
     assert (p.time_jumps, len(p.buffer)) == (1, 7)
     assert p.rejected == {'before_odometry': 2, 'pose_gap': 1} or sum(p.rejected.values()) == 3
     assert accounted(p)
+
+
+@pytest.mark.parametrize('reset', [False, True])
+def test_a_reading_from_the_future_stops_no_clock(reset: bool) -> None:
+    clock = Clock()
+
+    def extrinsics(base: str, frame: str, stamp: int) -> Pose2 | Later:
+        # TF knows the frame a tenth of a second later
+        return SENSOR if clock.now > stamp / NANOSECONDS + 0.1 else LATER
+
+    p = PoseAssociator(extrinsics, Parameters(), clock=clock)
+    for k in range(200):
+        clock.now = 0.1 * k
+        p.add_odometry(odometry(clock.now))
+        p.add_range(sonar(3e7 if k == 20 else clock.now))
+        if reset and k == 100:
+            p.clear()
+    assert p.rejected == ({} if reset else {'from_the_future': 1})
+    assert p.waiting <= 3
+    assert len(p.buffer) == p.received - p.waiting - sum(p.rejected.values()) > 90
+
+
+def test_odometry_whose_stamp_stands_still_times_readings_out() -> None:
+    clock = Clock()
+    p = associator(clock=clock)
+    for k in range(200):
+        clock.now = 0.1 * k
+        p.add_odometry(odometry(0.0))
+        p.add_range(sonar(1000.0 + clock.now))
+    assert p.odometry_stamp == 0
+    assert p.waiting < 30
+    assert p.rejected['no_odometry'] == p.received - p.waiting
 
 
 def test_what_strangers_can_make_grow_is_bounded() -> None:
