@@ -23,6 +23,7 @@ from .core.messages.rep117 import ODOMETRY_REASONS, REASONS, rejection_warnings
 from .files.pose_files import poses_from_csv, poses_from_tum
 from .files.quality_warning import data_warnings
 from .files.results import write_results
+from .recordings.drive import LogOddsMapOfAll, thinning_note
 
 __all__ = ['Sonar', 'SonarMaps', 'make_maps', 'poses_from_csv', 'poses_from_tum']
 
@@ -219,6 +220,7 @@ def make_maps(
         raise InputError(f'there are {len(odometry)} poses and {len(values)} ranges; it takes some of both')
     mounted: dict[str, Pose2] = {name: Mount(s.x, s.y, s.yaw, -s.pitch) for name, s in sensors.items()}
     associator = PoseAssociator(lambda base, frame, stamp: mounted.get(frame), chosen, patient=True)
+    live = LogOddsMapOfAll(associator, chosen)
     for pose in odometry:
         associator.add_odometry(pose)
     for i in np.argsort(stamps, kind='stable').tolist():
@@ -235,11 +237,12 @@ def make_maps(
             f'none of {len(values)} ranges could be used: {reasons}; {spans}, ranges '
             f'{stamps.min() / 1e9:.3f} … {stamps.max() / 1e9:.3f} s'
         )
-    maps = Mapper(chosen).run(associator.readings, watch)
+    maps = live.on(Mapper(chosen).run(associator.readings, watch))
     before = [
         *_told_of_poses(associator),
         *associator.limits.warnings(),
         *rejection_warnings(associator.rejected, len(values), 'ranges'),
+        *thinning_note(associator),
     ]
     judged = tuple(data_warnings(maps, {'extrinsics': mounted}))
     path = np.array(associator.path, np.float64).reshape(-1, 2)

@@ -119,9 +119,13 @@ class Mapper:
         # first, since it needs as much memory for a while as the evidence does
         live = self._standard_map(given)
         evidence = self._index(given, start)
-        found = self._search(given, evidence)
-        told = self._hand_out(given, evidence)
-        return self._judge(given, evidence, found, live, told)
+        try:
+            found = self._search(given, evidence)
+            told = self._hand_out(given, evidence)
+            return self._judge(given, evidence, found, live, told)
+        finally:
+            # it takes gigabytes, and whoever ran this may be kept
+            self._evidence = None
 
     def _prepare(self, readings: Readings) -> _Given:
         readings, p = in_canonical_order(readings), self._parameters

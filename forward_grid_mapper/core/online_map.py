@@ -283,11 +283,13 @@ class OnlineMap:
         evidence = self._evidence
         if evidence is not None and evidence.grid.union(g) == evidence.grid:
             return evidence
-        margin = MARGIN + max(g.width, g.height) // 4
-        larger = Grid(g.resolution, g.column - margin, g.row - margin, g.width + 2 * margin, g.height + 2 * margin)
         p = self._parameters
-        if evidence is not None:
-            larger = larger.union(evidence.grid)
+        known = g if evidence is None else g.union(evidence.grid)
+        wide, high = MARGIN + g.width // 4, MARGIN + g.height // 4
+        larger = Grid(g.resolution, g.column - wide, g.row - high, g.width + 2 * wide, g.height + 2 * high).union(known)
+        if larger.size > p.grid.max_cells:
+            # room to grow must not take what the map itself may
+            larger = known
         traversed = np.zeros(larger.shape, np.bool_)
         if evidence is not None:
             inner = larger.window(evidence.grid)

@@ -67,7 +67,7 @@ class TiledMapper:
         self._watch: Watch = lambda stage, progress: None
 
     def cancel(self) -> None:
-        """Make `run` raise `Cancelled` soon; may be called from any thread."""
+        """Make `run` raise `Cancelled` when the tiles at work are done; may be called from any thread."""
         self._stop[0] = 1
 
     def run(self, readings: Readings, watch: Watch = lambda stage, progress: None) -> MapSet:

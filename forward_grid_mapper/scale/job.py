@@ -78,9 +78,15 @@ class Plan(NamedTuple):
     sensors: dict[int, list[int]]
 
 
-@functools.lru_cache(maxsize=2)
 def plan_of(job_folder: WorkFolder, size: float) -> Plan:
     """Return the plan of a job."""
+    # workers may outlive a job, and another one may have its folder
+    written = job_folder.plan.stat()
+    return _plan_of(job_folder, size, (written.st_mtime_ns, written.st_size, written.st_ino))
+
+
+@functools.lru_cache(maxsize=2)
+def _plan_of(job_folder: WorkFolder, size: float, written: tuple[int, int, int]) -> Plan:
     data = read_json(job_folder.plan)
     return Plan(
         Tiling(Grid(*data['grid']), size, data['widest']),

@@ -196,7 +196,6 @@ class ScaledMapper:
             'sensors': {k: [names.index(name) for name in told[k]['sensors']] for k in kept},
         }
         write_json(self._job.folder.plan, plan)
-        plan_of.cache_clear()
         tiling = plan_of(self._job.folder, self._job.size).tiling
         paths = [np.array(told[k]['path'], np.float64).reshape(-1, 2) for k in kept]
         parted = [part for path in paths for part in (path, np.full((1, 2), np.nan))][:-1]

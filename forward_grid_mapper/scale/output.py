@@ -80,7 +80,6 @@ def write_output(
     else:
         layers, step = _write_whole(folder, job, found, parameters), 1
     warnings = list(found.source.get('warnings') or [])
-    step = max(step, 1)
     panels = []
     for name, values in layers.items():
         more = max(1, -(-max(values.shape) // OVERVIEW))

@@ -62,7 +62,7 @@ def corner(number: int, buildings: int) -> tuple[float, float]:
     """Return where the plot of a building begins, metres; successive ones are neighbours."""
     across = math.ceil(math.sqrt(buildings))
     row, column = divmod(number, across)
-    # to and fro, as one ploughs
+    # every second row backwards
     column = across - 1 - column if row % 2 else column
     # a way leads past the plots in the west, and a street past those in the south
     return column * PITCH[0] * 0.1 + 10.0, row * PITCH[1] * 0.1 + 15.0

@@ -111,11 +111,11 @@ def in_canonical_order(readings: Readings) -> Readings:
 
 def of_drives(drives: Sequence[Readings]) -> Readings:
     """Return the readings of several drives, numbered in their order; sensors of one name are one sensor."""
-    names = tuple(sorted({name for readings in drives for name in readings.sensor_names})) or ('',)
+    names = tuple(sorted({name for readings in drives for name in readings.sensor_names or ('',)})) or ('',)
     number = {name: k for k, name in enumerate(names)}
     columns: dict[str, list[NDArray[np.generic]]] = {}
     for k, readings in enumerate(drives):
-        sensors = np.array([number[name] for name in readings.sensor_names] or [0], np.int32)
+        sensors = np.array([number[name] for name in readings.sensor_names or ('',)], np.int32)
         of = replace(readings, sensor=sensors[readings.sensor], drive=np.full(len(readings), k, np.int32))
         for column in fields(Readings):
             if column.name != 'sensor_names':

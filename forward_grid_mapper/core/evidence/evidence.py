@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from contextlib import suppress
 from functools import partial
 from typing import NamedTuple
 
@@ -151,7 +152,7 @@ class Evidence:
 
     @property
     def nbytes(self) -> int:
-        """Memory of the pairs and of what is kept for readings and cells, bytes."""
+        """Memory of the pairs and of what is kept for readings and cells, without surface normals, bytes."""
         s = self.state
         kept = (s.cones, s.reading_states, s.pairs.cell, s.tiles.chunks, s.observing, *s.maps)
         return sum(int(array.nbytes) for array in kept)
@@ -191,12 +192,6 @@ class Evidence:
         """The largest range of every reading in metres, shape (N,)."""
         far = self.state.cones['z_max'][: self._size] - self.model.surface_offset
         out: Floats = far * self.grid.resolution
-        return out
-
-    @property
-    def likelihoods(self) -> Floats:
-        """p(z | m) of every reading in 1/m, shape (N,)."""
-        out: Floats = np.exp(self.state.reading_states['likelihood'][: self._size] * QUANTUM)
         return out
 
     def observed(self) -> NDArray[np.int8]:
@@ -365,7 +360,9 @@ class Evidence:
         self.state = self.state._replace(normals=normals)
         self._since = None
         if self._totals[UNUSED] > MOST_UNUSED * self._totals[WORDS]:
-            self.grow(self.grid)
+            # it saves memory, so it may be left undone where there is none
+            with suppress(MemoryError):
+                self.grow(self.grid)
         return window
 
     def summed(self, begin: int, end: int, work: Work, total: NDArray[np.int64], beside: int = 0) -> None:
@@ -411,7 +408,7 @@ class Evidence:
         self.summed(begin, end, work, self.state.maps.evidence)
 
     def _evaluate_again(self, end: int, new: bool = False) -> None:
-        """Do so for the readings up to `end` in a way that cannot fail: on one thread, heedless of `stop`."""
+        """Do so for the readings up to `end` in a way that cannot fail: on one thread, whatever `stop` says."""
         self.state.maps.evidence[:] = 0
         evaluate_all(self.state._replace(stop=NEVER), 0, end, new)
 
@@ -488,7 +485,7 @@ class Evidence:
         return normals
 
     def _keep_bearings(self, cones: NDArray[np.void]) -> None:
-        """Add what readings say about surface normals, in a way that cannot fail: on one thread, heedless of `stop`."""
+        """Add what readings say about surface normals; it cannot fail: on one thread, whatever `stop` says."""
         gather(cones, self.grid.shape, (0, len(cones)), self._sums, NEVER)
 
     def _reserve(self, size: int) -> None:

@@ -43,7 +43,7 @@ class Pairs(NamedTuple):
 
     A reading with r runs and m band pairs has 2 r words for the first and last cells of its runs, each in one row and
     ascending; then, from near to far, m cells, m densities N(z; d, σ) in 1/m, and m logs of the likelihood ratio of
-    flipping the cell, in units of `logs.QUANTUM`.
+    flipping the cell, in units of `fixed_point.QUANTUM`.
     """
 
     cell: NDArray[np.uint32]

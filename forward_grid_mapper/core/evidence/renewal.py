@@ -18,13 +18,11 @@ from ..runtime.jit import kernel
 from ..sensor.cone import rows_of, runs_of
 from ..sensor.cone_table import cone_of
 from ..sensor.surface_normals import SurfaceNormals, exceeds_incidence_angle
+from .indexing import UNSTORED, UNUSED, WORDS
 from .pairs import WORDS_PER_BAND_PAIR, WORDS_PER_RUN, make
 from .state import State
 from .tile_index import CHUNK, SHIFT
 from .updates import evaluate_and_add, take_off
-
-# places in `Evidence._totals`
-WORDS, UNSTORED, UNUSED = 3, 4, 5
 
 
 def box_of(cones: NDArray[np.void], grid: Grid) -> Window | None:

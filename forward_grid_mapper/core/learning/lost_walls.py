@@ -27,7 +27,7 @@ _JOINED = 2
 """Cells of one stretch are at most so many apart, in rows and columns."""
 _TRAVERSED = 0.3
 """Metres around the place of a sensor that cannot be wall: what is gone from there was somebody walking."""
-_CHUNK = 4096
+_CHUNK, _USUAL_FAN = 4096, 81
 
 
 @dataclass(frozen=True)
@@ -99,11 +99,13 @@ def _arcs(
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return (reading, flat cell) of the cells of `wanted` within one cell of the arcs of the readings `which`."""
     pairs: list[NDArray[np.int64]] = []
-    for begin in range(0, len(which), _CHUNK):
-        numbers = which[begin : begin + _CHUNK]
+    widest = float((readings.half_angle[which] * readings.z[which]).max(initial=0.0)) / grid.resolution
+    # two points a cell
+    fan = np.linspace(-1.0, 1.0, 2 * (2 * int(widest) + 1) + 1)
+    at_once = max(_CHUNK * _USUAL_FAN // len(fan), 1)
+    for begin in range(0, len(which), at_once):
+        numbers = which[begin : begin + at_once]
         part = readings.select(numbers)
-        widest = float((part.half_angle * part.z).max()) / grid.resolution
-        fan = np.linspace(-1.0, 1.0, 2 * min(2 * int(widest) + 1, 40) + 1)
         angles = part.yaw[:, None] + part.half_angle[:, None] * fan
         for shift in (-grid.resolution, 0.0, grid.resolution):
             z: Floats = np.maximum(part.z + shift, 0.0)[:, None]

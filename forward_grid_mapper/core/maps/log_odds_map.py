@@ -82,12 +82,13 @@ class LogOddsMap:
         ------
         InputError
             If the grid would exceed `max_cells`; the map is unchanged.
+        MemoryError
+            As well.
         """
         if not len(readings):
             return
         r = readings
-        self.grid = map_grid(r, self._parameters, self.grid, self._arc)
-        self._grow()
+        self._grow(map_grid(r, self._parameters, self.grid, self._arc))
         g = self._stored
         beams = Beams(*(np.ascontiguousarray(v) for v in (r.x, r.y, r.yaw, r.half_angle, r.z, r.z_max)))
         lattice = Lattice(float(g.resolution), g.column, g.row, g.width, g.height)
@@ -105,8 +106,7 @@ class LogOddsMap:
             return
         grid = self.grid.union(other.grid)
         check_size(grid, self._parameters.grid)
-        self.grid = grid
-        self._grow()
+        self._grow(grid)
         for k in range(len(self._planes)):
             mine = self._plane(self._planes, k, self._stored)[self._stored.window(other.grid)]
             mine += other._plane(other._planes, k, other._stored)[other._stored.window(other.grid)]
@@ -162,10 +162,12 @@ class LogOddsMap:
         together[untouched] = np.nan
         return together
 
-    def _grow(self) -> None:
-        if self._stored.union(self.grid) == self._stored:
+    def _grow(self, g: Grid) -> None:
+        """Have a grid, or, without the memory for it, that of before."""
+        if self._stored.union(g) == self._stored:
+            self.grid = g
             return
-        stored, g = self.grid, self.grid
+        stored = g
         if self._stored.size:
             # a robot that drives on; what is offered at once is often all there is
             wide, high = g.width + 2 * MARGIN, g.height + 2 * MARGIN
@@ -174,4 +176,4 @@ class LogOddsMap:
         if self._stored.size:
             for k in range(len(grown)):
                 self._plane(grown, k, stored)[stored.window(self._stored)] = self._plane(self._planes, k, self._stored)
-        self._stored, self._planes = stored, grown
+        self.grid, self._stored, self._planes = g, stored, grown

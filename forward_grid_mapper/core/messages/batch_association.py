@@ -46,7 +46,7 @@ class _Waiting(NamedTuple):
 
 
 class BatchAssociator(PoseAssociator):
-    """A patient associator, as befits a file, that takes messages in batches or one at a time.
+    """A patient associator, for files, that takes messages in batches or one at a time.
 
     In a batch, an answer of `extrinsics` that is a `Later` is final.
     """

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
+from numbers import Real
 
 from ..common.errors import ParameterError
 from .message_types import Pose2
@@ -31,7 +32,7 @@ def mount_of(name: str, values: object) -> Pose2:
         If it is not that, or the numbers can only be of other units.
     """
     numbers = list(values) if isinstance(values, Iterable) and not isinstance(values, str) else []
-    good = [float(v) for v in numbers if isinstance(v, (int, float)) and not isinstance(v, bool) and math.isfinite(v)]
+    good = [float(v) for v in numbers if isinstance(v, Real) and not isinstance(v, bool) and math.isfinite(v)]
     if len(good) != 3 or len(numbers) != 3:
         raise ParameterError(f'{name}: {values!r} is not [x, y, yaw], three finite numbers (metres, radians)')
     pose = Pose2(*good)

@@ -135,7 +135,7 @@ class OdometryRecord:
         return stamp[begin:], pose[begin:]
 
     def since(self, stamp: int) -> tuple[NDArray[np.int64], Floats]:
-        """Return stamps and poses from one stamp on, as `snapshot` does, without those that came late of late."""
+        """Return stamps and poses from one stamp on, as `snapshot` does, without late ones not yet sorted in."""
         begin = int(np.searchsorted(self._stamp[: self._size], stamp))
         return self._stamp[begin : self._size], self._pose[begin : self._size]
 

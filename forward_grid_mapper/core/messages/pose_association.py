@@ -87,7 +87,7 @@ class PoseAssociator:
             Answers where a sensor sits on the robot (`extrinsics`).
         parameters : Parameters, optional
         patient : bool
-            Keep all odometry and let readings wait for it without a bound, as befits a file: then the readings accepted
+            Keep all odometry and let readings wait for it without a bound, as a file allows: then the readings accepted
             do not depend on how the two streams interleave.
         clock : callable
             Returns seconds. A reading times out when `pose_timeout` has passed both by the stamps that came after it

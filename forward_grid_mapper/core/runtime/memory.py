@@ -7,6 +7,7 @@ or it takes the readings and the live map with it.
 from __future__ import annotations
 
 import resource
+from collections.abc import Iterator
 from pathlib import Path
 
 from ..common.parameters import Parameters
@@ -25,7 +26,11 @@ THREAD_MEMORY = 64_000_000
 """Bytes that all threads but the first may take together. Where an array for each of them would be more, on maps of
 some hundred thousand cells and more, fewer threads work; the maps are the same."""
 
-CGROUP = Path('/sys/fs/cgroup')
+CGROUP, OWN_CGROUPS = Path('/sys/fs/cgroup'), Path('/proc/self/cgroup')
+"""Where control groups are, and the file that names those of this process."""
+
+NO_LIMIT = 1 << 60
+"""Bytes from which on a limit is none."""
 
 
 def least_memory(cells: int, readings: int, threads: int) -> int:
@@ -57,7 +62,7 @@ def shortage(cells: int, readings: int, threads: int) -> str:
     if free is None or needed <= free:
         return ''
     return (
-        f'EM of {readings} readings takes {needed / 1e9:.1f} GB at the least, and {free / 1e9:.1f} GB are free; '
+        f'EM of {readings} readings takes {_words(needed)} at the least, and {_words(free)} are free; '
         f'lower max_readings, use a coarser resolution, or reset'
     )
 
@@ -73,17 +78,55 @@ def _of_the_process() -> int | None:
 
 
 def _of_the_group() -> int | None:
+    """Return the least that its control group, or one that this is in, leaves; of either version of control groups."""
+    left = [_left_in(folder, *names) for folder, names in _groups()]
+    return min((value for value in left if value is not None), default=None)
+
+
+def _groups() -> Iterator[tuple[Path, tuple[str, str, str]]]:
+    """Yield the folders of its control groups, and what limit, use, and reclaimable part of it are called there."""
+    second = 'memory.max', 'memory.current', 'inactive_file'
+    first = 'memory.limit_in_bytes', 'memory.usage_in_bytes', 'total_inactive_file'
+    yield CGROUP, second
+    yield CGROUP / 'memory', first
     try:
-        limit = (CGROUP / 'memory.max').read_text().strip()
-        used = int((CGROUP / 'memory.current').read_text())
-        return None if limit == 'max' else int(limit) - used
+        lines = OWN_CGROUPS.read_text().splitlines()
+    except OSError:
+        return
+    for line in lines:
+        _, controllers, path = [*line.split(':', 2), '', ''][:3]
+        names = second if not controllers else first if 'memory' in controllers.split(',') else None
+        folder = Path(path.lstrip('/'))
+        while names and folder.parts:
+            yield CGROUP / ('memory' if controllers else '') / folder, names
+            folder = folder.parent
+
+
+def _left_in(folder: Path, limit: str, use: str, reclaimable: str) -> int | None:
+    try:
+        most, used = (folder / limit).read_text().strip(), int((folder / use).read_text())
+        if most == 'max' or int(most) >= NO_LIMIT:
+            return None
     except (OSError, ValueError):
         return None
+    # what files were read is in there, too, and given up where it is needed
+    return int(most) - max(used - (_number(folder / 'memory.stat', reclaimable) or 0), 0)
 
 
 def _kilobytes(path: Path, key: str) -> int | None:
+    found = _number(path, key)
+    return None if found is None else found * 1024
+
+
+def _number(path: Path, key: str) -> int | None:
+    """Return the number behind a key in a file that has one a line."""
     try:
-        line = next(line for line in path.read_text().splitlines() if line.startswith(key))
-        return int(line.split()[1]) * 1024
-    except (OSError, StopIteration, ValueError, IndexError):
+        words = [line.split() for line in path.read_text().splitlines()]
+        return next(int(line[1]) for line in words if len(line) > 1 and line[0] == key)
+    except (OSError, StopIteration, ValueError):
         return None
+
+
+def _words(size: float) -> str:
+    """Return bytes in words."""
+    return f'{size / 1e9:.1f} GB' if size >= 1e9 else f'{size / 1e6:.0f} MB'

@@ -114,11 +114,11 @@ def found_normals(given: Given, parameters: Parameters) -> NDArray[np.float32]:
     return np.stack([given.core(normals.x), given.core(normals.y)])
 
 
-def _evidence(given: Given, parameters: Parameters, stop: NDArray[np.uint8] | None = None) -> Evidence:
+def _evidence(given: Given, parameters: Parameters) -> Evidence:
     threads = parameters.search.threads or 1
     memory = memory_for_pairs(parameters)
     normals = normals_from(given.normals, parameters)
-    made = Evidence(given.box, parameters.model, memory, threads, stop, given.occupied, normals=normals)
+    made = Evidence(given.box, parameters.model, memory, threads, start=given.occupied, normals=normals)
     if len(given.readings):
         made.extend(given.readings)
     return made
@@ -133,22 +133,22 @@ def _filled_part(mask: NDArray[np.bool_], window: Grid) -> Grid | None:
     return Grid(window.resolution, window.column + columns[0], window.row + rows[0], width, height)
 
 
-def first_map(given: Given, parameters: Parameters, stop: NDArray[np.uint8] | None = None) -> Searched:
+def first_map(given: Given, parameters: Parameters) -> Searched:
     """Search all of the box from the empty map, and return the window's part of it.
 
     What lies outside of the window is not seen by all its readings, and serves to explain those of the window.
     """
     given = given._replace(occupied=np.zeros_like(given.occupied))
-    evidence = _evidence(given, parameters, stop)
+    evidence = _evidence(given, parameters)
     found = Search(evidence, parameters.search, given.traversed.ravel()).run()
     occupied = evidence.state.maps.occupied.reshape(given.box.shape)
     part = np.array(occupied[given.box.window(given.tile.window)])
     return Searched(part, _filled_part(part != 0, given.tile.window), found.progress, found.converged)
 
 
-def improved(given: Given, parameters: Parameters, stop: NDArray[np.uint8] | None = None) -> Searched:
+def improved(given: Given, parameters: Parameters) -> Searched:
     """Search the window, and hold the rest of the box, until nothing gains."""
-    evidence = _evidence(given, parameters, stop)
+    evidence = _evidence(given, parameters)
     rows, columns = given.box.window(given.tile.window)
     window = rows.start, rows.stop, columns.start, columns.stop
     before = evidence.state.maps.occupied.copy()

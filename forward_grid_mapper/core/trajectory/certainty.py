@@ -178,7 +178,7 @@ def of_ways(
 
 
 def thinned(readings: Readings, every: int) -> Readings:
-    """Return every so-manieth reading of each sensor, each sensor beginning with another one."""
+    """Return every n-th reading of each sensor, each sensor beginning with another one."""
     readings = readings.select(np.argsort(readings.stamp, kind='stable'))
     stay = np.zeros(len(readings), np.bool_)
     for number in np.unique(readings.sensor):

@@ -19,6 +19,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ..common.errors import InputError
 from ..common.parameters import Parameters
 from ..common.readings import Readings
 from ..runtime.cancelling import check
@@ -225,7 +226,11 @@ class Refiner:
     def _at_any_angle(self, drive: _Drive, by_walls: _Attempt, least_moved: float) -> Refinement:
         """Return the trajectory that matches alone say, if it is better than what walls at right angles say."""
         readings, odometry, windows, scans = drive
-        found = matched(odometry, scans, self._say, self._parameters.association.odometry_noise)
+        try:
+            found = matched(odometry, scans, self._say, self._parameters.association.odometry_noise)
+        except InputError:
+            # its cells are of one size, so that a map of the whole drive may be too large though the maps are not
+            found = None
         if found is None:
             return _stays(by_walls.refinement)
         nodes = found.nodes

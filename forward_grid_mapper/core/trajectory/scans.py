@@ -46,7 +46,7 @@ class Scans:
         local = relative(np.repeat(windows.node, np.diff(first), axis=0), sensors)
         unknown = UNKNOWN * hit_probability(parameters.model, resolution)
         whole = make_scan(windows.readings, local, parameters.model, resolution, unknown)
-        # in any order, so that every so-manieth reading is not of the same few sensors
+        # in any order, so that every n-th reading is not of the same few sensors
         window = np.repeat(np.arange(len(windows)), np.diff(first))
         mixed = whole.readings[np.lexsort((np.random.default_rng(0).random(len(window)), window))]
         self.count = np.where(held_out, 0, np.diff(first))
@@ -83,7 +83,7 @@ class Scans:
             return None
         which = self._readings_of(members)
         if len(which) > most:
-            # sensors take turns, so every so-manieth reading may be of a few of them only
+            # sensors take turns, so every n-th reading may be of a few of them only
             which = np.sort(np.random.default_rng(len(which)).choice(which, most, replace=False))
         return local_map(self._placed(which, nodes, origin), self._parameters, self._stop)
 

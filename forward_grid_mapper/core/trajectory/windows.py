@@ -1,6 +1,6 @@
 """The windows of a drive: pieces short enough for the shape that odometry gives them, each with a node in its middle.
 
-    u = travel / 1.5 m + |turn| / 270°
+    u = travel / 0.4 m + |turn| / 90°
 
 counts how far odometry has drifted, more or less; a window is a whole step of u. Its *node* is the robot's pose in the
 middle of the step. The trajectory is a pose for each node; between nodes the correction of the odometry goes over
@@ -185,8 +185,9 @@ def cut(readings: Readings, odometry: Odometry) -> Windows:
     u = travel / TRAVEL + turn / TURN
     seconds = odometry.seconds(readings.stamp)
     count = max(int(u[-1]), 1)
-    # where the robot stands u does not grow: its middle is when it first came there
-    rising = np.concatenate([[True], np.diff(u) > 0])
+    # where the robot stands u does not grow: the way goes on from the end of it
+    grows = np.diff(u) > 0
+    rising = np.concatenate([[True], grows]) | np.concatenate([grows, [True]])
     middle = np.interp(np.arange(count) + 0.5, u[rising], knots[rising])
     of_reading = np.clip(np.interp(seconds, knots, u).astype(np.int64), 0, count - 1)
     first = np.searchsorted(of_reading, np.arange(count + 1))
