@@ -32,7 +32,7 @@ ALLOWED = {
     '~/change_state': 'a service of every lifecycle node',
     '~/get_state': 'a service of every lifecycle node',
     'manager.yaml': 'a file of the user',
-    'node_names': "a parameter of Nav2's lifecycle manager",
+    'bond_timeout': "a parameter of Nav2's lifecycle manager",
     '~/live_map_updates': "the live map's topic and an ending",
     'map_updates': "the map's topic and an ending",
     'NUMBA_CACHE_DIR': 'an environment variable of numba',

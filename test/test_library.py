@@ -91,6 +91,18 @@ def test_what_is_wrong_without_an_error_is_a_warning() -> None:
     assert any('mm' in warning or 'millimetre' in warning for warning in make_maps(**arrays).warnings)
 
 
+def test_readings_that_max_readings_leaves_out_are_told_of() -> None:
+    arrays = given()
+    whole = make_maps(**arrays)
+    most = len(whole.maps.readings) // 2
+    part = make_maps(**arrays, parameters={'max_readings': most})
+    assert len(part.maps.readings) <= most
+    assert any('max_readings' in warning for warning in part.warnings)
+    assert not any('max_readings' in warning for warning in whole.warnings)
+    # the live map has all of them
+    assert np.array_equal(part.maps.live, whole.maps.live, equal_nan=True)
+
+
 def test_the_report_warns_of_what_the_result_warns_of(tmp_path: Path) -> None:
     arrays = given()
     poses = np.array(arrays['poses'])

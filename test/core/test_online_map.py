@@ -18,6 +18,7 @@ from forward_grid_mapper.core.common.errors import InputError
 from forward_grid_mapper.core.common.grid import Grid, part_of
 from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.common.readings import Readings
+from forward_grid_mapper.core.evidence import evidence as evidence_module
 from forward_grid_mapper.core.evidence.evidence import Evidence
 from forward_grid_mapper.core.evidence.neighbourhood import patterns
 from forward_grid_mapper.core.mapping import Mapper
@@ -247,6 +248,41 @@ def test_cleared_it_is_as_new_and_empty_adds_change_nothing() -> None:
         online.add(some(count=0))
         online.add(some(2).select(slice(begin, begin + 24)))
     assert same(online, fresh)
+
+
+@pytest.mark.parametrize('turned', [False, True])
+def test_a_corridor_has_room_along_it_and_within_max_cells(turned: bool) -> None:
+    way = np.arange(0.0, 60.0, 0.5)
+    x, y = (way * 0.0, way) if turned else (way, way * 0.0)
+    readings = Readings.from_columns(
+        ('a',), x=x, y=y, yaw=way, z=np.ones(len(way)), z_max=2.0, half_angle=0.13, stamp=(way * 1e9).astype(np.int64)
+    )
+    online = in_sweeps(readings, Parameters())
+    room, needed = online._evidence.grid, online.grid
+    assert needed.width <= room.width <= 1.5 * needed.width + 2 * MARGIN
+    assert needed.height <= room.height <= 1.5 * needed.height + 2 * MARGIN
+    most = online.grid.size + 1000
+    bounded = in_sweeps(readings, Parameters().varied({'max_cells': most}))
+    assert bounded.grid == online.grid
+    assert bounded._evidence.grid.size <= most
+
+
+def test_without_memory_to_pack_pairs_it_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    recording = door_drive(3, NOISY, 0)
+    whole = in_sweeps(recording.readings, Parameters())
+    tried = []
+
+    def grow(self: Evidence, grid: Grid) -> None:
+        if grid == self.grid:
+            tried.append(grid)
+            raise MemoryError
+        return was(self, grid)
+
+    was = Evidence.grow
+    monkeypatch.setattr(Evidence, 'grow', grow)
+    monkeypatch.setattr(evidence_module, 'MOST_UNUSED', -1.0)
+    short = in_sweeps(recording.readings, Parameters())
+    assert tried and same(short, whole)
 
 
 def test_a_jump_is_not_driven_over() -> None:

@@ -27,7 +27,7 @@ from forward_grid_mapper.files.map_archive import read_npz
 from forward_grid_mapper.files.map_files import read_map
 from forward_grid_mapper.recordings.drive import WHOLE
 from forward_grid_mapper.scale import extra
-from forward_grid_mapper.scale.job import Job, Recordings, check_versions, versions
+from forward_grid_mapper.scale.job import Job, Recordings, check_versions, plan_of, versions
 from forward_grid_mapper.scale.work_folder import WorkFolder, whole
 from forward_grid_mapper.simulation.campus import campus_drive
 from forward_grid_mapper.simulation.sonar import front_array
@@ -455,6 +455,23 @@ def test_a_work_folder_holds_one_job(tmp_path: Path) -> None:
     with pytest.raises(OutputError, match='not empty'):
         WorkFolder(str(tmp_path / 'other')).begin({})
     assert [path.name for path in (tmp_path / 'other').iterdir()] == ['file']
+
+
+def test_a_worker_that_outlives_a_job_takes_the_plan_of_the_next(tmp_path: Path) -> None:
+    work = WorkFolder(str(tmp_path))
+    for name, width in (('left', 30), ('right', 50)):
+        plan = {
+            'grid': [0.1, 0, 0, width, 20],
+            'widest': 3.0,
+            'sensor_names': [name],
+            'drives': [0],
+            'sensors': {0: [0]},
+        }
+        work.plan.unlink(missing_ok=True)
+        work.plan.write_text(json.dumps(plan))
+        found = plan_of(work, 5.0)
+        assert (found.sensor_names, found.tiling.grid.width) == ((name,), width)
+        assert plan_of(work, 5.0) is found
 
 
 @pytest.mark.parametrize(('number', 'told'), [(errno.ENOSPC, 'disk is full'), (errno.EACCES, 'permission')])

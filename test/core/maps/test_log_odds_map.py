@@ -164,6 +164,20 @@ def test_a_map_that_would_be_too_large_is_refused_and_nothing_changes() -> None:
     assert np.array_equal(live.log_odds(), before, equal_nan=True)
 
 
+def test_a_growth_without_memory_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    live = LogOddsMap(Parameters())
+    near = random_readings(np.random.default_rng(4), AREA, 5, z_max=1.0)
+    live.add(near)
+    before, grid = live.log_odds(), live.grid
+    far = dataclasses.replace(near, x=near.x + 50.0)
+    with monkeypatch.context() as patched, pytest.raises(MemoryError):
+        patched.setattr(np, 'full', lambda *arguments: (_ for _ in ()).throw(MemoryError))
+        live.add(far)
+    assert live.grid == grid and np.array_equal(live.log_odds(), before, equal_nan=True)
+    live.add(near)
+    assert np.nanmax(np.abs(live.log_odds())) > np.nanmax(np.abs(before))
+
+
 def test_evidence_that_cancels_leaves_a_known_cell() -> None:
     live = LogOddsMap(Parameters().varied({'live_p_occupied': 0.8, 'live_p_free': 0.2}))
     both = Readings.from_columns(x=0.05, y=0.05, yaw=0.0, z=[1.0, 2.0], z_max=4.0, half_angle=0.1)

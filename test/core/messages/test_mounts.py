@@ -18,6 +18,11 @@ def test_forms_of_three_numbers(form: type) -> None:
     assert mount_of('left', form([0.1, -0.2, 1.5])) == Pose2(0.1, -0.2, 1.5)
 
 
+@pytest.mark.parametrize('kind', [np.float32, np.int32])
+def test_numbers_of_numpy_are_numbers(kind: type) -> None:
+    assert mount_of('left', np.array([1, 0, -2], kind)) == Pose2(1.0, 0.0, -2.0)
+
+
 def test_the_limits_are_admitted() -> None:
     assert mount_of('left', [FARTHEST, 0, float(np.float32(-TURN))]).x == FARTHEST
 

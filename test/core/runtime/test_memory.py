@@ -52,6 +52,39 @@ def test_what_is_free_is_known_and_bounded_by_the_group(monkeypatch: pytest.Monk
     (tmp_path / 'memory.current').write_text('2000000\n')
     assert free_memory() == 3_000_000
     assert shortage(1000, 10, 1) == ''
-    assert '0.0 GB are free' in shortage(10**5, 12_000, 1)
+    assert '15 MB at the least, and 3 MB are free' in shortage(10**5, 12_000, 1)
     (tmp_path / 'memory.max').write_text('max\n')
     assert shortage(10**5, 12_000, 1) == ''
+
+
+@pytest.mark.parametrize('version', [1, 2])
+def test_the_group_of_a_service_is_its_own_and_what_files_were_read_is_no_use(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, version: int
+) -> None:
+    limit, use, cached = (
+        ('memory.limit_in_bytes', 'memory.usage_in_bytes', 'total_inactive_file'),
+        ('memory.max', 'memory.current', 'inactive_file'),
+    )[version - 1]
+    root = tmp_path / 'cgroup'
+    group = root / ('memory' if version == 1 else '') / 'system.slice' / 'mapper.service'
+    group.mkdir(parents=True)
+    own = tmp_path / 'own'
+    own.write_text(
+        '12:cpu,memory:/system.slice/mapper.service\n' if version == 1 else '0::/system.slice/mapper.service\n'
+    )
+    monkeypatch.setattr(memory, 'CGROUP', root)
+    monkeypatch.setattr(memory, 'OWN_CGROUPS', own)
+    machine = free_memory()
+    assert machine is not None and machine > 10**7
+    (group / limit).write_text('9000000\n')
+    (group / use).write_text('8000000\n')
+    assert free_memory() == 1_000_000
+    (group / 'memory.stat').write_text(f'anon 1\n{cached} 6000000\n')
+    assert free_memory() == 7_000_000
+    # that of the slice, which it is in, counts as well
+    (group.parent / limit).write_text('9000000\n')
+    (group.parent / use).write_text('8500000\n')
+    assert free_memory() == 500_000
+    for folder in (group, group.parent):
+        (folder / limit).write_text('9223372036854771712\n' if version == 1 else 'max\n')
+    assert free_memory() > 10**7

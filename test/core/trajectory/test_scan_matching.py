@@ -206,6 +206,16 @@ def test_what_readings_do_not_speak_for_is_left(bent, matched, monkeypatch) -> N
     assert left.reason == refinement.NO_WALLS + refinement.NOR_MATCHES
 
 
+def test_a_drive_too_large_for_cells_of_one_size_keeps_what_walls_say(bent, scans) -> None:
+    recording, odometry = bent
+    drive_of = _Drive(recording.readings, odometry, scans.windows, scans)
+    attempt = by_walls(scans, recording, odometry)
+    small = Scans(
+        scans.windows, for_matching(Parameters.from_flat({'max_cells': 1000})), np.zeros(1, np.uint8), scans.held_out
+    )
+    assert Refiner(Parameters())._at_any_angle(drive_of._replace(scans=small), attempt, 0.15) is attempt.refinement
+
+
 class Trials:
     """A solver that puts the second half of a drive a metre farther with each round, and what it is asked.
 

@@ -1,0 +1,41 @@
+"""Windows of a drive: nodes in their middles, one behind the other, wherever the robot stood."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from forward_grid_mapper.core.common.readings import Readings
+from forward_grid_mapper.core.trajectory.windows import Odometry, corrected, cut
+
+
+def driven(steps: list[tuple[float, float]]) -> tuple[Readings, Odometry]:
+    """A drive along x in steps of seconds and metres, and a reading of each of two sensors at every pose."""
+    seconds, metres = np.cumsum([(0.0, 0.0), *steps], axis=0).T
+    stamp = np.round(seconds * 1e9).astype(np.int64)
+    odometry = Odometry.of(stamp, np.stack([metres, 0.0 * metres, 0.0 * metres], axis=1))
+    both = {'x': np.repeat(metres, 2), 'stamp': np.repeat(stamp, 2), 'sensor': np.tile([0, 1], len(stamp))}
+    return Readings.from_columns(
+        ('left', 'right'), **both, y=0.0, yaw=0.0, z=both['x'] * 0.0 + 1.0, z_max=3.0, half_angle=0.1
+    ), odometry
+
+
+@pytest.mark.parametrize('last', [0.3, 0.6, 0.9, 1.3])
+@pytest.mark.parametrize('stop', [0, 100])
+def test_no_two_nodes_fall_together_where_the_robot_stood(last: float, stop: int) -> None:
+    readings, odometry = driven([(0.1, 0.02)] * 100 + [(0.1, 0.0)] * stop + [(0.1, last)])
+    windows = cut(readings, odometry)
+    assert (np.diff(windows.node_progress) > 0.0).all()
+    assert windows.node[:, 0] == pytest.approx(0.2 + 0.4 * np.arange(len(windows)), abs=1e-6)
+    same = corrected(odometry.progress, odometry.pose, windows.node_progress, windows.node, windows.node)
+    assert same == pytest.approx(odometry.pose, abs=1e-9)
+
+
+def test_nodes_of_slow_odometry_lie_on_the_way() -> None:
+    rng = np.random.default_rng(3)
+    for _ in range(20):
+        steps = [(1.0, 0.8 * float(moves)) for moves in rng.random(60) < 0.5]
+        readings, odometry = driven([(1.0, 0.8), *steps, (1.0, 0.8)])
+        windows = cut(readings, odometry)
+        assert (np.diff(windows.node_progress) > 0.0).all()
+        assert windows.travel == pytest.approx(windows.node[:, 0], abs=1e-6)
