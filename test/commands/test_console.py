@@ -118,6 +118,7 @@ def test_errors_are_one_line(tmp_path: Path) -> None:
     assert re.fullmatch(r'process_bag: error: .*absent does not exist.*\n', done.stderr)
 
 
+@pytest.mark.slow
 def test_a_reader_that_goes_away(tmp_path: Path, bag: Path) -> None:
     """As `process_bag … | head` and `| true` do."""
     for arguments in (['--list-parameters'], [str(bag), '-o', str(tmp_path / 'maps')]):
@@ -145,6 +146,7 @@ def test_output_that_cannot_be_printed(tmp_path: Path, bag: Path) -> None:
         assert re.fullmatch(r'process_bag: error: .*No space left on device\n', done.stderr)
 
 
+@pytest.mark.slow
 def test_a_terminal_that_cannot_show_a_name(tmp_path: Path, bag: Path) -> None:
     done = shell('process_bag', bag, '-q', '-o', tmp_path / 'maps–日本', PYTHONIOENCODING='latin-1')
     assert done.returncode == 0, done.stderr

@@ -313,6 +313,7 @@ def test_a_sensor_that_is_missing_is_told(days: Path, tmp_path: Path) -> None:
     assert warning.startswith(f'{other} has no reading of {frame},')
 
 
+@pytest.mark.slow
 def test_a_drive_in_a_frame_of_its_own_is_told(tmp_path: Path) -> None:
     way = np.array([[1.5, 1.5], [3.0, 3.45], [9.0, 3.45], [9.0, 2.0], [10.5, 6.5]])
     paths = []

@@ -19,6 +19,7 @@ LEAST = {
 """The fraction of the floor that a robot may use in map and reference alike (nav_iou), and F1 of the wall cells."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('run', ['office_a', 'office_b'])
 def test_floor_that_a_robot_may_use(shared: Path, tmp_path: Path, run: str) -> None:
     pytest.importorskip('scipy', reason='score_map.py needs scipy')

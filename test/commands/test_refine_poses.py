@@ -161,6 +161,7 @@ def test_each_of_several_drives_is_judged_for_itself(days: dict[str, Any]) -> No
     assert '(trajectory_3.tum)' in text
 
 
+@pytest.mark.slow
 def test_drives_that_are_refined_fit_those_that_are_not(days: dict[str, Any]) -> None:
     found = [np.loadtxt(days['maps'] / f'trajectory_{number}.tum')[:, 1:3] for number in (1, 3)]
     for poses, true in zip(found, (days['true'][0], days['true'][2]), strict=True):
@@ -175,6 +176,7 @@ def test_drives_that_are_refined_fit_those_that_are_not(days: dict[str, Any]) ->
         assert np.array_equal(one.z, other.z)
 
 
+@pytest.mark.slow
 def test_drives_that_all_stay_make_the_same_maps(days: dict[str, Any], tmp_path: Path) -> None:
     other = drive_of(tmp_path, 4, 3, 8, None)[0]
     bags = [days['bags'][1], other]

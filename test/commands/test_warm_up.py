@@ -39,6 +39,7 @@ def signatures():
 """
 
 
+@pytest.mark.slow
 def test_a_trajectory_and_its_maps_need_no_more_kernels() -> None:
     program = f"""{SIGNATURES}
 warm_up()

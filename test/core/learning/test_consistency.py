@@ -141,7 +141,18 @@ SCENARIOS: dict[str, tuple[Callable[[Messages], Messages], str]] = {
 }
 
 
-@pytest.mark.parametrize('name', sorted(SCENARIOS))
+FEW = (
+    'left and right of the sensors swapped',
+    'odometry in feet',
+    'ranges half a second late',
+    'half of the field of view',
+)
+"""Those that are tried first, one of each kind."""
+
+
+@pytest.mark.parametrize(
+    'name', [*FEW, *(pytest.param(name, marks=pytest.mark.slow) for name in sorted({*SCENARIOS} - {*FEW}))]
+)
 def test_wrong_poses_are_warned_of(name: str) -> None:
     change, expected = SCENARIOS[name]
     warnings = told(change(office()))

@@ -168,6 +168,7 @@ def sample(rng: np.random.Generator, readings, grid, occupied, model):
     return dataclasses.replace(readings, z=np.abs(z))
 
 
+@pytest.mark.slow
 def test_learning_recovers_the_truth_when_it_knows_the_map() -> None:
     rng = np.random.default_rng(5)
     grid = Grid(0.1, 0, 0, 30, 30)

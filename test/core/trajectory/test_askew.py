@@ -124,6 +124,7 @@ def test_a_node_has_the_direction_of_the_nearest_votes(bent, found) -> None:
         assert angle in found.askew[off == off.min()]
 
 
+@pytest.mark.slow
 def test_a_drive_through_both_parts_is_refined(exact: Recording, bent: tuple[Recording, Odometry, Windows]) -> None:
     (recording, odometry, _), true = bent, odometry_of(exact)
     assert rms_after_alignment(odometry.pose, true.pose) > 1.0
@@ -195,6 +196,7 @@ def test_walls_askew_are_as_far_as_those_of_a_map_turned_back(bent) -> None:
     assert one.normal @ np.array([[c, s], [-s, c]]) == pytest.approx(other.normal, abs=1e-9)
 
 
+@pytest.mark.slow
 def test_drift_is_not_taken_for_another_part() -> None:
     recording = drive(building_world(), building_tour(), 0.1, front_array(), NOISY, seed=3)
     drifting = with_drift(recording, LEVELS['wheels'], 2)

@@ -75,6 +75,7 @@ def test_what_is_not_curved_has_no_top() -> None:
     assert top_of(flat[:5] - 1, flat[:5], flat[:5] - 1) is None
 
 
+@pytest.mark.slow
 def test_a_scale_is_told_or_nothing_is_said(tour: Recording) -> None:
     true = odometry_of(tour)
     want = {'scale': 0.03, 'heading': -0.02}

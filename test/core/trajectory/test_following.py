@@ -115,7 +115,9 @@ def test_what_was_found_as_a_whole_stays_and_nothing_is_left_out(sample: Sample,
     assert np.hypot(*np.diff(path[:, :2], axis=0).T).max() < 0.1, 'no jumps'
 
 
-@pytest.mark.parametrize('every', [pytest.param(1, marks=pytest.mark.slow), 7, 150])
+@pytest.mark.parametrize(
+    'every', [pytest.param(1, marks=pytest.mark.slow), 7, pytest.param(150, marks=pytest.mark.slow)]
+)
 def test_portions_do_not_matter(sample: Sample, followed: Follower, every: int) -> None:
     stamps = sample.odometry.stamp[sample.known :: every]
     follower, changes = follower_of(sample), 0

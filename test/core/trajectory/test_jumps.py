@@ -141,6 +141,7 @@ def test_exact_odometry_that_begins_anew_is_put_together_and_otherwise_stays(exa
     assert found.calibration == {}
 
 
+@pytest.mark.slow
 def test_missing_messages_are_no_reason_to_move_exact_odometry(exact: Recording) -> None:
     readings, odometry = without_messages(exact.readings, odometry_of(exact), 5.0)
     assert len(jumps(odometry)) == 1
