@@ -240,6 +240,8 @@ def test_a_clean_up_leaves_neither_readings_nor_threads(inside: Callable[..., In
         robot.until(lambda: not Kernels.at_work)
         parts = [weakref.ref(part) for part in (node.associator, node.associator.buffer, node.live, node.em, node.maps)]
         assert node.trigger_deactivate() == node.trigger_cleanup() == TransitionCallbackReturn.SUCCESS
+        # the executor looks anew what there is
+        robot.spin(0.1)
         gc.collect()
         assert [part() for part in parts] == [None] * len(parts)
         assert not {thread.name for thread in threading.enumerate()} & {'kernels', 'live map', 'EM', 'readings'}
