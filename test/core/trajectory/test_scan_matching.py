@@ -211,7 +211,7 @@ def test_a_drive_too_large_for_cells_of_one_size_keeps_what_walls_say(bent, scan
     drive_of = _Drive(recording.readings, odometry, scans.windows, scans)
     attempt = by_walls(scans, recording, odometry)
     small = Scans(
-        scans.windows, for_matching(Parameters.from_flat({'max_cells': 1000})), np.zeros(1, np.uint8), scans.held_out
+        scans.windows, for_matching(Parameters.from_flat({'max_cells': 10_000})), np.zeros(1, np.uint8), scans.held_out
     )
     assert Refiner(Parameters())._at_any_angle(drive_of._replace(scans=small), attempt, 0.15) is attempt.refinement
 
