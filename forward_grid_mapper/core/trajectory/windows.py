@@ -185,10 +185,14 @@ def cut(readings: Readings, odometry: Odometry) -> Windows:
     u = travel / TRAVEL + turn / TURN
     seconds = odometry.seconds(readings.stamp)
     count = max(int(u[-1]), 1)
-    # where the robot stands u does not grow: the way goes on from the end of it
     grows = np.diff(u) > 0
-    rising = np.concatenate([[True], grows]) | np.concatenate([grows, [True]])
-    middle = np.interp(np.arange(count) + 0.5, u[rising], knots[rising])
+    came, went = np.concatenate([[True], grows]), np.concatenate([grows, [True]])
+    half = np.arange(count) + 0.5
+    # u does not grow where the robot stands: a node just behind such a place is put there, where it was read from
+    middle = np.interp(half, u[came], knots[came])
+    again = np.concatenate([[False], np.diff(np.interp(middle, knots, u)) <= 0.0])
+    # unless another node is there
+    middle[again] = np.interp(half[again], u[came | went], knots[came | went])
     of_reading = np.clip(np.interp(seconds, knots, u).astype(np.int64), 0, count - 1)
     first = np.searchsorted(of_reading, np.arange(count + 1))
     progress = odometry.progress

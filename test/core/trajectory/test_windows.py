@@ -26,7 +26,10 @@ def test_no_two_nodes_fall_together_where_the_robot_stood(last: float, stop: int
     readings, odometry = driven([(0.1, 0.02)] * 100 + [(0.1, 0.0)] * stop + [(0.1, last)])
     windows = cut(readings, odometry)
     assert (np.diff(windows.node_progress) > 0.0).all()
-    assert windows.node[:, 0] == pytest.approx(0.2 + 0.4 * np.arange(len(windows)), abs=1e-6)
+    middle = 0.2 + 0.4 * np.arange(len(windows))
+    assert windows.node[:-3, 0] == pytest.approx(middle[:-3], abs=1e-6)
+    # one of them may be where the robot stood
+    assert (np.abs(windows.node[-3:, 0] - middle[-3:]) > 1e-6).sum() <= (stop > 0)
     same = corrected(odometry.progress, odometry.pose, windows.node_progress, windows.node, windows.node)
     assert same == pytest.approx(odometry.pose, abs=1e-9)
 
