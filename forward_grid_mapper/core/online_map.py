@@ -23,11 +23,11 @@ from numpy.typing import NDArray
 from .common.constants import FORBIDDEN
 from .common.grid import Grid, Window, part_of, united
 from .common.parameters import Parameters
-from .common.readings import Readings
+from .common.readings import Readings, of_drives
 from .evidence.evidence import Evidence
 from .maps.handed_out import hand_out
 from .maps.log_odds_map import map_grid
-from .maps.traversed import STRIDES, mark_traversed
+from .maps.traversed import LONGEST_STEP, STRIDES, longest_step, mark_traversed
 from .runtime.memory import memory_for_pairs
 from .runtime.threads import cores
 from .search.flips import flip_in_order, promising
@@ -104,12 +104,20 @@ class _Numbers(MutableMapping[Key, int]):
             part.clear()
 
 
+OF_THE_ROBOT = 1000
+"""Readings from which it is known how far apart the sensors of a robot are (`traversed.longest_step`)."""
+
+NO_READINGS = Readings.from_columns(x=[], y=[], yaw=[], z=[], z_max=[], half_angle=[])
+
+
 class _Traversed(NamedTuple):
-    """What new readings say about the cells that the robot traversed: some of the grid."""
+    """What new readings say about the cells that the robot traversed: some of the grid; and about its size."""
 
     near: tuple[slice, slice]
     cells: NDArray[np.bool_]
     last: tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]
+    begun: Readings
+    longest: float
 
 
 class OnlineMap:
@@ -129,6 +137,7 @@ class OnlineMap:
         self._count = 0
         self._prior = wall_prior(self._parameters.search, np.zeros(0, np.bool_), self._parameters.grid.resolution)
         self._last = np.zeros(0), np.zeros(0), np.zeros(0, np.int64)
+        self._begun, self._longest = NO_READINGS, LONGEST_STEP
         self.grid = Grid(self._parameters.grid.resolution, 0, 0, 0, 0)
         self.taken = 0
         """Readings added, those that were merged with others included."""
@@ -177,7 +186,7 @@ class OnlineMap:
         self._since = united(self._since, window)
         self._traversed[traversed.near] = traversed.cells
         self._prior.local.reshape(evidence.grid.shape)[traversed.near][traversed.cells] = -FORBIDDEN
-        self._last = traversed.last
+        self._last, self._begun, self._longest = traversed[2:]
         if len(evidence) - before > MANY:
             self._search(evidence)
         elif self._count >= min(REFINE_EVERY, max(REFINE_LEAST, REFINE_SHARE * len(evidence))):
@@ -274,9 +283,13 @@ class OnlineMap:
         near = (slice(bottom, int(rows.max()) + 1), slice(left, int(columns.max()) + 1))
         cells = self._traversed[near].copy()
         part = Grid(grid.resolution, grid.column + left, grid.row + bottom, cells.shape[1], cells.shape[0])
-        mark_traversed(x, y, stamp, part, cells)
+        begun, longest = self._begun, self._longest
+        if len(begun) < OF_THE_ROBOT:
+            begun = of_drives([begun, readings])
+            longest = longest_step(begun)
+        mark_traversed(x, y, stamp, part, cells, longest)
         n = STRIDES[-1]
-        return _Traversed(near, cells, (x[-n:], y[-n:], stamp[-n:]))
+        return _Traversed(near, cells, (x[-n:], y[-n:], stamp[-n:]), begun, longest)
 
     def _with_room(self, g: Grid) -> Evidence:
         """Return the evidence, on a grid that holds `g`."""

@@ -180,11 +180,11 @@ def _remove_empty(folders: list[Path]) -> None:
 def _output_error(path: Path, error: OSError) -> OutputError:
     path = _as_asked_for(path)
     if error.errno in _FULL:
-        return OutputError(f'{path}: the disk is full; free some space or choose another place with -o')
+        return OutputError(f'{path}: the disk is full; free some space, or choose another folder')
     if error.errno == errno.ENOTDIR:
-        return OutputError(f'{path}: a part of this path is a file, not a folder; choose another with -o')
+        return OutputError(f'{path}: a part of this path is a file, not a folder; choose another folder')
     if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
-        return OutputError(f'{path}: no permission to write there; choose another place with -o')
+        return OutputError(f'{path}: no permission to write there; choose another folder')
     return OutputError(f'{path} cannot be written: {error.strerror or error}')
 
 

@@ -267,6 +267,22 @@ def test_a_corridor_has_room_along_it_and_within_max_cells(turned: bool) -> None
     assert bounded._evidence.grid.size <= most
 
 
+def test_no_obstacle_stands_inside_a_large_robot() -> None:
+    # two sensors 3 m apart, as at the ends of a car
+    way = np.repeat(np.arange(0.0, 12.0, 0.1), 2)
+    front = np.tile([0, 1], len(way) // 2)
+    moving = {'x': way + 3.0 * front, 'stamp': (way * 1e9).astype(np.int64) + front, 'sensor': front}
+    readings = Readings.from_columns(
+        ('rear', 'front'), **moving, y=0.05, yaw=np.pi / 2, z=np.ones(len(way)), z_max=2.0, half_angle=0.13
+    )
+    online = in_sweeps(readings, Parameters())
+    whole = Mapper(Parameters()).run(readings)
+    grid = online._evidence.grid
+    rows, columns = grid.cells_of(np.arange(1.05, 14.0, 0.1), np.full(130, 0.05))
+    assert online._traversed[rows, columns].all()
+    assert (whole.ml[whole.grid.cells_of(np.arange(1.05, 14.0, 0.1), np.full(130, 0.05))] == 0).all()
+
+
 def test_without_memory_to_pack_pairs_it_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
     recording = door_drive(3, NOISY, 0)
     whole = in_sweeps(recording.readings, Parameters())

@@ -66,8 +66,8 @@ class AssociationParameters:
     )
     odometry_noise: float = param(
         0.0,
-        'How far the yaw of odometry strays at random in one metre of driving (standard deviation; it grows with the '
-        'square root of the way), for refine_poses. Usual wheels stray by 0.01 to 0.08; 0 estimates it from the drive.',
+        'How far the yaw of odometry drifts at random in one metre of driving (standard deviation; it grows with the '
+        'square root of the way), for refine_poses. Usual wheels drift by 0.01 to 0.08; 0 estimates it from the drive.',
         'rad',
         0.0,
         0.5,

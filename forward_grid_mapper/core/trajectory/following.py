@@ -2,7 +2,8 @@
 
 The last windows form a small pose graph, the *tail*. Its first nodes are settled: they stay. The others follow from
 odometry, calibrated as the whole drive has it, from the directions of walls and their distances, as in a whole drive,
-and from places that were mapped before. So a window costs the same however long the drive is.
+and from places that were mapped before. So the search for a window costs the same however long the drive is; what grows
+with the drive is the path, which is copied at each window, and the readings that it keeps to recognise places by.
 
 What is followed has to prove itself. Every few windows a block is foreseen, before its readings are used, once where it
 is followed and once where the correction is kept as it was. Where following foresees clearly better, the correction of
