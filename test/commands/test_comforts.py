@@ -109,6 +109,19 @@ def test_show_opens_pictures(
     assert shown == [tmp_path / 'out' / picture] and shown[0].exists()
 
 
+def test_show_opens_a_figure_of_several(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def draw(folder: Path, *rest: Any) -> str:
+        for name in ('rooms', 'corridor'):
+            (folder / f'figure_{name}.png').touch()
+        return 'a table'
+
+    shown: list[Path] = []
+    monkeypatch.setattr(experiment, 'drifting', draw)
+    monkeypatch.setattr(experiment, 'show', shown.append)
+    assert code_of(experiment.main, 'drift', '--show', '-o', tmp_path / 'out') == 0
+    assert shown == [tmp_path / 'out' / 'figure_corridor.png']
+
+
 def test_without_a_desktop_show_says_what_to_open(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -310,6 +310,23 @@ def test_a_map_frame_without_its_transform_is_named(
     assert frame.fault() == ''
 
 
+def test_a_map_frame_that_is_tilted_is_told_of_and_waited_for_by_nobody(
+    buffer: Buffer, transforms: Transforms, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now = 100.0
+    monkeypatch.setattr(frames.time, 'monotonic', lambda: now)
+    frame = MapFrame('map', transforms, timeout=1.0)
+    buffer.known['map', 'odom'] = transform(1.0, 0.0, pitch=1.5)
+    for _ in range(40):
+        now += 0.1
+        assert frame.convert(OdometryMessage(round(now * NANOSECONDS), 'odom', 'base', Pose2(0, 0, 0))) == []
+    assert frame.dropped == 40 and not frame.found
+    assert "TF's transform from map (map_frame) to odom is tilted" in frame.fault()
+    buffer.known['map', 'odom'] = transform(1.0, 0.0)
+    (placed,) = frame.convert(OdometryMessage(round(now * NANOSECONDS) + 1, 'odom', 'base', Pose2(0, 0, 0)))
+    assert placed.pose == Pose2(1.0, 0.0, 0.0) and frame.found and not frame.fault()
+
+
 def test_the_lookup_says_whether_a_frame_or_a_time_is_missing(buffer: Buffer, transforms: Transforms) -> None:
     buffer.known['base', 'servo'] = transform(0.1, 0.0)
     buffer.until = 4

@@ -11,7 +11,9 @@ pytest.importorskip('rclpy', reason='the tests of the node need rclpy')
 from stand_ins import Taking
 
 from forward_grid_mapper.core.common.grid import Grid
+from forward_grid_mapper.node import diagnostics
 from forward_grid_mapper.node.diagnostics import Health
+from forward_grid_mapper.node.frames import Extrinsics, Transforms
 from forward_grid_mapper.node.reporter import Reporter
 
 OK, WARN = b'\x00', b'\x01'
@@ -53,6 +55,32 @@ def test_the_reason_is_that_of_the_last_second_also_after_a_reset() -> None:
     assert level == WARN and '55 of 65' in message and 'most of them as empty_frame_id' in message
 
 
+def test_a_stamp_of_odometry_that_stands_still_is_told_of(monkeypatch: pytest.MonkeyPatch) -> None:
+    robot, now = Taking(), 50.0
+    monkeypatch.setattr(diagnostics.time, 'monotonic', lambda: now)
+    health = Health()
+    robot.intake.begin()
+
+    def second(k: int, stamp: float) -> tuple[bytes, str]:
+        nonlocal now
+        now += 1.0
+        robot.odometry(stamp)
+        robot.range(1000.0 + k)
+        return judged(robot, health)
+
+    told = [second(k, 0.0) for k in range(5)]
+    assert 'its stamp has been 0.000 s for 5 s' in told[-1][1] and told[-1][0] == WARN
+    assert 'header.stamp' not in told[1][1]
+    assert all('header.stamp' not in second(k, 1000.0 + k)[1] for k in range(5, 12))
+    # without readings that wait for it, such as a robot that only listens, it does not matter
+    quiet, health = Taking(), Health()
+    quiet.intake.begin()
+    for _ in range(6):
+        now += 1.0
+        quiet.odometry(0.0)
+        assert 'header.stamp' not in judged(quiet, health)[1]
+
+
 def reporter_of(robot: Taking) -> Any:
     made = Reporter.__new__(Reporter)
     made._node, made._associator, made._no_name = robot.node, robot.associator, False
@@ -73,3 +101,17 @@ def test_odometry_without_a_frame_is_told_of() -> None:
     named.intake.begin()
     named.odometry(100.0)
     assert reporter_of(named)._nameless() == [] and named.node.warned == []
+
+
+def test_without_a_base_frame_no_transform_is_asked_for() -> None:
+    for child, advice in (('base_link', 'publish the transform from base_link'), ('', 'child_frame_id')):
+        robot = Taking()
+        robot.intake.begin()
+        robot.odometry(100.0)
+        reporter = reporter_of(robot)
+        reporter._reported, reporter._lost, reporter._extrinsics = set(), set(), Extrinsics({}, Transforms())
+        robot.associator.base_frame = child
+        robot.associator.unknown_frames.add('sonar')
+        reporter._name_frames()
+        (text,) = robot.node.warned
+        assert 'set sensors.sonar.pose: [x, y, yaw], or ' in text and advice in text
