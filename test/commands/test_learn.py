@@ -114,7 +114,7 @@ def test_files_are_never_overwritten(tmp_path: Path, bag: Path, capsys: pytest.C
     taken = tmp_path / 'mine.yaml'
     taken.write_text('mine')
     before = everything_in(tmp_path)
-    for path, expected in ((taken, 'exists'), (tmp_path, 'exists'), (tmp_path / 'none' / 'x.yaml', 'no folder')):
+    for path, expected in ((taken, 'exists'), (tmp_path, 'exists'), (tmp_path / 'none' / 'x.yaml', 'not a folder')):
         message = said(capsys, bag, '-o', path, code=1)
         assert message.startswith('learn: error: ') and expected in message and '--output' in message
     assert everything_in(tmp_path) == before and taken.read_text() == 'mine'
