@@ -81,6 +81,8 @@ def test_memory_that_runs_out_fails_the_call_and_nothing_else(start: Any, robot:
     robot.meet()
     robot.sent = 4000
     robot.play(circle(0, 50))
+    # the compiler takes more than the limit leaves
+    robot.until(lambda: robot.diagnostics.get('background', {}).get('message') == 'all is well', what='all is compiled')
     free = memory(node, 'VmSize:')
     # enough for all that the node does, and less than EM takes at the least
     limit = memory(node, 'VmSize:') + (50 << 20)
