@@ -7,7 +7,7 @@ Of the drives under ../shared/data, or those named, with their right poses: the 
 live map, the paper's plain maximum likelihood map, and the standard map with the best of 216 gains for that very drive,
 once for F1 and once for nav_iou, which nobody could know. Figures are those of ../shared/tools/score_map.py.
 
---drawn takes twelve buildings drawn by chance instead (`material_worlds.py`), on which nothing was chosen, and prints
+--drawn takes twelve buildings drawn at random instead (`material_worlds.py`), on which nothing was chosen, and prints
 means; --set changes the default.
 """
 
@@ -84,7 +84,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument('names', nargs='*', metavar='NAME', help=f'by default {", ".join(NAMES)}')
     parser.add_argument('--set', action='append', default=[], metavar='NAME=VALUE', help='change the default')
-    parser.add_argument('--drawn', action='store_true', help='buildings drawn by chance, instead')
+    parser.add_argument('--drawn', action='store_true', help='buildings drawn at random, instead')
     options = parser.parse_args()
     if options.drawn and options.names:
         parser.error('--drawn takes the place of names')

@@ -3,7 +3,7 @@
 
 usage: live.py [--quick]
 
-On buildings of many materials drawn by chance (`material_worlds.py`), of which the first 24 are those that the default
+On buildings of many materials drawn at random (`material_worlds.py`), of which the first 24 are those that the default
 was tuned on and the others are not; on the worlds of `quality.py`; and on the recordings under ../shared/data where
 they are. Figures are those of ../shared/tools/score_map.py, of all cells with a probability. --quick takes fewer.
 """

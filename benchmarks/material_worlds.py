@@ -1,4 +1,4 @@
-"""Drives through buildings drawn by chance, whose walls are of many materials, to tune maps on and to judge them.
+"""Drives through buildings drawn at random, whose walls are of many materials, to tune maps on and to judge them.
 
 Floor plans are a corridor or two with rooms on both sides and a hall, turned by any angle, so that no wall runs along
 the lattice. Walls have two faces. Each piece of 3 m is of one material, which returns echoes up to an incidence of its

@@ -72,16 +72,12 @@ class Kernels:
 
     def _compile(self, name: str, ready: Callable[[], None], begin: float) -> None:
         self.stage = name
-        try:
-            self._steps[name]()
-            self._log(f'kernels of the {name} are ready after {time.monotonic() - begin:.1f} s')
-            self._done[name].set()
-            if name == 'live map':
-                ready()
-        finally:
-            self._left -= 1
-            if not self._left:
-                self._end()
+        self._steps[name]()
+        self._log(f'kernels of the {name} are ready after {time.monotonic() - begin:.1f} s')
+        self._done[name].set()
+        if name == 'live map':
+            ready()
+        self._one_less()
 
     def _give_up(self, ready: Callable[[], None]) -> None:
         """Let everybody go on: whoever needs a kernel compiles it, and says so if it fails."""
@@ -90,6 +86,13 @@ class Kernels:
             done.set()
         if first:
             ready()
+        self._one_less()
+
+    def _one_less(self) -> None:
+        """Count a step that is over, well or not; the last one ends the work."""
+        self._left -= 1
+        if not self._left:
+            self._end()
 
     def _end(self) -> None:
         self.stage = ''

@@ -209,7 +209,7 @@ class MapperNode(ManagedNode):
 
     def _undo(self) -> None:
         super()._undo()
-        # readings and maps are forgotten; what refers to itself, too, which was taken for lasting (`Kernels`)
+        # `Kernels` froze what there was, and the collector does not look at frozen objects
         for name in vars(self).keys() - self._own - {'_own'}:
             delattr(self, name)
         gc.unfreeze()

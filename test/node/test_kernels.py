@@ -114,3 +114,15 @@ def test_pictures_that_cannot_be_drawn_do_not_leave_the_collector_off(
     kernels = compiling.begin()
     ended(kernels)
     assert gc.isenabled() and kernels not in Kernels.at_work and kernels.worker.trouble == ''
+
+
+def test_without_a_thread_everybody_goes_on_and_the_collector_too(
+    compiling: Compiling, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(thread: threading.Thread) -> None:
+        raise RuntimeError("can't start new thread")
+
+    monkeypatch.setattr(threading.Thread, 'start', fail)
+    kernels = compiling.begin()
+    assert len(compiling.ready) == 1 and all(kernels.has(name) for name in warm_up.STEPS)
+    assert gc.isenabled() and kernels not in Kernels.at_work

@@ -83,7 +83,7 @@ class LogOddsMap:
         InputError
             If the grid would exceed `max_cells`; the map is unchanged.
         MemoryError
-            As well.
+            If there is no memory to grow; the map is unchanged.
         """
         if not len(readings):
             return
@@ -163,7 +163,7 @@ class LogOddsMap:
         return together
 
     def _grow(self, g: Grid) -> None:
-        """Have a grid, or, without the memory for it, that of before."""
+        """Make room for a grid; without memory for it nothing changes."""
         if self._stored.union(g) == self._stored:
             self.grid = g
             return

@@ -30,7 +30,7 @@ CGROUP, OWN_CGROUPS = Path('/sys/fs/cgroup'), Path('/proc/self/cgroup')
 """Where control groups are, and the file that names those of this process."""
 
 NO_LIMIT = 1 << 60
-"""Bytes from which on a limit is none."""
+"""A limit of so many bytes or more is none: v1 writes a large number."""
 
 
 def least_memory(cells: int, readings: int, threads: int) -> int:
@@ -78,13 +78,13 @@ def _of_the_process() -> int | None:
 
 
 def _of_the_group() -> int | None:
-    """Return the least that its control group, or one that this is in, leaves; of either version of control groups."""
+    """Return how many bytes the control groups (v1 or v2) of this process leave, None if unlimited."""
     left = [_left_in(folder, *names) for folder, names in _groups()]
     return min((value for value in left if value is not None), default=None)
 
 
 def _groups() -> Iterator[tuple[Path, tuple[str, str, str]]]:
-    """Yield the folders of its control groups, and what limit, use, and reclaimable part of it are called there."""
+    """Yield the folders of the control groups, and the names there of limit, use and reclaimable memory."""
     second = 'memory.max', 'memory.current', 'inactive_file'
     first = 'memory.limit_in_bytes', 'memory.usage_in_bytes', 'total_inactive_file'
     yield CGROUP, second
@@ -109,7 +109,7 @@ def _left_in(folder: Path, limit: str, use: str, reclaimable: str) -> int | None
             return None
     except (OSError, ValueError):
         return None
-    # what files were read is in there, too, and given up where it is needed
+    # the use includes the page cache, which the kernel can reclaim
     return int(most) - max(used - (_number(folder / 'memory.stat', reclaimable) or 0), 0)
 
 
