@@ -268,19 +268,24 @@ def test_a_corridor_has_room_along_it_and_within_max_cells(turned: bool) -> None
 
 
 def test_no_obstacle_stands_inside_a_large_robot() -> None:
-    # two sensors 3 m apart, as at the ends of a car
+    # two sensors 3 m apart, on either side of a car
     way = np.repeat(np.arange(0.0, 12.0, 0.1), 2)
-    front = np.tile([0, 1], len(way) // 2)
-    moving = {'x': way + 3.0 * front, 'stamp': (way * 1e9).astype(np.int64) + front, 'sensor': front}
+    left = np.tile([0, 1], len(way) // 2)
+    side = 2.0 * left - 1.0
+    moving = {'x': way, 'y': 1.5 * side + 0.05, 'yaw': side * np.pi / 2, 'sensor': left}
     readings = Readings.from_columns(
-        ('rear', 'front'), **moving, y=0.05, yaw=np.pi / 2, z=np.ones(len(way)), z_max=2.0, half_angle=0.13
+        ('right', 'left'),
+        **moving,
+        stamp=(way * 1e9).astype(np.int64) + left,
+        z=np.ones(len(way)),
+        z_max=2.0,
+        half_angle=0.13,
     )
-    online = in_sweeps(readings, Parameters())
-    whole = Mapper(Parameters()).run(readings)
+    online, whole = in_sweeps(readings, Parameters()), Mapper(Parameters()).run(readings)
     grid = online._evidence.grid
-    rows, columns = grid.cells_of(np.arange(1.05, 14.0, 0.1), np.full(130, 0.05))
-    assert online._traversed[rows, columns].all()
-    assert (whole.ml[whole.grid.cells_of(np.arange(1.05, 14.0, 0.1), np.full(130, 0.05))] == 0).all()
+    across = np.full(28, 6.05), np.arange(-1.35, 1.45, 0.1)
+    assert online._traversed[grid.cells_of(*across)].all()
+    assert (whole.ml[whole.grid.cells_of(*across)] == 0).all()
 
 
 def test_without_memory_to_pack_pairs_it_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
