@@ -14,11 +14,13 @@ import numpy as np
 
 from .common.parameters import Parameters
 from .common.readings import Readings
+from .evidence.evidence import Evidence
 from .learning.sensor_health import sensor_health
 from .mapping import Mapper
-from .maps.log_odds_map import LogOddsMap
+from .maps.log_odds_map import LogOddsMap, map_grid
 from .maps.map_set import MapSet
 from .online_map import OnlineMap
+from .trajectory.hidden_markov import smooth
 from .trajectory.holding_out import held_out
 from .trajectory.likelihood import scores
 from .trajectory.scans import Scans
@@ -30,6 +32,14 @@ def _square_room() -> Readings:
     yaw = np.linspace(-math.pi, math.pi, 24, endpoint=False)
     z = 1.0 / np.maximum(np.abs(np.cos(yaw)), np.abs(np.sin(yaw)))
     return Readings.from_columns(('',), x=0.0, y=0.0, yaw=yaw, z=np.minimum(z, 1.4), z_max=1.4, half_angle=0.1)
+
+
+def _flip_at_once(readings: Readings) -> None:
+    # the search of so small a room flips too few cells at once
+    parameters = Parameters()
+    evidence = Evidence(map_grid(readings, parameters), parameters.model)
+    evidence.extend(readings)
+    evidence.flip(np.zeros(1, np.int64))
 
 
 def warm_up_live_map() -> None:
@@ -46,10 +56,12 @@ def warm_up_online_map() -> None:
     for moved in (0.0, 0.0, 40.0):
         online.add(dataclasses.replace(readings, x=readings.x + moved))
     online.maps()
+    _flip_at_once(readings)
 
 
 def warm_up_em() -> MapSet:
     """Compile the kernels of EM and of what comes after it."""
+    _flip_at_once(_square_room())
     maps = Mapper(Parameters()).run(_square_room())
     sensor_health(maps)
     return maps
@@ -67,6 +79,8 @@ def warm_up_trajectory() -> None:
     windows = cut(readings, Odometry.of(np.arange(steps) * 10**8, path))
     scans = Scans(windows, Parameters(), np.zeros(1, np.uint8), held_out(len(windows)))
     wall_votes(windows, scans.held_out)
+    # so short a drive has too few votes for a heading
+    smooth(np.ones((2, 1, 4)), np.full((1, 4), 0.25), np.zeros(1), np.full(4, 0.25))
     around = scans.map(np.arange(len(windows)), windows.node[0], windows.node)
     assert around is not None
     scores(scans.scan[0], around, windows.node)

@@ -195,7 +195,7 @@ class SearchParameters:
         'readings',
     )
     max_iterations: int = param(
-        200, 'Bound on the iterations of the search; the report says when it was reached.', 'iterations', 1, 100_000
+        1000, 'Bound on the iterations of the search; the report says when it was reached.', 'iterations', 1, 100_000
     )
     threads: int = param(0, 'Threads of a search, 0 for one a core; the maps do not depend on it.', 'threads', 0, 256)
     max_memory: int = param(

@@ -23,12 +23,12 @@ from ..sensor.incidence import count, edges_of, narrowed, no_counts, slots_of, w
 from ..sensor.surface_normals import SurfaceNormals, gather, no_normals, normals_of, on_larger_grid, renewed, touched
 from .fixed_point import QUANTUM
 from .indexing import BAND, FREE, LARGEST, UNSTORED, UNUSED, WORDS, insert_readings, reading_state_table
-from .neighbourhood import set_patterns
+from .neighbourhood import note_flips, set_patterns
 from .pairs import WORD, WORDS_PER_BAND_PAIR, Lattice, empty_pairs, workspace_for
 from .renewal import box_of, find_changed, near, renew
 from .state import READING_STATE, Maps, Model, State
 from .tile_index import more_chunks, no_tiles
-from .updates import add_multiplicity, evaluate_all, forget
+from .updates import add_multiplicity, evaluate_all, evaluate_flipped, forget
 
 NO_INCIDENCE_LIMIT = 1.5707
 """Radians off the normal from where on no reading exceeds the incidence angle."""
@@ -322,6 +322,37 @@ class Evidence:
         maps.evidence[:] = 0
         try:
             self._evaluate_and_add(0, self._size, new=False)
+        except BaseException:
+            self._evaluate_again(self._size)
+            raise
+
+    def flip(self, cells: NDArray[np.int64]) -> None:
+        """Flip cells, all different, at once, and evaluate the readings that see any of them anew.
+
+        Parameters
+        ----------
+        cells : int64, shape (N,)
+
+        Raises
+        ------
+        Cancelled
+            If `stop` was set; the cells are flipped all the same.
+        MemoryError
+        """
+        maps, flipped = self.state.maps, np.zeros(self.grid.size, np.uint8)
+        flipped[cells] = 1
+        maps.occupied[cells] ^= 1
+        if self.unstored:
+            # what such a reading said of the map before is not known any more
+            self.rebuild()
+            return
+        note_flips(maps.pattern, cells, self.grid.shape)
+
+        def work(s: State, first: int, last: int, evidence: NDArray[np.int64]) -> None:
+            evaluate_flipped(s._replace(maps=s.maps._replace(evidence=evidence)), first, last, flipped)
+
+        try:
+            self.summed(0, self._size, work, maps.evidence)
         except BaseException:
             self._evaluate_again(self._size)
             raise

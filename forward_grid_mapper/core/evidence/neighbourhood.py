@@ -59,6 +59,13 @@ def set_patterns(occupied: NDArray[np.uint8], shape: tuple[int, int], out: NDArr
             note_flip(out, c, shape[0], shape[1])
 
 
+@kernel
+def note_flips(pattern: NDArray[np.uint8], cells: NDArray[np.int64], shape: tuple[int, int]) -> None:
+    """Bring the patterns of the neighbours of cells, which were flipped, up to date."""
+    for c in cells:
+        note_flip(pattern, c, shape[0], shape[1])
+
+
 def patterns(occupied: NDArray[np.uint8], shape: tuple[int, int]) -> NDArray[np.uint8]:
     """Return the pattern of occupied neighbours of every cell, shape (cells,)."""
     out = np.zeros(shape[0] * shape[1], np.uint8)

@@ -190,6 +190,53 @@ def evaluate_all(s: State, begin: int, end: int, new: bool) -> None:
 
 
 @kernel
+def _sees_flipped(reading_state: Any, pairs: Pairs, at: int, flipped: Any) -> bool:
+    """Return whether any cell of a reading is one of those that are 1 in `flipped`."""
+    begin = np.uint64(at + WORDS_PER_RUN * reading_state.runs)
+    for k in range(begin, begin + np.uint64(reading_state.bands)):
+        if flipped[pairs.cell[k]]:
+            return True
+    for k in range(np.uint64(at), begin, np.uint64(WORDS_PER_RUN)):
+        for c in range(np.uint64(pairs.cell[k]), np.uint64(pairs.cell[k + np.uint64(1)]) + np.uint64(1)):
+            if flipped[c]:
+                return True
+    return False
+
+
+@kernel
+def evaluate_flipped(s: State, begin: int, end: int, flipped: Any) -> None:
+    """Bring the evidence up to date with what those of the readings `begin` to `end` say that see flipped cells.
+
+    Their pairs must be stored.
+
+    Parameters
+    ----------
+    flipped : uint8, shape (cells,)
+        1 where cells were flipped since the readings were evaluated.
+    """
+    maps = s.maps
+    for t in range(begin, end):
+        if s.stop[0]:
+            break
+        reading_state = s.reading_states[t]
+        pairs, at = pairs_of(s, t)
+        if not _sees_flipped(reading_state, pairs, at, flipped):
+            continue
+        times = reading_state.multiplicity
+        # a flipped cell of the free zone goes from one ratio to the other: what it had comes off before they change
+        for k in range(np.uint64(at), np.uint64(at + WORDS_PER_RUN * reading_state.runs), np.uint64(WORDS_PER_RUN)):
+            for c in range(np.uint64(pairs.cell[k]), np.uint64(pairs.cell[k + np.uint64(1)]) + np.uint64(1)):
+                if flipped[c]:
+                    step = 1 if maps.occupied[c] else -1
+                    reading_state.blocking += step
+                    maps.evidence[c] += step * times * (reading_state.release - reading_state.occupy)
+        reading_state.through = s.model.mixture_weight * (1.0 - s.model.p_hit) ** reading_state.blocking
+        evaluate(s.model, reading_state, maps.occupied, pairs, at, s.workspace)
+        _add_difference(reading_state, pairs, at, maps, s.workspace.new)
+        reading_state.changed = s.clock[0]
+
+
+@kernel
 def _add_seen(s: State, t: int, times: int) -> None:
     """Count reading t so many times more, or fewer, at every cell of its cone."""
     cone = cone_of(s.cones[t])

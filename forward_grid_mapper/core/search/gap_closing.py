@@ -224,6 +224,9 @@ def close_gaps(s: State, prior: Prior, least: Least, cells: NDArray[np.int64], l
     flips, total = 0, 0.0
     for n in range(2, longest + 1):
         gaps, paths = _gaps(s, prior, cells, n)
+        if not len(gaps) and n > 2:
+            # the first length goes on without gaps as well, so that one run of the search has called every kernel
+            continue
         gains = _gain_of_sets(s, prior, least, paths.ravel(), np.arange(len(gaps) + 1) * (n - 1), False)
         order = np.argsort(-gains, kind='stable')[: int((gains > 0.0).sum())]
         gains = np.empty(len(order))

@@ -24,6 +24,7 @@ than `LEAST_GAIN` and `ROUNDING` for each of the cell's readings.
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -132,6 +133,12 @@ class Search:
         self._of_walls = wall_prior(parameters, traversed, evidence.grid.resolution)
         self._settled = np.zeros(evidence.grid.size, np.uint8)
         self._tried_at = -1
+        # to work in; in a small map it takes longer to get the memory than to do most steps
+        bottom, top, left, right = self._window
+        cells = (top - bottom) * (right - left)
+        self._gaining, self._gains = np.empty(cells, np.int64), np.empty(cells)
+        self._all_zero = np.zeros(evidence.grid.size)
+        self._all_none: list[NDArray[np.int32]] = []
         self.progress = Progress(0, 0, 0, 0.0)
         occupied = evidence.state.maps.occupied
         if occupied[traversed].any():
@@ -232,26 +239,22 @@ class Search:
 
     def _promising(self) -> tuple[NDArray[np.int64], Floats]:
         """Return the cells whose flip gains, the best first, and what they gain."""
-        bottom, top, left, right = self._window
-        cells, gains = np.empty((top - bottom) * (right - left), np.int64), np.empty((top - bottom) * (right - left))
-        n = promising(self.evidence.state, self._prior, LEAST, self._window, cells, gains)
-        order = np.argsort(-gains[:n], kind='stable')
+        n = promising(self.evidence.state, self._prior, LEAST, self._window, self._gaining, self._gains)
+        cells, gains = self._gaining[:n], self._gains[:n]
+        order = np.argsort(-gains, kind='stable')
         return cells[order], gains[order]
 
     def _update_in_parallel(self, watch: Watch) -> bool:
         """Flip all that gain more than their neighbours at once; return whether that helped."""
-        maps = self.evidence.state.maps
         cells, gains = self._promising()
-        cells = cells[highest(self.evidence.state, cells, gains, np.zeros(self.evidence.grid.size))]
+        cells = cells[highest(self.evidence.state, cells, gains, self._all_zero)]
         if len(cells) < FEW:
             return False
         before = self._objective()
-        maps.occupied[cells] ^= 1
-        self.evidence.rebuild()
+        self.evidence.flip(cells)
         gain = self._objective() - before
         if gain <= 0:
-            maps.occupied[cells] ^= 1
-            self.evidence.rebuild()
+            self.evidence.flip(cells)
             return False
         self._advance(len(cells), 0, gain, watch)
         return gain > LITTLE * self.progress.gain
@@ -264,6 +267,12 @@ class Search:
         self._advance(flips, 0, gain, watch)
         return flips
 
+    def _none(self) -> NDArray[np.int32]:
+        """Return an array of -1 for all cells, which goes back to `_all_none` once it is all -1 again; any thread."""
+        with suppress(IndexError):
+            return self._all_none.pop()
+        return np.full(self.evidence.grid.size, -1, np.int32)
+
     def _shift(self, watch: Watch) -> int:
         evidence, s = self.evidence, self.evidence.state
         if self._tried_at >= 0:
@@ -272,7 +281,7 @@ class Search:
         cells = self._occupied()
         cells = cells[self._settled[cells] == 0]
         self._settled[cells] = 1
-        slot = np.full(evidence.grid.size, -1, np.int32)
+        slot = self._none()
         slot[cells] = np.arange(len(cells), dtype=np.int32)
         sees = np.ones(len(evidence), np.uint8)
         if s.maps.seen[cells].sum() < len(evidence):
@@ -282,9 +291,13 @@ class Search:
         joint = np.zeros((len(cells), NEIGHBOURS), np.int64)
 
         def work(s: State, begin: int, end: int, own: NDArray[np.int64]) -> None:
-            try_shifts(s, readings[begin:end], slot, np.full(len(slot), -1, np.int32), own)
+            place = self._none()
+            try_shifts(s, readings[begin:end], slot, place, own)
+            self._all_none.append(place)
 
         evidence.summed(0, len(readings), work, joint, beside=slot.nbytes)
+        slot[cells] = -1
+        self._all_none.append(slot)
         targets, gains = best_shifts(s, self._prior, LEAST, cells, joint)
         order = np.argsort(-gains, kind='stable')[: int((targets >= 0).sum())]
         shifts, gain = shift_in_order(s, self._prior, LEAST, cells[order], targets[order])

@@ -38,13 +38,10 @@ from ..common.parameters import ModelParameters
 from ..runtime.jit import kernel
 from .cone import rows_of, runs_of, strength
 from .cone_table import Cones, cone_of
-from .surface_normals import QUANTUM, SurfaceNormals, box_sums, touched
+from .surface_normals import QUANTUM, Reach, SurfaceNormals, reach_of, sum_across, touched, unit_of_sums
 
 ZONES = 3
 """Zones of incidence that readings are counted in: two that are a few degrees wider, or five, are about as good."""
-
-BLOCK = 2**14
-"""Cells that are judged at once, which bounds the memory that it takes."""
 
 
 def slots_of(normals: SurfaceNormals, window: Window) -> NDArray[np.int32]:
@@ -136,37 +133,90 @@ def count(
                         counts[zone, slots[c]] += int(unit * math.exp(-0.5 * error * error))
 
 
-def _log_likelihood(echoes: NDArray[np.float64], passes: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return log L of the rate that is likeliest."""
-    rate = rate_of(echoes, passes)
-    out: NDArray[np.float64] = echoes * np.log(rate) + passes * np.log(1.0 - rate)
-    return out
-
-
-def rate_of(echoes: NDArray[np.float64], passes: NDArray[np.float64]) -> NDArray[np.float64]:
+@kernel
+def _rate(echoes: float, passes: float) -> float:
     """Return the part of the readings that are echoes, a half where there are none."""
-    out: NDArray[np.float64] = (echoes + FEW_ECHOES) / (echoes + passes + FEW_READINGS)
-    return out
+    return (echoes + FEW_ECHOES) / (echoes + passes + FEW_READINGS)
 
 
-def limits(counts: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Return the zone with which the surface of each cell ends, shape (...,).
+@kernel
+def _log_likelihood(echoes: float, passes: float) -> float:
+    """Return log L of the rate that is likeliest."""
+    rate = _rate(echoes, passes)
+    return echoes * math.log(rate) + passes * math.log(1.0 - rate)
+
+
+@kernel
+def limit(counts: Any) -> int:
+    """Return the zone with which a surface ends, given its echoes and passes in each: float64, shape (2 · ZONES,)."""
+    echoes, passes = 0.0, 0.0
+    for k in range(ZONES):
+        echoes += counts[k]
+        passes += counts[ZONES + k]
+    one_rate = _log_likelihood(echoes, passes)
+    best, zone = GAIN, ZONES - 1
+    echoes_within, passes_within = 0.0, 0.0
+    for k in range(ZONES - 1):
+        echoes_within += counts[k]
+        passes_within += counts[ZONES + k]
+        echoes_beyond, passes_beyond = echoes - echoes_within, passes - passes_within
+        gained = (
+            _log_likelihood(echoes_within, passes_within) + _log_likelihood(echoes_beyond, passes_beyond) - one_rate
+        )
+        rate = _rate(echoes_within, passes_within)
+        if gained > best and rate >= LEAST_RATE and rate >= CONTRAST * _rate(echoes_beyond, passes_beyond):
+            best, zone = gained, k
+    return zone
+
+
+@kernel
+def _narrow(
+    normals: SurfaceNormals,
+    counts: Any,
+    slots: Any,
+    lengths: Any,
+    window: Window,
+    reach: Reach,
+    unit: float,
+    columns: Any,
+    pooled: Any,
+) -> None:
+    """Give the normals in a window the lengths of the zones with which their surfaces end.
 
     Parameters
     ----------
-    counts : float64, shape (2 · ZONES, ...)
-        Echoes and passes of each zone.
+    normals, counts, slots, window
+        As for `narrowed`.
+    lengths : float64, shape (ZONES,)
+    reach, unit
+        Of the square around a cell, and what 1 counts in a sum over it.
+    columns : float64, shape (columns of the window and what `reach` is beyond, 2 · ZONES)
+    pooled : float64, shape (2 · ZONES,)
+        To work in.
     """
-    echoes, passes = (np.cumsum(half, axis=0) for half in (counts[:ZONES], counts[ZONES:]))
-    one_rate = _log_likelihood(echoes[-1], passes[-1])
-    best, zone = np.full(one_rate.shape, GAIN), np.full(one_rate.shape, ZONES - 1)
-    for k in range(ZONES - 1):
-        within, beyond = (echoes[k], passes[k]), (echoes[-1] - echoes[k], passes[-1] - passes[k])
-        gained = _log_likelihood(*within) + _log_likelihood(*beyond) - one_rate
-        rate = rate_of(*within)
-        better = (gained > best) & (rate >= LEAST_RATE) & (rate >= CONTRAST * rate_of(*beyond))
-        best, zone = np.where(better, gained, best), np.where(better, k, zone)
-    return zone
+    bottom, top, left, right = window
+    height, width = len(normals.before), normals.before.shape[1] - 1
+    first = left - reach[0]
+    for row in range(bottom, top):
+        if normals.before[row, right] == normals.before[row, left]:
+            continue
+        columns[:] = 0.0
+        for other in range(max(row - reach[0], 0), min(row + reach[0] + 1, height)):
+            weight = reach[1] if abs(other - row) == reach[0] else 1.0
+            for column in range(max(first, 0), min(right + reach[0], width)):
+                slot = slots[other * width + column]
+                if slot >= 0:
+                    for k in range(2 * ZONES):
+                        columns[column - first, k] += weight * counts[k, slot]
+        for column in range(left, right):
+            c = row * width + column
+            if not normals.known[c]:
+                continue
+            for k in range(2 * ZONES):
+                pooled[k] = sum_across(columns[:, k], column - left, reach) * unit
+            length = lengths[limit(pooled)]
+            normals.x[c] *= length
+            normals.y[c] *= length
 
 
 def narrowed(
@@ -189,26 +239,10 @@ def narrowed(
     grid : Grid
     window : first row, last one plus one, and columns likewise
     """
-    lengths = np.sqrt(edges[-1] / edges)
-    bottom, top, left, right = window
-    known, x, y, numbers = (array.reshape(grid.shape) for array in (normals.known, normals.x, normals.y, slots))
-    step = max(BLOCK // max(right - left, 1), 1)
-    for first in range(bottom, top, step):
-        part = first, min(first + step, top), left, right
-        low, high, begin, end = touched(part, grid)
-        cells = slice(*part[:2]), slice(*part[2:])
-        here = known[cells] > 0
-        if not here.any():
-            continue
-        inside = numbers[low:high, begin:end]
-        pooled = []
-        for row in counts:
-            spread = np.where(inside >= 0, row[inside], 0)
-            box = part[0] - low, part[1] - low, left - begin, right - begin
-            pooled.append(box_sums(spread, grid.resolution, box)[here])
-        length = lengths[limits(np.stack(pooled) * (WEIGHT_CELL / NEIGHBOURHOOD))]
-        x[cells][here] *= length
-        y[cells][here] *= length
+    reach = reach_of(grid.resolution)
+    unit = unit_of_sums(grid.resolution) * WEIGHT_CELL / NEIGHBOURHOOD
+    columns = np.empty((window[3] - window[2] + 2 * reach[0], 2 * ZONES))
+    _narrow(normals, counts, slots, np.sqrt(edges[-1] / edges), window, reach, unit, columns, np.empty(2 * ZONES))
     return normals
 
 

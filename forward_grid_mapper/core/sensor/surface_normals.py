@@ -28,9 +28,6 @@ from ..runtime.jit import kernel
 from .cone import rows_of, runs_of
 from .cone_table import Cones, cone_of
 
-BLOCK = 2**16
-"""Cells whose normals are estimated at once, which bounds the memory that it takes."""
-
 QUANTUM = 2.0**-20
 """Unit of the sums, which as whole numbers do not depend on their order."""
 
@@ -131,54 +128,84 @@ def _before(known: NDArray[Any]) -> NDArray[np.int32]:
     return out
 
 
-def _half_width(resolution: float) -> tuple[int, float]:
-    """Return how many cells `NEIGHBOURHOOD` reaches beyond the middle one, and which part of the outermost counts."""
+Reach = tuple[int, float]
+"""How many cells `NEIGHBOURHOOD` reaches beyond the middle one, and which part of the outermost counts."""
+
+
+def reach_of(resolution: float) -> Reach:
+    """Return it for cells of so many metres."""
     half = (max(round(NEIGHBOURHOOD / resolution, 6), 1.0) - 1.0) / 2.0
     whole = math.ceil(half - 1e-9)
     return whole, half - whole + 1.0
 
 
-def box_sums(values: NDArray[np.int64], resolution: float, window: Window) -> NDArray[np.float64]:
-    """Return the sums over the square of `NEIGHBOURHOOD` around each cell of a window, in cells of `WEIGHT_CELL`.
+def unit_of_sums(resolution: float) -> float:
+    """Return what 1 in a sum over `NEIGHBOURHOOD` counts, in cells of `WEIGHT_CELL`."""
+    return float(QUANTUM * (resolution / WEIGHT_CELL) ** 2)
 
-    Nothing is added from beyond the edges of the grid. The order of summation does not depend on the window.
+
+@kernel
+def sum_columns(values: Any, row: int, first: int, reach: Reach, out: Any) -> None:
+    """Write to `out` the sums of columns over the height of `NEIGHBOURHOOD` around a row, those from `first` on.
+
+    Nothing is added from beyond the edges of `values`, int64, shape (height, width).
+    """
+    height, width = values.shape
+    out[:] = 0.0
+    for k in range(-reach[0], reach[0] + 1):
+        if 0 <= row + k < height:
+            weight = reach[1] if abs(k) == reach[0] else 1.0
+            for i in range(max(-first, 0), min(len(out), width - first)):
+                out[i] += weight * values[row + k, first + i]
+
+
+@kernel
+def sum_across(columns: Any, begin: int, reach: Reach) -> float:
+    """Return the sum of what `sum_columns` wrote, over the width of `NEIGHBOURHOOD`."""
+    total = 0.0
+    for k in range(-reach[0], reach[0] + 1):
+        total += (reach[1] if abs(k) == reach[0] else 1.0) * columns[begin + reach[0] + k]
+    return total
+
+
+@kernel
+def _estimate(normals: SurfaceNormals, sums: Any, window: Window, reach: Reach, unit: float, columns: Any) -> None:
+    """Write the normals of the cells of a window.
+
+    Parameters
+    ----------
+    normals : SurfaceNormals
+    sums : int64, shape (3, height, width)
+    window, reach
+    unit : float
+        `unit_of_sums`.
+    columns : float64, shape (3, columns of the window and what `reach` is beyond)
+        To work in.
     """
     bottom, top, left, right = window
-    height, width = values.shape
-    n, part = _half_width(resolution)
-    inside = values[max(bottom - n, 0) : top + n, max(left - n, 0) : right + n]
-    missing = (max(n - bottom, 0), max(top + n - height, 0)), (max(n - left, 0), max(right + n - width, 0))
-    wide = np.pad(inside, missing)
-    weights = np.ones(2 * n + 1)
-    if n:
-        weights[[0, -1]] = part
-    rows = np.zeros((top - bottom, wide.shape[1]))
-    for k, weight in enumerate(weights):
-        rows += weight * wide[k : k + top - bottom]
-    out = np.zeros((top - bottom, right - left))
-    for k, weight in enumerate(weights):
-        out += weight * rows[:, k : k + right - left]
-    return out * (QUANTUM * (resolution / WEIGHT_CELL) ** 2)
+    width = sums.shape[2]
+    for row in range(bottom, top):
+        for k in range(3):
+            sum_columns(sums[k], row, left - reach[0], reach, columns[k])
+        for column in range(left, right):
+            c, at = row * width + column, column - left
+            normals.known[c], normals.x[c], normals.y[c] = 0, 0.0, 0.0
+            mass = sum_across(columns[2], at, reach) * unit
+            if mass < LEAST_WEIGHT:
+                continue
+            cosine, sine = sum_across(columns[0], at, reach) * unit, sum_across(columns[1], at, reach) * unit
+            if math.hypot(cosine, sine) >= LEAST_AGREEMENT * mass:
+                angle = math.atan2(sine, cosine) / 2
+                normals.known[c], normals.x[c], normals.y[c] = 1, math.cos(angle), math.sin(angle)
+        for column in range(width):
+            normals.before[row, column + 1] = normals.before[row, column] + normals.known[row * width + column]
 
 
-def _estimate(normals: SurfaceNormals, sums: NDArray[np.int64], grid: Grid, window: Window) -> None:
+def _write(normals: SurfaceNormals, sums: NDArray[np.int64], grid: Grid, window: Window) -> None:
     """Write the normals of the cells of a window."""
-    shape = grid.shape
-    bottom, top, left, right = window
-    known, x, y = (array.reshape(shape) for array in (normals.known, normals.x, normals.y))
-    step = max(BLOCK // (right - left), 1)
-    for first in range(bottom, top, step):
-        part = first, min(first + step, top), left, right
-        cells = slice(*part[:2]), slice(*part[2:])
-        cosine, sine, mass = (box_sums(values.reshape(shape), grid.resolution, part) for values in sums)
-        clear = (mass >= LEAST_WEIGHT) & (np.hypot(cosine, sine) >= LEAST_AGREEMENT * mass)
-        angle = np.arctan2(sine, cosine) / 2
-        known[cells], x[cells], y[cells] = (
-            clear,
-            np.where(clear, np.cos(angle), 0.0),
-            np.where(clear, np.sin(angle), 0.0),
-        )
-    np.cumsum(known[bottom:top], axis=1, dtype=np.int32, out=normals.before[bottom:top, 1:])
+    reach = reach_of(grid.resolution)
+    columns = np.empty((3, window[3] - window[2] + 2 * reach[0]))
+    _estimate(normals, sums.reshape(3, *grid.shape), window, reach, unit_of_sums(grid.resolution), columns)
 
 
 def normals_of(sums: NDArray[np.int64], grid: Grid, angle: float) -> SurfaceNormals:
@@ -192,7 +219,7 @@ def normals_of(sums: NDArray[np.int64], grid: Grid, angle: float) -> SurfaceNorm
         Radians off the normal beyond which a surface returns no echo.
     """
     normals = _unknown(grid.shape, math.cos(angle) ** 2)
-    _estimate(normals, sums, grid, (0, grid.height, 0, grid.width))
+    _write(normals, sums, grid, (0, grid.height, 0, grid.width))
     return normals
 
 
@@ -216,14 +243,14 @@ def renewed(normals: SurfaceNormals, sums: NDArray[np.int64], grid: Grid, window
     new = normals._replace(
         known=normals.known.copy(), x=normals.x.copy(), y=normals.y.copy(), before=normals.before.copy()
     )
-    _estimate(new, sums, grid, window)
+    _write(new, sums, grid, window)
     return new
 
 
 def touched(window: Window, grid: Grid) -> Window:
     """Return the window of the cells whose squares of `NEIGHBOURHOOD` reach into `window`."""
     bottom, top, left, right = window
-    n, _ = _half_width(grid.resolution)
+    n, _ = reach_of(grid.resolution)
     return max(bottom - n, 0), min(top + n, grid.height), max(left - n, 0), min(right + n, grid.width)
 
 

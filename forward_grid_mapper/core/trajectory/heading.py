@@ -27,6 +27,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from .hidden_markov import forward, smooth
 from .poses import Floats
 from .walls import DIRECTIONS
 from .windows import Windows
@@ -73,8 +74,6 @@ FEWEST_VOTES = 4
 
 DOUBTFUL, PAUSE = 0.02, 5
 """Probability of having lost a right angle from where on a place is doubtful, and votes between two such places."""
-
-TINY = 1e-300
 
 PARTS_ASKEW = 2
 """Parts of a building that stand askew to the first, at the most."""
@@ -185,6 +184,7 @@ class _Chain:
         places = np.arange(DIRECTIONS + 1)
         rows = np.stack([np.interp(place, places, row) for place, row in zip(seen, ends, strict=True)])
         self.likelihood: Floats = (DOUBT + (1.0 - DOUBT) * rows) ** temper
+        self._anywhere = np.full(self.states, 1 / self.states)
         self._other = -np.expm1(-ENTERED * self.length) if len(askew) > 1 else np.zeros(len(self.length))
 
     def drift(self, drifts: Drifts) -> Floats:
@@ -198,42 +198,30 @@ class _Chain:
         out: Floats = (self.grid - value + period / 2) % period - period / 2
         return out
 
-    def _moves(self, drifts: Drifts) -> NDArray[np.complex128]:
-        """Return the transforms of the densities that δ moves with from place to place."""
+    def _densities(self, drifts: Drifts) -> Floats:
+        """Return the densities that δ moves with from place to place, shape (B - 1, states)."""
         noise = self._wider * drifts.noise
         sigma = np.sqrt(noise**2 * self.length + TURN_NOISE**2 * self.turned + LEAST_NOISE**2)[:, None]
         x = self.off(self.drift(drifts)[:, None])
         density = (1 - SLIPS) * np.exp(-0.5 * (x / sigma) ** 2) + SLIPS / 3 * np.exp(-0.5 * (x / sigma / 3) ** 2)
-        return np.fft.rfft(density / density.sum(1, keepdims=True), axis=1)
+        out: Floats = density / density.sum(1, keepdims=True)
+        return out
 
-    def _mixed(self, belief: Floats, k: int) -> Floats:
-        """Return what is known of direction and δ once the robot went from place k to the next."""
-        other = self._other[k]
-        return belief if other == 0.0 else (1.0 - other) * belief + other * belief.mean(0)
-
-    def forward(self, drifts: Drifts, start: Floats | None = None) -> tuple[float, list[Floats]]:
-        """Return the log-likelihood of all votes, and what those so far say at each place, shape (D, states)."""
-        begin = np.full(self.states, 1 / self.states) if start is None else start
-        belief = self.likelihood[0] * (begin / self.likelihood.shape[1])
-        total, beliefs = math.log(belief.sum()), [belief / belief.sum()]
-        for k, (move, likelihood) in enumerate(zip(self._moves(drifts), self.likelihood[1:], strict=True)):
-            moved = self._mixed(np.fft.irfft(np.fft.rfft(beliefs[-1]) * move, self.states), k)
-            belief = np.maximum(moved, TINY) * likelihood
-            total += math.log(belief.sum())
-            beliefs.append(belief / belief.sum())
-        return total, beliefs
+    def log_likelihood(self, drifts: Drifts) -> float:
+        """Return that of all votes, in nats."""
+        return forward(self.likelihood, self._densities(drifts), self._other, self._anywhere)[0]
 
     def smooth(self, drifts: Drifts, start: Floats | None = None) -> Floats:
-        """Return what all votes say of direction and δ at each place, shape (B, D, states)."""
-        moves, (_, beliefs) = self._moves(drifts), self.forward(drifts, start)
-        later, out = np.ones_like(beliefs[0]), [beliefs[-1]]
-        for k in range(len(moves) - 1, -1, -1):
-            mixed = self._mixed(later * self.likelihood[k + 1], k)
-            later = np.fft.irfft(np.fft.rfft(mixed) * np.conj(moves[k]), self.states)
-            later = np.maximum(later, TINY) / later.sum()
-            both = beliefs[k] * later
-            out.append(both / both.sum())
-        return np.array(out[::-1])
+        """Return what all votes say of direction and δ at each place, shape (B, D, states).
+
+        Parameters
+        ----------
+        drifts : Drifts
+        start : float64, shape (states,), optional
+            How likely each δ is before any vote; by default all are equally likely.
+        """
+        begin = self._anywhere if start is None else start
+        return smooth(self.likelihood, self._densities(drifts), self._other, begin)
 
     def without_drift(self) -> float:
         """Return the log-likelihood of all votes if δ is the same everywhere."""
@@ -313,7 +301,7 @@ def heading(windows: Windows, at: NDArray[np.int64], votes: Floats, noises: Sequ
         if now - value < LEAST_ASKEW:
             break
         askew, chain, best, value = [*askew, angle], other, found, now
-    total = chain.forward(best)[0]
+    total = chain.log_likelihood(best)
     if total < LEAST_GAIN * len(at):
         return None
     circle = _Chain(windows, at, votes, askew, 4, TEMPER, WIDER)
@@ -341,7 +329,7 @@ def heading(windows: Windows, at: NDArray[np.int64], votes: Floats, noises: Sequ
 def _value(chain: _Chain, drifts: Drifts) -> float:
     """Return the log-likelihood of all votes, with the prior of a calibration."""
     prior = (drifts.bias / BIAS_SIGMA) ** 2 + (drifts.turn_scale / TURN_SCALE_SIGMA) ** 2
-    return chain.forward(drifts)[0] - 0.5 * prior
+    return chain.log_likelihood(drifts) - 0.5 * prior
 
 
 def _fitted(chain: _Chain, drifts: Drifts, noises: Sequence[float]) -> tuple[Drifts, float]:

@@ -9,6 +9,7 @@ with it on windows that were kept out of every match, map and vote, and lie wher
 
 from __future__ import annotations
 
+import hashlib
 from typing import NamedTuple
 
 import numpy as np
@@ -55,18 +56,28 @@ def foreseen(scans: Scans, nodes: Floats, blocks: list[NDArray[np.int64]], span:
     span : float
         Metres of progress before and after a block that its map is made of.
     """
-    progress, out = scans.windows.node_progress, np.full(len(blocks), np.nan)
+    along = hashlib.sha256(nodes.tobytes()).digest()
+    out = np.empty(len(blocks))
     for i, block in enumerate(blocks):
-        middle = block[len(block) // 2]
-        near = np.hypot(*(nodes[:, :2] - nodes[middle, :2]).T) < NEAR
-        near &= np.abs(progress - progress[middle]) < span
-        near[block] = False
-        around = scans.map(np.flatnonzero(near), nodes[middle], nodes)
-        count = sum(len(scans.scan[k].readings) for k in block)
-        if around is not None and count >= FEWEST:
-            total = [scores(scans.scan[k], around, relative(nodes[middle], nodes[k : k + 1]))[0] for k in block]
-            out[i] = float(sum(total)) / count
+        asked = along, block.tobytes(), span
+        if asked not in scans.judged:
+            scans.judged[asked] = _foreseen(scans, nodes, block, span)
+        out[i] = scans.judged[asked]
     return out
+
+
+def _foreseen(scans: Scans, nodes: Floats, block: NDArray[np.int64], span: float) -> float:
+    """Return the mean log ratio of the readings of a block, nats, NaN where there is none."""
+    progress, middle = scans.windows.node_progress, block[len(block) // 2]
+    near = np.hypot(*(nodes[:, :2] - nodes[middle, :2]).T) < NEAR
+    near &= np.abs(progress - progress[middle]) < span
+    near[block] = False
+    around = scans.map(np.flatnonzero(near), nodes[middle], nodes)
+    count = sum(len(scans.scan[k].readings) for k in block)
+    if around is None or count < FEWEST:
+        return float('nan')
+    total = [scores(scans.scan[k], around, relative(nodes[middle], nodes[k : k + 1]))[0] for k in block]
+    return float(sum(total)) / count
 
 
 class Gain(NamedTuple):

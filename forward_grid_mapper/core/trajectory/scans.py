@@ -33,6 +33,8 @@ class Scans:
     count : int64, shape (K,)
         How many of them may be used; none of windows that are held out.
     held_out : bool, shape (K,)
+    judged : dict
+        What `holding_out.foreseen` found, since the same is asked several times.
     """
 
     def __init__(
@@ -42,6 +44,7 @@ class Scans:
         first, resolution = windows.first, parameters.grid.resolution
         self.resolution = resolution
         self.held_out = held_out
+        self.judged: dict[tuple[bytes, bytes, float], float] = {}
         sensors = compose(windows.robot, windows.mount)
         local = relative(np.repeat(windows.node, np.diff(first), axis=0), sensors)
         unknown = UNKNOWN * hit_probability(parameters.model, resolution)

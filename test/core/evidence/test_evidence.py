@@ -198,6 +198,32 @@ def test_after_flips_all_is_as_if_built_from_the_new_map(seed: int, cells: list[
     assert evidence.state.clock[0] == len(cells)
 
 
+@settings(max_examples=80, deadline=None)
+@given(seeds, st.lists(st.sets(st.integers(0, GRID.size - 1), max_size=30), max_size=4), st.sampled_from([math.inf, 0]))
+def test_after_flips_at_once_all_is_as_if_built_from_the_new_map(
+    seed: int, sets: list[set[int]], memory: float
+) -> None:
+    readings, model, occupied = random_case(seed, 40)
+    evidence = evidence_of(readings, model, occupied, memory=memory)
+    evidence.add_multiplicity(np.arange(0, 40, 3))
+    for cells in sets:
+        evidence.flip(np.array(sorted(cells), np.int64))
+        occupied[list(cells)] ^= 1
+    fresh = evidence_of(readings, model, occupied, memory=memory)
+    fresh.add_multiplicity(np.arange(0, 40, 3))
+    assert snapshot(evidence) == snapshot(fresh)
+
+
+def test_flips_at_once_evaluate_no_reading_that_sees_none_of_them() -> None:
+    readings = random_readings(np.random.default_rng(2), GRID, 50)
+    evidence = evidence_of(readings, MODEL, np.zeros(GRID.size, np.uint8))
+    evidence.state.clock[0] = 7
+    evidence.flip(np.array([50, 3]))
+    seers = {int(t) for c in (50, 3) for t in evidence.state.observing[: find_observing(evidence.state, c), 0]}
+    assert 0 < len(seers) < 50
+    assert set(np.flatnonzero(evidence.state.reading_states['changed'] == 7)) == seers
+
+
 @settings(max_examples=40, deadline=None)
 @given(seeds, st.lists(st.integers(0, GRID.size - 1), max_size=10), st.booleans())
 def test_flipping_there_and_back_changes_nothing(seed: int, cells: list[int], backwards: bool) -> None:
@@ -281,6 +307,9 @@ def test_the_number_of_threads_changes_nothing(monkeypatch: pytest.MonkeyPatch, 
     for evidence in (one, many):
         evidence.state.maps.occupied[::3] ^= 1
         evidence.rebuild()
+    assert snapshot(many) == snapshot(one)
+    for evidence in (one, many):
+        evidence.flip(np.arange(0, GRID.size, 5))
     assert snapshot(many) == snapshot(one)
 
 

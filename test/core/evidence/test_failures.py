@@ -20,7 +20,6 @@ from forward_grid_mapper.core.evidence import evidence as module
 from forward_grid_mapper.core.evidence.evidence import Evidence
 from forward_grid_mapper.core.maps.free_space import expected_passes
 from forward_grid_mapper.core.runtime import threads
-from forward_grid_mapper.core.sensor import surface_normals
 
 LARGE = Grid(0.1, GRID.column - 9, GRID.row - 11, GRID.width + 30, GRID.height + 25)
 AGAIN = np.array([0, 3, 45, 45])
@@ -140,15 +139,17 @@ def test_cancelled_in_the_middle_everything_is_as_it_was(
     assert told(evidence) == told(whole)
 
 
-def test_cancelled_while_it_is_rebuilt_the_evidence_is_that_of_the_map() -> None:
+@pytest.mark.parametrize('at_once', [False, True])
+def test_cancelled_while_it_is_rebuilt_the_evidence_is_that_of_the_map(at_once: bool) -> None:
     readings, model, occupied = case(22)
     stop = np.zeros(1, np.uint8)
     evidence = Evidence(GRID, model, start=occupied.reshape(GRID.shape), stop=stop)
     evidence.extend(readings)
-    evidence.state.maps.occupied[::3] ^= 1
+    if not at_once:
+        evidence.state.maps.occupied[::3] ^= 1
     stop[0] = 1
     with pytest.raises(Cancelled):
-        evidence.rebuild()
+        evidence.flip(np.arange(0, GRID.size, 3)) if at_once else evidence.rebuild()
     fresh = Evidence(GRID, model, start=evidence.state.maps.occupied.reshape(GRID.shape))
     fresh.extend(readings)
     assert snapshot(evidence) == snapshot(fresh)
@@ -223,13 +224,3 @@ def test_threads_that_wait_for_one_another_come_to_the_same_as_one(monkeypatch: 
         assert np.array_equal(one, two)
     assert snapshot(alone) == snapshot(both)
     assert np.array_equal(passed[0], expected_passes(alone, alone.state.maps.occupied))
-
-
-def test_normals_are_estimated_block_by_block(monkeypatch: pytest.MonkeyPatch) -> None:
-    readings, model, _ = case(26)
-    whole = Evidence(GRID, model, renewable=True)
-    whole.extend(readings)
-    monkeypatch.setattr(surface_normals, 'BLOCK', 2 * GRID.width)
-    blocks = Evidence(GRID, model, renewable=True)
-    blocks.extend(readings)
-    assert told(whole) == told(blocks)

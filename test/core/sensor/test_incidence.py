@@ -20,7 +20,7 @@ from forward_grid_mapper.core.sensor.incidence import (
     ZONES,
     count,
     edges_of,
-    limits,
+    limit,
     narrowed,
     no_counts,
     slots_of,
@@ -115,12 +115,12 @@ def test_parts_of_readings_and_of_the_map_sum_up_to_the_whole() -> None:
 def test_limits_are_those_of_the_twin(quanta: list[int]) -> None:
     # counts are whole numbers of quanta, whose sums are exact: an empty zone is a tie for both
     counts = np.array(quanta) / 64
-    assert limits(counts[:, None])[0] == naive.incidence_limit(counts[:ZONES], counts[ZONES:])
+    assert limit(counts) == naive.incidence_limit(counts[:ZONES], counts[ZONES:])
 
 
 def test_limits_of_typical_surfaces() -> None:
     def zone(echoes: list[float], passes: list[float]) -> int:
-        return int(limits(np.array([*echoes, *passes])[:, None])[0])
+        return limit(np.array([*echoes, *passes], float))
 
     assert zone([9, 0, 0], [1, 9, 9]) == 0, 'glass'
     assert zone([9, 9, 0], [1, 1, 9]) == 1, 'a smooth wall'

@@ -20,12 +20,15 @@ from forward_grid_mapper.core.evidence.updates import find_observing, flip
 from forward_grid_mapper.core.runtime import threads
 from forward_grid_mapper.core.sensor.surface_normals import (
     QUANTUM,
-    box_sums,
     exceeds_incidence_angle,
     gather,
     no_normals,
     normals_of,
     on_larger_grid,
+    reach_of,
+    sum_across,
+    sum_columns,
+    unit_of_sums,
 )
 from samples import plain_model, random_readings
 
@@ -110,13 +113,22 @@ def test_sums_are_over_a_square_in_metres_of_which_the_edge_may_be_parts_of_cell
             y, x = row + i - within, column + j - within
             if 0 <= y < 9 and 0 <= x < 12:
                 expected[row, column] += weights[i] * weights[j] * values[y, x]
-    scale = QUANTUM * (resolution / WEIGHT_CELL) ** 2
-    whole = box_sums(values, resolution, (0, 9, 0, 12))
-    assert whole == pytest.approx(expected * scale, abs=1e-12)
+    reach = reach_of(resolution)
+    assert reach == (within, part)
+    assert unit_of_sums(resolution) == pytest.approx(QUANTUM * (resolution / WEIGHT_CELL) ** 2)
+
+    def box_sums(bottom: int, top: int, left: int, right: int) -> np.ndarray:
+        out, columns = np.empty((top - bottom, right - left)), np.empty(right - left + 2 * within)
+        for row, column in np.ndindex(out.shape):
+            sum_columns(values, bottom + row, left - within, reach, columns)
+            out[row, column] = sum_across(columns, column, reach)
+        return out
+
+    whole = box_sums(0, 9, 0, 12)
+    assert whole == pytest.approx(expected, abs=1e-9)
     # to the bit, so that what is renewed is what would be estimated at once
     for bottom, top, left, right in ((0, 1, 0, 1), (2, 9, 0, 5), (8, 9, 11, 12), (1, 4, 3, 12)):
-        part_of_it = box_sums(values, resolution, (bottom, top, left, right))
-        assert np.array_equal(part_of_it, whole[bottom:top, left:right])
+        assert np.array_equal(box_sums(bottom, top, left, right), whole[bottom:top, left:right])
 
 
 def test_the_same_wall_has_its_normals_in_cells_of_any_size() -> None:
