@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from forward_grid_mapper.core import online_map
-from forward_grid_mapper.core.evidence import evidence
+from forward_grid_mapper.core.evidence import evidence, learned_normals
 from forward_grid_mapper.core.search import search
 
 NUMPY = (
@@ -21,7 +21,8 @@ NUMPY = (
 
 OURS: tuple[tuple[Any, str], ...] = (
     *((evidence, name) for name in ('cone_table', 'reading_state_table', 'no_tiles', 'more_chunks', 'empty_pairs')),
-    *((evidence, name) for name in ('workspace_for', 'normals_of', 'renewed', 'on_larger_grid', 'box_of', '_maps')),
+    *((evidence, name) for name in ('workspace_for', 'on_larger_grid', 'box_of', '_maps')),
+    *((learned_normals, name) for name in ('normals_of', 'renewed')),
     *((evidence.Evidence, name) for name in ('_reserve', '_make_room', '_insert', 'grow', 'extend', 'renew_normals')),
     *((online_map, name) for name in ('map_grid', 'grid_of', 'wall_prior', 'mark_traversed', 'Evidence', 'Search')),
     *((search, name) for name in ('log_prior', 'best_shifts', 'independent_prior', 'wall_prior')),

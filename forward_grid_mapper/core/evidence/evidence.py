@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
 from typing import NamedTuple
@@ -14,24 +13,21 @@ from numpy.typing import NDArray
 from ..common.grid import UNKNOWN, Grid, Window, united
 from ..common.parameters import ModelParameters
 from ..common.readings import Readings
-from ..runtime.cancelling import check
+from ..runtime.cancelling import NEVER, check
 from ..runtime.memory import THREAD_MEMORY
 from ..runtime.threads import parts, run_each
 from ..sensor.cone_table import CONE, Cones, Floats, cone_table
 from ..sensor.density import hit_probability
-from ..sensor.incidence import count, edges_of, narrowed, no_counts, slots_of, with_own_angles
-from ..sensor.surface_normals import SurfaceNormals, gather, no_normals, normals_of, on_larger_grid, renewed, touched
+from ..sensor.surface_normals import SurfaceNormals, no_normals, on_larger_grid, touched
 from .fixed_point import QUANTUM
 from .indexing import BAND, FREE, LARGEST, UNSTORED, UNUSED, WORDS, insert_readings, reading_state_table
+from .learned_normals import first_normals, has_limit, keep_bearings, renewed_normals
 from .neighbourhood import note_flips, set_patterns
 from .pairs import WORD, WORDS_PER_BAND_PAIR, Lattice, empty_pairs, workspace_for
-from .renewal import box_of, find_changed, near, renew
-from .state import READING_STATE, Maps, Model, State
+from .renewal import box_of, find_changed, renew
+from .state import READING_STATE, Maps, Model, State, Work
 from .tile_index import more_chunks, no_tiles
 from .updates import add_multiplicity, evaluate_all, evaluate_flipped, forget
-
-NO_INCIDENCE_LIMIT = 1.5707
-"""Radians off the normal from where on no reading exceeds the incidence angle."""
 
 MOST_UNUSED = 0.25
 """Part of the words given to readings that may be out of use before all pairs are packed anew."""
@@ -40,12 +36,6 @@ BYTES_A_CONE_CELL = 64
 """Of a workspace, for each cell of the largest cone."""
 
 NOBODY = np.zeros(0, np.int64)
-
-NEVER = np.zeros(1, np.uint8)
-"""A `stop` that nobody sets."""
-
-Work = Callable[[State, int, int, NDArray[np.int64]], None]
-"""Takes the readings from one to another, and adds to an array."""
 
 
 class _Before(NamedTuple):
@@ -114,7 +104,7 @@ class Evidence:
         self._words = int(min(memory / WORD, 2.0**60))
         self._totals = np.zeros(6, np.int64)
         self._size = self._indexed = 0
-        learns = model.max_incidence_angle < NO_INCIDENCE_LIMIT
+        learns = has_limit(model)
         self._sums = np.zeros((3, grid.size), np.int64) if learns and renewable else None
         self._since: Window | None = None
         self._given_normals = normals is not None
@@ -229,8 +219,8 @@ class Evidence:
         since = united(self._since, *(box_of(cones, self.grid) for cones in later))
         before = self._index_so_far()
         try:
-            if not begin and not self._given_normals and self.model.max_incidence_angle < NO_INCIDENCE_LIMIT:
-                self._first_normals(end)
+            if not begin and not self._given_normals and has_limit(self.model):
+                self._learn_normals(end)
             self._insert(begin, end)
             try:
                 self._evaluate_and_add(begin, end, new=True)
@@ -245,7 +235,7 @@ class Evidence:
         self._size = end
         if self._sums is not None:
             for cones in later:
-                self._keep_bearings(cones)
+                keep_bearings(cones, self.grid, self._sums)
             self._since = since
 
     def add_multiplicity(self, readings: NDArray[np.int64]) -> None:
@@ -255,7 +245,7 @@ class Evidence:
         since = united(self._since, box_of(repeated, self.grid))
         add_multiplicity(self.state, readings)
         if self._sums is not None:
-            self._keep_bearings(repeated)
+            keep_bearings(repeated, self.grid, self._sums)
             self._since = since
 
     @staticmethod
@@ -300,7 +290,7 @@ class Evidence:
         self.grid, self.state, self._totals, self._sums = grid, grown, np.zeros(6, np.int64), larger
         try:
             if sums is None and len(s.normals.known):
-                self._first_normals(self._size)
+                self._learn_normals(self._size)
             self._insert(0, self._size)
             evaluating = True
             self._evaluate_and_add(0, self._size, new=True)
@@ -372,7 +362,7 @@ class Evidence:
         s, shape = self.state, self.grid.shape
         # what changed is seen in the normals around it, and these in the incidence angles around them
         around = touched(touched(self._since, self.grid), self.grid)
-        normals = self._renewed(s, self._sums, around)
+        normals = renewed_normals(s, self._size, self.grid, self.model, self._sums, around)
         differ = np.zeros(shape, np.uint8)
         sees = np.zeros(self._size, np.uint8)
         find_changed(s, normals, around, differ, sees)
@@ -472,52 +462,12 @@ class Evidence:
         if not begin and self._sums is not None:
             self._sums[:] = 0
 
-    def _first_normals(self, end: int) -> None:
+    def _learn_normals(self, end: int) -> None:
         """Learn from the first readings which way surfaces face, and up to which incidence they return echoes."""
         self._indexed = 0
-        normals, edges = self._unit_normals(end), edges_of(self.model)
-        self.state = self.state._replace(normals=normals)
-        if edges is None:
-            return
-        whole = 0, self.grid.height, 0, self.grid.width
-        slots = slots_of(normals, whole)
-        counts = no_counts(slots)
-        weights = np.ascontiguousarray(self.state.reading_states['multiplicity'][:end])
-
-        def work(s: State, first: int, last: int, into: NDArray[np.int64]) -> None:
-            count(s.cones, weights, normals, slots, whole, edges, (first, last), into, s.stop)
-
-        self.summed(0, end, work, counts)
-        narrowed(normals, counts, slots, edges, self.grid, whole)
-
-    def _unit_normals(self, end: int) -> SurfaceNormals:
         sums = np.zeros((3, self.grid.size), np.int64) if self._sums is None else self._sums
-
-        def work(s: State, first: int, last: int, into: NDArray[np.int64]) -> None:
-            gather(s.cones, self.grid.shape, (first, last), into, s.stop)
-
-        self.summed(0, end, work, sums)
-        return normals_of(sums, self.grid, self.model.max_incidence_angle)
-
-    def _renewed(self, s: State, sums: NDArray[np.int64], window: Window) -> SurfaceNormals:
-        """Return the normals as they are with other sums and readings, which change them in a window alone."""
-        around = touched(window, self.grid)
-        normals, edges = renewed(s.normals, sums, self.grid, around), edges_of(self.model)
-        if edges is None:
-            return normals
-        readings = np.flatnonzero(near(s.cones[: self._size], around))
-        weights = s.reading_states['multiplicity'][readings]
-        with_own_angles(normals, s.cones[readings], weights, self.grid, window, edges)
-        # around the window nothing changed
-        outside = np.ones(self.grid.shape, np.bool_)
-        outside[window[0] : window[1], window[2] : window[3]] = False
-        for new, old in ((normals.x, s.normals.x), (normals.y, s.normals.y)):
-            np.copyto(new.reshape(self.grid.shape), old.reshape(self.grid.shape), where=outside)
-        return normals
-
-    def _keep_bearings(self, cones: NDArray[np.void]) -> None:
-        """Add what readings say about surface normals; it cannot fail: on one thread, whatever `stop` says."""
-        gather(cones, self.grid.shape, (0, len(cones)), self._sums, NEVER)
+        normals = first_normals(self.state, end, self.grid, self.model, sums, self.summed)
+        self.state = self.state._replace(normals=normals)
 
     def _reserve(self, size: int) -> None:
         """Make room for `size` readings; more than that where they come in small numbers."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -119,3 +120,7 @@ class State(NamedTuple):
     observing: NDArray[np.int32]
     clock: NDArray[np.int64]
     stop: NDArray[np.uint8]
+
+
+Work = Callable[[State, int, int, NDArray[np.int64]], None]
+"""Takes the readings from one to another, and adds to an array."""

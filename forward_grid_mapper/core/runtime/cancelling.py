@@ -7,6 +7,9 @@ from numpy.typing import NDArray
 
 from ..common.errors import Cancelled
 
+NEVER = np.zeros(1, np.uint8)
+"""A `stop` that nobody sets."""
+
 
 def check(stop: NDArray[np.uint8]) -> None:
     """Raise `Cancelled` if `stop` is set."""

@@ -35,6 +35,7 @@ from ..common.constants import (
 )
 from ..common.grid import Grid, Window
 from ..common.parameters import ModelParameters
+from ..runtime.cancelling import NEVER
 from ..runtime.jit import kernel
 from .cone import rows_of, runs_of, strength
 from .cone_table import Cones, cone_of
@@ -268,8 +269,8 @@ def with_own_angles(
     window : first row, last one plus one, and columns likewise
     edges : float64, shape (ZONES,)
     """
-    around, never = touched(window, grid), np.zeros(1, np.uint8)
+    around = touched(window, grid)
     slots = slots_of(normals, around)
     counts = no_counts(slots)
-    count(cones, weights, normals, slots, around, edges, (0, len(cones)), counts, never)
+    count(cones, weights, normals, slots, around, edges, (0, len(cones)), counts, NEVER)
     return narrowed(normals, counts, slots, edges, grid, window)

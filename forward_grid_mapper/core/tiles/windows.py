@@ -13,9 +13,11 @@ from numpy.typing import NDArray
 from ..common.grid import Grid
 from ..common.parameters import Parameters
 from ..common.readings import Readings
-from ..evidence.evidence import NEVER, NO_INCIDENCE_LIMIT, Evidence
+from ..evidence.evidence import Evidence
+from ..evidence.learned_normals import has_limit
 from ..maps.dynamic import dynamic_echoes
 from ..maps.handed_out import hand_out
+from ..runtime.cancelling import NEVER
 from ..runtime.memory import memory_for_pairs
 from ..search.search import Progress, Search
 from ..sensor.cone_table import cone_table
@@ -62,11 +64,10 @@ class Given(NamedTuple):
 
 def normals_from(xy: NDArray[np.float32], parameters: Parameters) -> SurfaceNormals:
     """Return normals from x and y as of `SurfaceNormals`, float32, shape (2, height, width), 0 where none is known."""
-    angle = parameters.model.max_incidence_angle
-    if angle >= NO_INCIDENCE_LIMIT:
+    if not has_limit(parameters.model):
         return no_normals()
     x, y = xy
-    return known_normals(((x != 0) | (y != 0)).astype(np.uint8), x, y, angle)
+    return known_normals(((x != 0) | (y != 0)).astype(np.uint8), x, y, parameters.model.max_incidence_angle)
 
 
 class Searched(NamedTuple):
@@ -101,13 +102,13 @@ class Judged(NamedTuple):
 
 def found_normals(given: Given, parameters: Parameters) -> NDArray[np.float32]:
     """Return x and y of the surface normals of the core, as of `SurfaceNormals`, float32, shape (2, *core.shape)."""
-    box, angle = given.box, parameters.model.max_incidence_angle
-    if angle >= NO_INCIDENCE_LIMIT:
+    box = given.box
+    if not has_limit(parameters.model):
         return np.zeros((2, *given.tile.core.shape), np.float32)
     sums = np.zeros((3, box.size), np.int64)
     cones = cone_table(given.readings, box, parameters.model)
     gather(cones, box.shape, (0, len(cones)), sums, NEVER)
-    normals, edges = normals_of(sums, box, angle), edges_of(parameters.model)
+    normals, edges = normals_of(sums, box, parameters.model.max_incidence_angle), edges_of(parameters.model)
     if edges is not None:
         whole, weights = (0, box.height, 0, box.width), np.ones(len(cones), np.int32)
         with_own_angles(normals, cones, weights, box, whole, edges)

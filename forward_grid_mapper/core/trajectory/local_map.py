@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from ..common.grid import Grid
 from ..common.parameters import ModelParameters, Parameters
 from ..common.readings import Readings
-from ..evidence.evidence import NO_INCIDENCE_LIMIT, Evidence
+from ..evidence.evidence import Evidence
+from ..evidence.learned_normals import NO_INCIDENCE_LIMIT
 from ..maps.traversed import traversed_cells
 from ..runtime.memory import memory_for_pairs
 from ..search.search import Search, SearchResult

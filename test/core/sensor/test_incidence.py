@@ -14,7 +14,8 @@ from forward_grid_mapper.core.common.constants import NEIGHBOURHOOD, WEIGHT_CELL
 from forward_grid_mapper.core.common.grid import Grid
 from forward_grid_mapper.core.common.parameters import ModelParameters
 from forward_grid_mapper.core.common.readings import Readings
-from forward_grid_mapper.core.evidence.evidence import NEVER, Evidence
+from forward_grid_mapper.core.evidence.evidence import Evidence
+from forward_grid_mapper.core.runtime.cancelling import NEVER
 from forward_grid_mapper.core.sensor.cone_table import cone_table
 from forward_grid_mapper.core.sensor.incidence import (
     ZONES,
