@@ -26,7 +26,7 @@ from forward_grid_mapper.core.sensor.incidence import (
     no_counts,
     slots_of,
 )
-from forward_grid_mapper.core.sensor.surface_normals import QUANTUM, SurfaceNormals, gather, normals_of
+from forward_grid_mapper.core.sensor.surface_normals import QUANTUM, SurfaceNormals, gather, normals_of, reach_of
 from samples import random_readings
 
 GRID = Grid(0.1, -25, 0, 50, 40)
@@ -57,9 +57,13 @@ def unit_normals(readings: Readings, grid: Grid = GRID) -> SurfaceNormals:
 
 
 def counted(
-    readings: Readings, normals: SurfaceNormals, window: tuple[int, int, int, int] = WHOLE, weights: object = None
+    readings: Readings,
+    normals: SurfaceNormals,
+    window: tuple[int, int, int, int] = WHOLE,
+    weights: object = None,
+    grid: Grid = GRID,
 ) -> tuple[np.ndarray, np.ndarray]:
-    slots, cones = slots_of(normals, window), cone_table(readings, GRID, MODEL)
+    slots, cones = slots_of(normals, window), cone_table(readings, grid, MODEL)
     counts, edges = no_counts(slots), edges_of(MODEL)
     each = np.ones(len(cones), np.int32) if weights is None else weights
     count(cones, each, normals, slots, window, edges, (0, len(cones)), counts, NEVER)
@@ -144,17 +148,22 @@ def test_a_place_through_which_readings_went_has_that_of_the_model() -> None:
     assert np.nanmin(told) == pytest.approx(MODEL.max_incidence_angle, abs=1e-3)
 
 
-def test_lengths_are_those_of_what_is_summed_around_a_cell() -> None:
-    readings = before_wall(0.45, 0.9)
-    normals = unit_normals(readings)
-    counts, slots = counted(readings, normals)
-    dense = np.where(slots >= 0, counts[:, np.maximum(slots, 0)], 0).reshape(-1, *GRID.shape) * QUANTUM
-    made = narrowed(unit_normals(readings), counts, slots, edges_of(MODEL), GRID, WHOLE)
-    seen = set[int]()
+@pytest.mark.parametrize('grid', [GRID, Grid(0.05, -50, 0, 100, 80)], ids=['whole cells', 'parts of cells'])
+def test_lengths_are_those_of_what_is_summed_around_a_cell(grid: Grid) -> None:
+    readings, whole = before_wall(0.45, 0.9), (0, grid.height, 0, grid.width)
+    normals = unit_normals(readings, grid)
+    counts, slots = counted(readings, normals, whole, grid=grid)
+    dense = np.where(slots >= 0, counts[:, np.maximum(slots, 0)], 0).reshape(-1, *grid.shape) * QUANTUM
+    made = narrowed(unit_normals(readings, grid), counts, slots, edges_of(MODEL), grid, whole)
+    (n, part), seen = reach_of(grid.resolution), set[int]()
+    weight = np.ones(2 * n + 1)
+    weight[[0, -1]] = part
+    wide = np.pad(dense, ((0, 0), (n, n), (n, n)))
+    unit = (grid.resolution / WEIGHT_CELL) ** 2 * WEIGHT_CELL / NEIGHBOURHOOD
     for c in np.flatnonzero(normals.known):
-        row, column = divmod(int(c), GRID.width)
-        rows, columns = slice(max(row - 1, 0), row + 2), slice(max(column - 1, 0), column + 2)
-        around = dense[:, rows, columns].sum(axis=(1, 2)) * WEIGHT_CELL / NEIGHBOURHOOD
+        row, column = divmod(int(c), grid.width)
+        square = wide[:, row : row + 2 * n + 1, column : column + 2 * n + 1]
+        around = np.einsum('kij,i,j', square, weight, weight) * unit
         zone = naive.incidence_limit(around[:ZONES], around[ZONES:])
         length = math.cos(MODEL.max_incidence_angle) / math.cos(ANGLES[zone])
         assert made.x[c] == pytest.approx(normals.x[c] * length, abs=1e-6)
@@ -162,11 +171,11 @@ def test_lengths_are_those_of_what_is_summed_around_a_cell() -> None:
         seen.add(zone)
     assert seen == set(range(ZONES))
     # and of a part of the map they are what they are on the whole of it
-    part = (20, 32, 10, 30)
-    again = narrowed(unit_normals(readings), counts, slots, edges_of(MODEL), GRID, part)
-    inside = (slice(*part[:2]), slice(*part[2:]))
-    assert np.array_equal(again.x.reshape(GRID.shape)[inside], made.x.reshape(GRID.shape)[inside])
-    again.x.reshape(GRID.shape)[inside] = normals.x.reshape(GRID.shape)[inside]
+    bottom, top, left, right = (20, 32, 10, 30) if grid is GRID else (40, 64, 20, 60)
+    again = narrowed(unit_normals(readings, grid), counts, slots, edges_of(MODEL), grid, (bottom, top, left, right))
+    inside = (slice(bottom, top), slice(left, right))
+    assert np.array_equal(again.x.reshape(grid.shape)[inside], made.x.reshape(grid.shape)[inside])
+    again.x.reshape(grid.shape)[inside] = normals.x.reshape(grid.shape)[inside]
     assert np.array_equal(again.x, normals.x)
 
 
