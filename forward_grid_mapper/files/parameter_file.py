@@ -16,7 +16,7 @@ from ..core.common.former_parameters import DEPRECATED
 from ..core.common.parameter import Parameter
 from ..core.common.parameters import LOG, find
 from ..core.messages.message_types import Pose2
-from ..core.messages.mounts import TURN, mount_of
+from ..core.messages.mounts import TURN, mount_from
 from .small_text import read_text
 
 NODE_NAME = 'forward_grid_mapper'
@@ -122,7 +122,7 @@ def parse_sensor(text: str) -> tuple[str, Pose2]:
         )
     if not degrees and TURN < abs(yaw) <= 360.0:
         raise ParameterError(f'{text!r}: a yaw of {yaw:g} rad is more than a full turn; is it {frame}={numbers}deg?')
-    return frame, mount_of(frame, [x, y, math.radians(yaw) if degrees else yaw])
+    return frame, mount_from(frame, [x, y, math.radians(yaw) if degrees else yaw])
 
 
 class _Loader(yaml.SafeLoader):
@@ -201,7 +201,7 @@ def _sort_out(flat: dict[str, Any]) -> ParameterFile:
     result = ParameterFile({}, {}, {})
     for name, value in flat.items():
         if extrinsic := _MOUNT.fullmatch(name):
-            result.extrinsics[extrinsic['frame']] = mount_of(name, value)
+            result.extrinsics[extrinsic['frame']] = mount_from(name, value)
             if len({isinstance(number, int) for number in value}) > 1:
                 LOG.warning('%s: write each number of %s with a point; ROS refuses lists of both kinds', name, value)
         elif _ROS_OWN.fullmatch(name):

@@ -16,7 +16,7 @@ from ..core.common.former_parameters import DEPRECATED, RENAMED, deprecation
 from ..core.common.parameter import Parameter
 from ..core.common.parameters import TABLE, Parameters
 from ..core.messages.message_types import Pose2
-from ..core.messages.mounts import mount_of
+from ..core.messages.mounts import mount_from
 
 ROS_OWN = ('use_sim_time', 'start_type_description_service', 'qos_overrides')
 NAMES = {row.name for row in TABLE}
@@ -107,7 +107,7 @@ def _extrinsics(given: dict[str, RosParameter]) -> dict[str, Pose2]:
     extrinsics = {}
     for name, parameter in given.items():
         if name.startswith('sensors.') and name.endswith('.pose'):
-            extrinsics[name[len('sensors.') : -len('.pose')]] = mount_of(name, parameter.value)
+            extrinsics[name[len('sensors.') : -len('.pose')]] = mount_from(name, parameter.value)
     return extrinsics
 
 

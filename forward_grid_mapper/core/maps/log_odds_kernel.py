@@ -59,7 +59,7 @@ class InverseModel(NamedTuple):
     width: float
 
 
-class Lattice(NamedTuple):
+class StoredGrid(NamedTuple):
     """The stored grid: edge of a cell in metres, lattice indices of the lower left cell, and columns and rows."""
 
     resolution: float
@@ -79,7 +79,7 @@ class _Ends(NamedTuple):
 
 
 @kernel
-def direction_of(yaw: float, directions: int) -> int:
+def direction_of_yaw(yaw: float, directions: int) -> int:
     """Return which of so many directions, even over half a turn, is nearest to looking along `yaw` or against it."""
     return int(math.floor(yaw * directions / math.pi + 0.5)) % directions
 
@@ -164,7 +164,7 @@ def _wedge_run(edges: tuple[_Edge, _Edge], reach2: float, x: float, v: float) ->
 
 
 @kernel
-def add_readings(beams: Beams, model: InverseModel, lattice: Lattice, planes: Any) -> None:
+def add_readings(beams: Beams, model: InverseModel, lattice: StoredGrid, planes: Any) -> None:
     """Add what every reading says.
 
     Parameters
@@ -172,7 +172,7 @@ def add_readings(beams: Beams, model: InverseModel, lattice: Lattice, planes: An
     beams : Beams
         Of readings all of whose cells lie on the lattice.
     model : InverseModel
-    lattice : Lattice
+    lattice : StoredGrid
     planes : float64, shape (directions, width * height + `PADDING`)
     """
     directions = len(planes)
@@ -186,7 +186,7 @@ def add_readings(beams: Beams, model: InverseModel, lattice: Lattice, planes: An
         column, row = column - lattice.column, row - lattice.row
         axis_x, axis_y = math.cos(beams.yaw[t]), math.sin(beams.yaw[t])
         width, height = lattice.width, lattice.height
-        k = direction_of(beams.yaw[t], directions)
+        k = direction_of_yaw(beams.yaw[t], directions)
         if is_steep(k, directions):
             x, y, axis_x, axis_y = y, x, axis_y, axis_x
             column, row, width, height = row, column, height, width

@@ -30,7 +30,7 @@ from ..common.grid import Grid
 from ..common.parameters import Parameters
 from ..common.readings import Readings
 from ..sensor.cone_table import Floats, check_size, grid_of
-from .log_odds_kernel import PADDING, UNTOUCHED, Beams, InverseModel, Lattice, add_readings, is_steep
+from .log_odds_kernel import PADDING, UNTOUCHED, Beams, InverseModel, StoredGrid, add_readings, is_steep
 
 MARGIN = 64
 """Cells by which the array outgrows what is needed, so that a driving robot rarely makes it grow again."""
@@ -91,7 +91,7 @@ class LogOddsMap:
         self._grow(map_grid(r, self._parameters, self.grid, self._arc))
         g = self._stored
         beams = Beams(*(np.ascontiguousarray(v) for v in (r.x, r.y, r.yaw, r.half_angle, r.z, r.z_max)))
-        lattice = Lattice(float(g.resolution), g.column, g.row, g.width, g.height)
+        lattice = StoredGrid(float(g.resolution), g.column, g.row, g.width, g.height)
         add_readings(beams, self._model(), lattice, self._planes)
 
     def add_map(self, other: LogOddsMap) -> None:

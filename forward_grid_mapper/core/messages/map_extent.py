@@ -29,7 +29,7 @@ def possible(pose: Pose2) -> bool:
     return abs(pose.x) < FARTHEST and abs(pose.y) < FARTHEST and math.isfinite(pose.yaw)
 
 
-def reach_of(measured: Measurement, parameters: Parameters) -> float:
+def reach_with_margin(measured: Measurement, parameters: Parameters) -> float:
     """Return how far from the sensor the maps take note of a reading, and two cells more, in metres."""
     sigma = measured.sigma or parameters.model.sigma
     return float(_reach(measured.z, measured.z_max, sigma, parameters, max, min))
@@ -38,7 +38,7 @@ def reach_of(measured: Measurement, parameters: Parameters) -> float:
 def _reach(
     z: Any, z_max: Any, sigma: Any, parameters: Parameters, highest: Callable[..., Any], lowest: Callable[..., Any]
 ) -> Any:
-    """Return `reach_of` for numbers or for arrays, of which `highest` and `lowest` take the greater and the smaller."""
+    """Return `reach_with_margin` of numbers or of arrays, of which `highest` and `lowest` take the greater and the less."""
     cell = parameters.grid.resolution
     evaluated = z + CUT * highest(sigma, cell / 2)
     return highest(lowest(evaluated, z_max), z + arc_depths(cell)[1]) + 2 * cell
@@ -140,7 +140,7 @@ class MapExtent:
 
     def admit(self, sensor: Pose2, measured: Measurement, parameters: Parameters) -> str:
         """Grow to hold a reading and return '', or return the reason (`rep117.REASONS`) why the map cannot."""
-        return self._admit(sensor, reach_of(measured, parameters), measured.half_angle, parameters)
+        return self._admit(sensor, reach_with_margin(measured, parameters), measured.half_angle, parameters)
 
     def _admit(self, sensor: Pose2, reach: float, half_angle: float, parameters: Parameters) -> str:
         cell = parameters.grid.resolution

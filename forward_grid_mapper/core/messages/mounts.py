@@ -16,7 +16,7 @@ FARTHEST = 10.0
 """Metres from the middle of the robot's base to a sensor, at the most; 15 cm that are written as 15 are more."""
 
 
-def mount_of(name: str, values: object) -> Pose2:
+def mount_from(name: str, values: object) -> Pose2:
     """Return the pose of a sensor in the robot's base frame (REP 103) from [x, y, yaw], metres and radians.
 
     Parameters

@@ -39,7 +39,7 @@ from ..runtime.cancelling import NEVER
 from ..runtime.jit import kernel
 from .cone import rows_of, runs_of, strength
 from .cone_table import Cones, cone_of
-from .surface_normals import QUANTUM, Reach, SurfaceNormals, reach_of, sum_across, touched, unit_of_sums
+from .surface_normals import QUANTUM, Square, SurfaceNormals, square_of, sum_across, touched, unit_of_sums
 
 ZONES = 3
 """Zones of incidence that readings are counted in: two that are a few degrees wider, or five, are about as good."""
@@ -177,7 +177,7 @@ def _narrow(
     slots: Any,
     lengths: Any,
     window: Window,
-    reach: Reach,
+    square: Square,
     unit: float,
     columns: Any,
     pooled: Any,
@@ -189,22 +189,22 @@ def _narrow(
     normals, counts, slots, window
         As for `narrowed`.
     lengths : float64, shape (ZONES,)
-    reach, unit
+    square, unit
         Of the square around a cell, and what 1 counts in a sum over it.
-    columns : float64, shape (columns of the window and what `reach` is beyond, 2 · ZONES)
+    columns : float64, shape (columns of the window and what `square` is beyond, 2 · ZONES)
     pooled : float64, shape (2 · ZONES,)
         To work in.
     """
     bottom, top, left, right = window
     height, width = len(normals.before), normals.before.shape[1] - 1
-    first = left - reach[0]
+    first = left - square[0]
     for row in range(bottom, top):
         if normals.before[row, right] == normals.before[row, left]:
             continue
         columns[:] = 0.0
-        for other in range(max(row - reach[0], 0), min(row + reach[0] + 1, height)):
-            weight = reach[1] if abs(other - row) == reach[0] else 1.0
-            for column in range(max(first, 0), min(right + reach[0], width)):
+        for other in range(max(row - square[0], 0), min(row + square[0] + 1, height)):
+            weight = square[1] if abs(other - row) == square[0] else 1.0
+            for column in range(max(first, 0), min(right + square[0], width)):
                 slot = slots[other * width + column]
                 if slot >= 0:
                     for k in range(2 * ZONES):
@@ -214,7 +214,7 @@ def _narrow(
             if not normals.known[c]:
                 continue
             for k in range(2 * ZONES):
-                pooled[k] = sum_across(columns[:, k], column - left, reach) * unit
+                pooled[k] = sum_across(columns[:, k], column - left, square) * unit
             length = lengths[limit(pooled)]
             normals.x[c] *= length
             normals.y[c] *= length
@@ -240,10 +240,10 @@ def narrowed(
     grid : Grid
     window : first row, last one plus one, and columns likewise
     """
-    reach = reach_of(grid.resolution)
+    square = square_of(grid.resolution)
     unit = unit_of_sums(grid.resolution) * WEIGHT_CELL / NEIGHBOURHOOD
-    columns = np.empty((window[3] - window[2] + 2 * reach[0], 2 * ZONES))
-    _narrow(normals, counts, slots, np.sqrt(edges[-1] / edges), window, reach, unit, columns, np.empty(2 * ZONES))
+    columns = np.empty((window[3] - window[2] + 2 * square[0], 2 * ZONES))
+    _narrow(normals, counts, slots, np.sqrt(edges[-1] / edges), window, square, unit, columns, np.empty(2 * ZONES))
     return normals
 
 

@@ -128,11 +128,11 @@ def _before(known: NDArray[Any]) -> NDArray[np.int32]:
     return out
 
 
-Reach = tuple[int, float]
+Square = tuple[int, float]
 """How many cells `NEIGHBOURHOOD` reaches beyond the middle one, and which part of the outermost counts."""
 
 
-def reach_of(resolution: float) -> Reach:
+def square_of(resolution: float) -> Square:
     """Return it for cells of so many metres."""
     half = (max(round(NEIGHBOURHOOD / resolution, 6), 1.0) - 1.0) / 2.0
     whole = math.ceil(half - 1e-9)
@@ -145,55 +145,55 @@ def unit_of_sums(resolution: float) -> float:
 
 
 @kernel
-def sum_columns(values: Any, row: int, first: int, reach: Reach, out: Any) -> None:
+def sum_columns(values: Any, row: int, first: int, square: Square, out: Any) -> None:
     """Write to `out` the sums of columns over the height of `NEIGHBOURHOOD` around a row, those from `first` on.
 
     Nothing is added from beyond the edges of `values`, int64, shape (height, width).
     """
     height, width = values.shape
     out[:] = 0.0
-    for k in range(-reach[0], reach[0] + 1):
+    for k in range(-square[0], square[0] + 1):
         if 0 <= row + k < height:
-            weight = reach[1] if abs(k) == reach[0] else 1.0
+            weight = square[1] if abs(k) == square[0] else 1.0
             for i in range(max(-first, 0), min(len(out), width - first)):
                 out[i] += weight * values[row + k, first + i]
 
 
 @kernel
-def sum_across(columns: Any, begin: int, reach: Reach) -> float:
+def sum_across(columns: Any, begin: int, square: Square) -> float:
     """Return the sum of what `sum_columns` wrote, over the width of `NEIGHBOURHOOD`."""
     total = 0.0
-    for k in range(-reach[0], reach[0] + 1):
-        total += (reach[1] if abs(k) == reach[0] else 1.0) * columns[begin + reach[0] + k]
+    for k in range(-square[0], square[0] + 1):
+        total += (square[1] if abs(k) == square[0] else 1.0) * columns[begin + square[0] + k]
     return total
 
 
 @kernel
-def _estimate(normals: SurfaceNormals, sums: Any, window: Window, reach: Reach, unit: float, columns: Any) -> None:
+def _estimate(normals: SurfaceNormals, sums: Any, window: Window, square: Square, unit: float, columns: Any) -> None:
     """Write the normals of the cells of a window.
 
     Parameters
     ----------
     normals : SurfaceNormals
     sums : int64, shape (3, height, width)
-    window, reach
+    window, square
     unit : float
         `unit_of_sums`.
-    columns : float64, shape (3, columns of the window and what `reach` is beyond)
+    columns : float64, shape (3, columns of the window and what `square` is beyond)
         To work in.
     """
     bottom, top, left, right = window
     width = sums.shape[2]
     for row in range(bottom, top):
         for k in range(3):
-            sum_columns(sums[k], row, left - reach[0], reach, columns[k])
+            sum_columns(sums[k], row, left - square[0], square, columns[k])
         for column in range(left, right):
             c, at = row * width + column, column - left
             normals.known[c], normals.x[c], normals.y[c] = 0, 0.0, 0.0
-            mass = sum_across(columns[2], at, reach) * unit
+            mass = sum_across(columns[2], at, square) * unit
             if mass < LEAST_WEIGHT:
                 continue
-            cosine, sine = sum_across(columns[0], at, reach) * unit, sum_across(columns[1], at, reach) * unit
+            cosine, sine = sum_across(columns[0], at, square) * unit, sum_across(columns[1], at, square) * unit
             if math.hypot(cosine, sine) >= LEAST_AGREEMENT * mass:
                 angle = math.atan2(sine, cosine) / 2
                 normals.known[c], normals.x[c], normals.y[c] = 1, math.cos(angle), math.sin(angle)
@@ -203,9 +203,9 @@ def _estimate(normals: SurfaceNormals, sums: Any, window: Window, reach: Reach, 
 
 def _write(normals: SurfaceNormals, sums: NDArray[np.int64], grid: Grid, window: Window) -> None:
     """Write the normals of the cells of a window."""
-    reach = reach_of(grid.resolution)
-    columns = np.empty((3, window[3] - window[2] + 2 * reach[0]))
-    _estimate(normals, sums.reshape(3, *grid.shape), window, reach, unit_of_sums(grid.resolution), columns)
+    square = square_of(grid.resolution)
+    columns = np.empty((3, window[3] - window[2] + 2 * square[0]))
+    _estimate(normals, sums.reshape(3, *grid.shape), window, square, unit_of_sums(grid.resolution), columns)
 
 
 def normals_of(sums: NDArray[np.int64], grid: Grid, angle: float) -> SurfaceNormals:
@@ -250,7 +250,7 @@ def renewed(normals: SurfaceNormals, sums: NDArray[np.int64], grid: Grid, window
 def touched(window: Window, grid: Grid) -> Window:
     """Return the window of the cells whose squares of `NEIGHBOURHOOD` reach into `window`."""
     bottom, top, left, right = window
-    n, _ = reach_of(grid.resolution)
+    n, _ = square_of(grid.resolution)
     return max(bottom - n, 0), min(top + n, grid.height), max(left - n, 0), min(right + n, grid.width)
 
 

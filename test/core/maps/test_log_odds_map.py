@@ -14,7 +14,7 @@ from forward_grid_mapper.core.common.errors import InputError
 from forward_grid_mapper.core.common.grid import Grid, cone_boxes
 from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.common.readings import Readings
-from forward_grid_mapper.core.maps.log_odds_kernel import direction_of
+from forward_grid_mapper.core.maps.log_odds_kernel import direction_of_yaw
 from forward_grid_mapper.core.maps.log_odds_map import LogOddsMap, map_grid
 from forward_grid_mapper.core.sensor.cone_table import effective_sigma, reach_of
 from samples import random_readings
@@ -264,6 +264,6 @@ def test_the_grid_is_that_of_the_boxes_of_all_cones(count: int) -> None:
 def test_looking_along_a_line_either_way_is_one_direction(directions: int) -> None:
     yaw = np.random.default_rng(0).uniform(-9.0, 9.0, 300)
     for angle in yaw:
-        k = direction_of(angle, directions)
-        assert direction_of(angle + math.pi, directions) == k
+        k = direction_of_yaw(angle, directions)
+        assert direction_of_yaw(angle + math.pi, directions) == k
         assert abs(math.remainder(angle - k * math.pi / directions, math.pi)) <= math.pi / directions / 2 + 1e-9

@@ -10,7 +10,7 @@ import pytest
 from forward_grid_mapper.core.common.constants import arc_depths
 from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.common.readings import Readings
-from forward_grid_mapper.core.messages.map_extent import FARTHEST, LARGEST_CONE, MapExtent, reach_of
+from forward_grid_mapper.core.messages.map_extent import FARTHEST, LARGEST_CONE, MapExtent, reach_with_margin
 from forward_grid_mapper.core.messages.message_types import Pose2, RangeMessage
 from forward_grid_mapper.core.messages.rep117 import Measurement, measure
 from forward_grid_mapper.core.sensor.density import CUT
@@ -84,22 +84,22 @@ def test_restored_readings_are_those_that_were_admitted() -> None:
 
 
 def test_reach_is_that_of_the_echo_and_not_of_the_sensor() -> None:
-    assert reach_of(measured(1.0, 3e38), PARAMETERS) < 2.0
-    assert reach_of(measured(4.0, 4.0), PARAMETERS) == pytest.approx(4.0 + 0.1 + 0.2)
+    assert reach_with_margin(measured(1.0, 3e38), PARAMETERS) < 2.0
+    assert reach_with_margin(measured(4.0, 4.0), PARAMETERS) == pytest.approx(4.0 + 0.1 + 0.2)
 
 
 def test_how_far_a_reading_reaches() -> None:
     """Up to four standard deviations beyond its range, or the arc that an echo marks, and two cells; σ is stated."""
     cell = PARAMETERS.grid.resolution
     sigma = PARAMETERS.model.sigma
-    assert reach_of(measured(1.0, 9.0), PARAMETERS) == pytest.approx(1.0 + CUT * sigma + 2 * cell)
-    assert reach_of(measured(4.0, 4.0), PARAMETERS) == pytest.approx(4.0 + arc_depths(cell)[1] + 2 * cell)
+    assert reach_with_margin(measured(1.0, 9.0), PARAMETERS) == pytest.approx(1.0 + CUT * sigma + 2 * cell)
+    assert reach_with_margin(measured(4.0, 4.0), PARAMETERS) == pytest.approx(4.0 + arc_depths(cell)[1] + 2 * cell)
     stated = measure(RangeMessage(0, 'sonar', 1.0, 0.1, 9.0, 0.3, 0.25), PARAMETERS.association)
     assert isinstance(stated, Measurement)
-    assert reach_of(stated, PARAMETERS) == pytest.approx(1.0 + CUT * 0.5 + 2 * cell)
+    assert reach_with_margin(stated, PARAMETERS) == pytest.approx(1.0 + CUT * 0.5 + 2 * cell)
     # no finer than half a cell
     coarse = Parameters.from_flat({'resolution': 1.0})
-    assert reach_of(measured(1.0, 90.0), coarse) == pytest.approx(1.0 + CUT * 0.5 + 2.0)
+    assert reach_with_margin(measured(1.0, 90.0), coarse) == pytest.approx(1.0 + CUT * 0.5 + 2.0)
 
 
 def largest(count: int, **values: float) -> Parameters:
@@ -109,7 +109,7 @@ def largest(count: int, **values: float) -> Parameters:
 @pytest.mark.parametrize('across', [True, False])
 def test_as_many_cells_as_are_admitted_and_no_more(across: bool) -> None:
     """Two readings 90 m apart: as many cells in a row as the box has, and one more since it may begin in a cell."""
-    reach = reach_of(measured(), PARAMETERS)
+    reach = reach_with_margin(measured(), PARAMETERS)
     cell = PARAMETERS.grid.resolution
     pose = Pose2(90.0, 0, 0) if across else Pose2(0, 90.0, 0)
     cells = ((90.0 + 2 * reach) / cell + 1) * (2 * reach / cell + 1)
@@ -129,7 +129,7 @@ def test_as_many_cells_as_are_admitted_and_no_more(across: bool) -> None:
 def test_how_far_a_reading_may_be_from_the_map(x: int, y: int, restored: bool) -> None:
     """From the edge of the map, not from its middle, on each side."""
     parameters = Parameters.from_flat({'max_jump': 20.0})
-    reach = reach_of(measured(), parameters)
+    reach = reach_with_margin(measured(), parameters)
     for distance, expected in ((reach + 19.9, ''), (reach + 20.1, 'far_from_map')):
         extent = MapExtent()
         if restored:

@@ -10,21 +10,21 @@ import pytest
 
 from forward_grid_mapper.core.common.errors import ParameterError
 from forward_grid_mapper.core.messages.message_types import Pose2
-from forward_grid_mapper.core.messages.mounts import FARTHEST, TURN, mount_of
+from forward_grid_mapper.core.messages.mounts import FARTHEST, TURN, mount_from
 
 
 @pytest.mark.parametrize('form', [list, tuple, np.array, lambda values: array.array('d', values)])
 def test_forms_of_three_numbers(form: type) -> None:
-    assert mount_of('left', form([0.1, -0.2, 1.5])) == Pose2(0.1, -0.2, 1.5)
+    assert mount_from('left', form([0.1, -0.2, 1.5])) == Pose2(0.1, -0.2, 1.5)
 
 
 @pytest.mark.parametrize('kind', [np.float32, np.int32])
 def test_numbers_of_numpy_are_numbers(kind: type) -> None:
-    assert mount_of('left', np.array([1, 0, -2], kind)) == Pose2(1.0, 0.0, -2.0)
+    assert mount_from('left', np.array([1, 0, -2], kind)) == Pose2(1.0, 0.0, -2.0)
 
 
 def test_the_limits_are_admitted() -> None:
-    assert mount_of('left', [FARTHEST, 0, float(np.float32(-TURN))]).x == FARTHEST
+    assert mount_from('left', [FARTHEST, 0, float(np.float32(-TURN))]).x == FARTHEST
 
 
 @pytest.mark.parametrize(
@@ -42,4 +42,4 @@ def test_the_limits_are_admitted() -> None:
 )
 def test_what_is_refused(values: object, message: str) -> None:
     with pytest.raises(ParameterError, match=message):
-        mount_of('left', values)
+        mount_from('left', values)

@@ -26,7 +26,7 @@ from forward_grid_mapper.core.sensor.incidence import (
     no_counts,
     slots_of,
 )
-from forward_grid_mapper.core.sensor.surface_normals import QUANTUM, SurfaceNormals, gather, normals_of, reach_of
+from forward_grid_mapper.core.sensor.surface_normals import QUANTUM, SurfaceNormals, gather, normals_of, square_of
 from samples import random_readings
 
 GRID = Grid(0.1, -25, 0, 50, 40)
@@ -155,7 +155,7 @@ def test_lengths_are_those_of_what_is_summed_around_a_cell(grid: Grid) -> None:
     counts, slots = counted(readings, normals, whole, grid=grid)
     dense = np.where(slots >= 0, counts[:, np.maximum(slots, 0)], 0).reshape(-1, *grid.shape) * QUANTUM
     made = narrowed(unit_normals(readings, grid), counts, slots, edges_of(MODEL), grid, whole)
-    (n, part), seen = reach_of(grid.resolution), set[int]()
+    (n, part), seen = square_of(grid.resolution), set[int]()
     weight = np.ones(2 * n + 1)
     weight[[0, -1]] = part
     wide = np.pad(dense, ((0, 0), (n, n), (n, n)))

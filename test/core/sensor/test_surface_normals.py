@@ -25,7 +25,7 @@ from forward_grid_mapper.core.sensor.surface_normals import (
     no_normals,
     normals_of,
     on_larger_grid,
-    reach_of,
+    square_of,
     sum_across,
     sum_columns,
     unit_of_sums,
@@ -113,15 +113,15 @@ def test_sums_are_over_a_square_in_metres_of_which_the_edge_may_be_parts_of_cell
             y, x = row + i - within, column + j - within
             if 0 <= y < 9 and 0 <= x < 12:
                 expected[row, column] += weights[i] * weights[j] * values[y, x]
-    reach = reach_of(resolution)
-    assert reach == (within, part)
+    square = square_of(resolution)
+    assert square == (within, part)
     assert unit_of_sums(resolution) == pytest.approx(QUANTUM * (resolution / WEIGHT_CELL) ** 2)
 
     def box_sums(bottom: int, top: int, left: int, right: int) -> np.ndarray:
         out, columns = np.empty((top - bottom, right - left)), np.empty(right - left + 2 * within)
         for row, column in np.ndindex(out.shape):
-            sum_columns(values, bottom + row, left - within, reach, columns)
-            out[row, column] = sum_across(columns, column, reach)
+            sum_columns(values, bottom + row, left - within, square, columns)
+            out[row, column] = sum_across(columns, column, square)
         return out
 
     whole = box_sums(0, 9, 0, 12)
