@@ -38,7 +38,7 @@ def reach_with_margin(measured: Measurement, parameters: Parameters) -> float:
 def _reach(
     z: Any, z_max: Any, sigma: Any, parameters: Parameters, highest: Callable[..., Any], lowest: Callable[..., Any]
 ) -> Any:
-    """Return `reach_with_margin` of numbers or of arrays, of which `highest` and `lowest` take the greater and the less."""
+    """Return `reach_with_margin` of numbers or of arrays; `highest` and `lowest` take the greater and the smaller."""
     cell = parameters.grid.resolution
     evaluated = z + CUT * highest(sigma, cell / 2)
     return highest(lowest(evaluated, z_max), z + arc_depths(cell)[1]) + 2 * cell
