@@ -158,6 +158,13 @@ class Evidence:
         reading_states = self.state.reading_states[: self._size]
         return float((reading_states['likelihood'].astype(np.int64) * reading_states['multiplicity']).sum() * QUANTUM)
 
+    @property
+    def log_likelihoods(self) -> Floats:
+        """Log p(z | m) of each reading, shape (N,), in nats; one that stands for several says it several times."""
+        s = self.state.reading_states[: self._size]
+        out: Floats = s['likelihood'].astype(np.int64) * s['multiplicity'] * QUANTUM
+        return out
+
     def log_likelihood_of(self, which: NDArray[np.bool_]) -> float:
         """Return the log-likelihood of some readings, shape (N,), in nats; sums of parts add up without rounding."""
         reading_states = self.state.reading_states[: self._size][which]

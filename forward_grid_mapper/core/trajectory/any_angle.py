@@ -49,8 +49,16 @@ class Matched(NamedTuple):
     part: float
 
 
-def matched(odometry: Odometry, scans: Scans, say: Callable[[str], Progress], noise: float = 0.0) -> Matched | None:
-    """Return where a drive is by matches alone; None if no map along it explains its readings better than odometry's.
+def matched(
+    odometry: Odometry,
+    scans: Scans,
+    say: Callable[[str], Progress],
+    noise: float = 0.0,
+    known: Floats | None = None,
+) -> Matched | None:
+    """Return where a drive is by matches alone; None if the map along it explains its readings no better.
+
+    It has to explain them better than the map along odometry, and than the one along the nodes that are `known`.
 
     Parameters
     ----------
@@ -60,14 +68,17 @@ def matched(odometry: Odometry, scans: Scans, say: Callable[[str], Progress], no
         Receives a stage, and returns what receives how much of it is done.
     noise : float
         By how much the yaw of odometry strays, radians a √metre; 0 if nobody knows.
+    known : float64, shape (K, 3), optional
     """
     best, value = None, scans.objective(scans.windows.node)
+    if known is not None:
+        value = max(value, scans.objective(known))
     for trust in TRUSTS:
         start = scan_matched(scans, trust._replace(yaw=noise or trust.yaw), say('scan matching'))
         found = _in_rounds(odometry, scans, say, start, min(LEFT, noise or LEFT), value)
         if found is not None:
             best, value = found, found.value
-        # a drive that fits together hardly gains from another trial, nor does one whose odometry is right
+        # a drive that fits together hardly gains from another trial, nor does one that is better explained already
         if best is None or best.part >= LEAST_RECOGNISED:
             break
     return best

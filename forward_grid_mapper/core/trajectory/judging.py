@@ -65,6 +65,19 @@ def chosen(scans: Scans, first: Floats, *others: Floats) -> Floats:
     return best
 
 
+def explained_better(scans: Scans, before: Floats, after: Floats) -> Gain:
+    """Return by how much more J is along one trajectory than along another, nats a block of all readings but held-out.
+
+    Either trajectory was fitted to these readings, so a small gain means nothing; a large one tells a trajectory that
+    contradicts itself.
+    """
+    (value, windows), (more, of_more) = (scans.explained(nodes) for nodes in (before, after))
+    blocks = np.add.reduceat(of_more - windows, np.arange(0, len(windows), BLOCK))
+    if len(blocks) < FEWEST_BLOCKS:
+        return Gain(0.0, np.inf)
+    return Gain((more - value) / len(blocks), float(blocks.std(ddof=1) / np.sqrt(len(blocks))))
+
+
 def turned_right(scans: Scans, nodes: Floats) -> bool:
     """Return whether readings are predicted better where nodes turn within a few metres as odometry does not.
 

@@ -105,8 +105,10 @@ def local_map(readings: Readings, parameters: Parameters, stop: NDArray[np.uint8
     return soft_map(evidence, grid, traversed, parameters.model)
 
 
-def objective_of(readings: Readings, parameters: Parameters, stop: NDArray[np.uint8]) -> float:
-    """Return J of readings, nats: what the search maximises, at the map that it finds.
+def explained(readings: Readings, parameters: Parameters, stop: NDArray[np.uint8]) -> tuple[float, Floats]:
+    """Return J of readings, what the search maximises, at the map that it finds, and what each reading has of it.
+
+    J is in nats; what readings have, shape (N,), is in nats, too, and is all of J but the prior of the map.
 
     Raises
     ------
@@ -114,7 +116,8 @@ def objective_of(readings: Readings, parameters: Parameters, stop: NDArray[np.ui
         If `stop` was set.
     """
     _, evidence, _, found = _searched(readings, parameters, stop, memory_for_pairs(parameters))
-    return evidence.tempered_log_likelihood + found.log_prior
+    each = parameters.model.likelihood_exponent * evidence.log_likelihoods
+    return evidence.tempered_log_likelihood + found.log_prior, each
 
 
 def _searched(

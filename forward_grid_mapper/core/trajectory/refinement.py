@@ -28,7 +28,7 @@ from .certainty import MOST, of_yaw
 from .heading import NOISES, Heading, heading
 from .holding_out import LEAST_SIGMAS, Gain, came_back, held_out
 from .hypotheses import solved
-from .judging import chosen, over_the_drive, seen_again, turned_right
+from .judging import chosen, explained_better, over_the_drive, seen_again, turned_right
 from .jumps import MOST_JUMPS, Part, begins_of, jumps, parts_at, with_yaw_anew, without_outliers
 from .local_map import for_matching
 from .odometry_model import CALIBRATION
@@ -226,21 +226,22 @@ class Refiner:
     def _at_any_angle(self, drive: _Drive, by_walls: _Attempt, least_moved: float) -> Refinement:
         """Return the trajectory that matches alone say, if it is better than what walls at right angles say."""
         readings, odometry, windows, scans = drive
+        known = by_walls.nodes if by_walls.refinement.accepted else None
         try:
-            found = matched(odometry, scans, self._say, self._parameters.association.odometry_noise)
+            found = matched(odometry, scans, self._say, self._parameters.association.odometry_noise, known)
         except InputError:
             # its cells are of one size, so that a map of the whole drive may be too large though the maps are not
             found = None
         if found is None:
             return _stays(by_walls.refinement)
         nodes = found.nodes
+        if known is not None and explained_better(scans, known, nodes).sigmas < LEAST_SIGMAS:
+            return by_walls.refinement
         better = seen_again(scans, windows.node, nodes)
         trajectory = refined(odometry, windows, nodes)
         moved, turned = differences(odometry, trajectory)
         if better.sigmas < LEAST_SIGMAS or moved < least_moved:
             return _stays(by_walls.refinement)
-        if by_walls.refinement.accepted and scans.objective(by_walls.nodes) >= found.value:
-            return by_walls.refinement
         again = 'with places seen before, ' if came_back(scans, nodes) else ''
         named = dict.fromkeys(CALIBRATION, 0.0) | {
             name: told.value for name, told in of_yaw(odometry, trajectory).items() if told.sigma <= MOST[name]

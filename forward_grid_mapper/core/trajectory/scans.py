@@ -11,7 +11,7 @@ from ..common.parameters import Parameters
 from ..common.readings import Readings
 from ..sensor.density import hit_probability
 from .likelihood import Scan, make_scan
-from .local_map import UNKNOWN, LocalMap, at_poses, local_map, objective_of
+from .local_map import UNKNOWN, LocalMap, at_poses, explained, local_map
 from .poses import Floats, compose, relative
 from .windows import Windows, corrected
 
@@ -91,12 +91,22 @@ class Scans:
         return local_map(self._placed(which, nodes, origin), self._parameters, self._stop)
 
     def objective(self, nodes: Floats) -> float:
-        """Return J of the whole drive along nodes, shape (K, 3), nats: `local_map.objective_of` all its readings.
+        """Return J of the whole drive along nodes, shape (K, 3), nats.
 
-        Those of windows that are held out have no say.
+        Readings of windows that are held out have no say.
+        """
+        return self.explained(nodes)[0]
+
+    def explained(self, nodes: Floats) -> tuple[float, Floats]:
+        """Return J of the whole drive along nodes, shape (K, 3), and what the readings of each window have of it.
+
+        Both are in nats; the second has shape (K,), and 0 for windows that are held out.
         """
         which = self._readings_of(np.arange(len(self.windows)))
-        return objective_of(self._placed(which, nodes, np.zeros(3)), self._parameters, self._stop)
+        value, each = explained(self._placed(which, nodes, np.zeros(3)), self._parameters, self._stop)
+        window = np.repeat(np.arange(len(self.windows)), np.diff(self.windows.first))[which]
+        windows: Floats = np.bincount(window, each, len(self.windows)).astype(np.float64)
+        return value, windows
 
     def _readings_of(self, members: NDArray[np.int64]) -> NDArray[np.int64]:
         first = self.windows.first

@@ -15,7 +15,7 @@ from forward_grid_mapper.core.mapping import Mapper
 from forward_grid_mapper.core.trajectory import any_angle, refinement, scan_matching
 from forward_grid_mapper.core.trajectory.any_angle import Matched
 from forward_grid_mapper.core.trajectory.holding_out import Gain, held_out
-from forward_grid_mapper.core.trajectory.judging import turned_right
+from forward_grid_mapper.core.trajectory.judging import explained_better, turned_right
 from forward_grid_mapper.core.trajectory.likelihood import scores
 from forward_grid_mapper.core.trajectory.local_map import for_matching
 from forward_grid_mapper.core.trajectory.outcome import Refinement
@@ -312,6 +312,7 @@ def test_a_drive_is_explained_by_the_map_of_its_readings_but_for_those_held_out(
 def test_places_seen_before_are_named_where_there_are_any(bent, scans, matched, monkeypatch, again: bool) -> None:
     recording, odometry = bent
     monkeypatch.setattr(refinement, 'seen_again', lambda *rest: Gain(0.1, 0.01))
+    monkeypatch.setattr(refinement, 'explained_better', lambda *rest: Gain(0.1, 0.01))
     told = Matched(matched, [], np.inf, 0.0)
     monkeypatch.setattr(refinement, 'matched', lambda *rest: told)
     monkeypatch.setattr(refinement, 'came_back', lambda *rest: again)
@@ -334,19 +335,52 @@ def by_walls(scans: Scans, recording: Recording, odometry: Odometry) -> _Attempt
     return _Attempt(found, scans.windows.node)
 
 
-@pytest.mark.parametrize('better', [1.0, -1.0])
-def test_of_two_trajectories_the_one_whose_map_explains_readings_better_is_taken(
-    bent, scans, matched, monkeypatch, better: float
+@pytest.mark.parametrize('sigmas', [5.0, 1.0, -5.0])
+def test_matches_alone_are_taken_over_walls_only_if_they_explain_readings_much_better(
+    bent, scans, matched, monkeypatch, sigmas: float
 ) -> None:
     recording, odometry = bent
-    attempt = by_walls(scans, recording, odometry)
-    value = scans.objective(attempt.nodes) + better
+    attempt, told = by_walls(scans, recording, odometry), []
     monkeypatch.setattr(refinement, 'seen_again', lambda *rest: Gain(0.1, 0.01))
-    monkeypatch.setattr(refinement, 'matched', lambda *rest: Matched(matched, [], value, 1.0))
+    monkeypatch.setattr(refinement, 'explained_better', lambda *rest: told.append(rest[1:]) or Gain(sigmas, 1.0))
+    monkeypatch.setattr(refinement, 'matched', lambda *rest: Matched(matched, [], np.inf, 1.0))
     found = Refiner(Parameters())._at_any_angle(
         _Drive(recording.readings, odometry, scans.windows, scans), attempt, 0.15
     )
-    assert (found is attempt.refinement) == (better < 0.0)
+    assert (found is attempt.refinement) == (sigmas < 2.3)
+    ((before, after),) = told
+    assert before is attempt.nodes and after is matched
+
+
+def test_what_explains_readings_no_better_than_what_is_known_is_not_looked_for_long(bent, scans, monkeypatch) -> None:
+    trials, objective = Trials(monkeypatch, [(0.5, 1.0), (0.5, 2.0)]), Scans.objective
+    known = scans.windows.node + 1.0
+    monkeypatch.setattr(Scans, 'objective', lambda s, nodes: 3.0 if nodes is known else objective(s, nodes))
+    assert any_angle.matched(bent[1], scans, lambda stage: quietly, 0.0, known) is None
+    assert len(trials.asked) == 1
+
+
+def test_a_trajectory_that_contradicts_itself_is_explained_worse_by_many_standard_errors(exact, bent, scans) -> None:
+    true = odometry_of(exact).at(scans.windows.node_stamp)
+    told = explained_better(scans, scans.windows.node, true)
+    blocks = -(-len(true) // 4)
+    assert told.sigmas > 4.0
+    assert told.mean * blocks == pytest.approx(scans.objective(true) - scans.objective(scans.windows.node))
+    again = explained_better(scans, true, scans.windows.node)
+    assert again.sigmas == pytest.approx(-told.sigmas)
+    # chance alone decides which of two that are as good has the larger J
+    near = true + np.array([0.0, 0.0, 1e-3]) * np.sin(np.arange(len(true)))[:, None]
+    assert abs(explained_better(scans, true, near).sigmas) < 2.3
+
+
+def test_what_windows_have_of_the_objective_is_all_of_it_but_the_prior(scans) -> None:
+    value, windows = scans.explained(scans.windows.node)
+    assert value == scans.objective(scans.windows.node)
+    assert not windows[scans.held_out].any()
+    kept = ~np.repeat(scans.held_out, np.diff(scans.windows.first))
+    maps = Mapper(for_matching(Parameters())).run(scans.windows.readings.select(kept))
+    assert windows.sum() == pytest.approx(maps.statistics['searched_log_likelihood'], rel=1e-3)
+    assert windows.sum() != pytest.approx(value, rel=1e-3)
 
 
 def test_turns_that_odometry_does_not_have_are_told_from_those_of_drift(exact, bent, scans) -> None:
