@@ -15,7 +15,7 @@ from forward_grid_mapper.core.mapping import Mapper
 from forward_grid_mapper.core.trajectory import any_angle, refinement, scan_matching
 from forward_grid_mapper.core.trajectory.any_angle import Matched
 from forward_grid_mapper.core.trajectory.holding_out import Gain, held_out
-from forward_grid_mapper.core.trajectory.judging import explained_better, turned_right
+from forward_grid_mapper.core.trajectory.judging import explained_better, over_the_drive, turned_right
 from forward_grid_mapper.core.trajectory.likelihood import scores
 from forward_grid_mapper.core.trajectory.local_map import for_matching
 from forward_grid_mapper.core.trajectory.outcome import Refinement
@@ -356,8 +356,28 @@ def test_what_explains_readings_no_better_than_what_is_known_is_not_looked_for_l
     trials, objective = Trials(monkeypatch, [(0.5, 1.0), (0.5, 2.0)]), Scans.objective
     known = scans.windows.node + 1.0
     monkeypatch.setattr(Scans, 'objective', lambda s, nodes: 3.0 if nodes is known else objective(s, nodes))
-    assert any_angle.matched(bent[1], scans, lambda stage: quietly, 0.0, known) is None
-    assert len(trials.asked) == 1
+    for sigmas, rounds in ((1.0, 0), (2.0, 1)):
+        monkeypatch.setattr(any_angle, 'over_the_drive', lambda *rest, by=sigmas: Gain(by, 1.0))
+        assert any_angle.matched(bent[1], scans, lambda stage: quietly, 0.0, known) is None
+        assert len(trials.asked) == rounds
+
+
+def test_scan_matching_foresees_readings_better_than_corners_that_are_taken_for_square_ones(exact, scans) -> None:
+    true = odometry_of(exact).at(scans.windows.node_stamp)
+    start = scan_matched(scans, TRUST, quietly)
+    assert over_the_drive(scans, as_if_square(true, true), start, quietly).sigmas > any_angle.WORTH_A_TRIAL
+    assert over_the_drive(scans, true, start, quietly).sigmas < any_angle.WORTH_A_TRIAL
+
+
+def as_if_square(nodes: Floats, true: Floats) -> Floats:
+    """The nodes, turned at every corner of the true way as if it were square."""
+    corner = np.cumsum(np.abs(np.diff(true[:, 2], prepend=true[0, 2]))) // math.radians(72.0)
+    steps = relative(nodes[:-1], nodes[1:])
+    steps[:, 2] += np.diff(corner) * math.radians(18.0)
+    square = nodes[:1]
+    for step in steps:
+        square = np.concatenate([square, compose(square[-1:], step[None])])
+    return square
 
 
 def test_a_trajectory_that_contradicts_itself_is_explained_worse_by_many_standard_errors(exact, bent, scans) -> None:
@@ -387,14 +407,7 @@ def test_turns_that_odometry_does_not_have_are_told_from_those_of_drift(exact, b
     true = odometry_of(exact).at(scans.windows.node_stamp)
     odometry = scans.windows.node
     assert turned_right(scans, true)
-    # odometry turned at every corner as if it were square
-    corner = np.cumsum(np.abs(np.diff(true[:, 2], prepend=true[0, 2]))) // math.radians(72.0)
-    steps = relative(odometry[:-1], odometry[1:])
-    steps[:, 2] += np.diff(corner) * math.radians(18.0)
-    square = odometry[:1]
-    for step in steps:
-        square = np.concatenate([square, compose(square[-1:], step[None])])
-    assert not turned_right(scans, square)
+    assert not turned_right(scans, as_if_square(odometry, true))
     # nothing is asked where odometry turns as the nodes do
     assert turned_right(scans, odometry)
 
