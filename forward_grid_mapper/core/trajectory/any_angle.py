@@ -63,8 +63,8 @@ def matched(
 ) -> Matched | None:
     """Return where a drive is by matches alone; None if the map along it explains its readings no better.
 
-    It has to explain them better than the map along odometry, and than the one along the nodes that are `known`. Only if
-    scan matching foresees readings better than these, more is tried.
+    It has to explain them better than the map along odometry, and than the one along the nodes that are `known`. More
+    than scan matching is tried only if that foresees readings better than these.
 
     Parameters
     ----------
