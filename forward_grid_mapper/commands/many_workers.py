@@ -150,6 +150,7 @@ def _check(options: argparse.Namespace) -> None:
     given = (
         ('--learn', options.learn),
         ('--refine-poses', options.refine_poses),
+        ('--odometry-calibration', options.odometry_calibration),
         ('--bag', options.write_bag),
         ('--show', options.show),
         ('--rerun', options.rerun),

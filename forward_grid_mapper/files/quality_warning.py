@@ -19,6 +19,8 @@ from ..core.messages.message_types import Pose2
 TOO_MANY = 0.5
 """Fraction of unexplained readings above which a warning is due."""
 
+NOT_CONVERGED = 'the search ended at max_iterations before it converged; raise max_iterations'
+
 ENOUGH = 20
 """Readings below which nothing can be said."""
 
