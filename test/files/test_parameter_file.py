@@ -117,6 +117,12 @@ def test_the_specific_section_wins(tmp_path: Path) -> None:
         assert load(tmp_path, text) == ParameterFile({'p_hit': 0.5}, {}, {'use_sim_time': True})
 
 
+def test_a_section_of_all_nodes_goes_with_one_in_a_namespace(tmp_path: Path) -> None:
+    common = '/**: {ros__parameters: {p_hit: 0.3, p_rand: 0.2}}\nother:\n'
+    own = '/r1: {forward_grid_mapper: {ros__parameters: {p_hit: 0.5}}}'
+    assert load(tmp_path, common + own).values == {'p_hit': 0.5, 'p_rand': 0.2}
+
+
 def test_parameters_of_ros_itself_pass(tmp_path: Path) -> None:
     assert load(tmp_path, 'qos_overrides: {/odom: {subscription: {depth: 5}}}').node == {
         'qos_overrides./odom.subscription.depth': 5
@@ -151,6 +157,14 @@ def test_parameters_of_ros_itself_pass(tmp_path: Path) -> None:
         ('- p_hit', 'names with values'),
         ('/**: {ros__parameters: [1]}', 'names with values'),
         ('amcl: {ros__parameters: {a: 1}}\nother: {ros__parameters: {a: 1}}', 'there are: amcl, other'),
+        (
+            'r1: {forward_grid_mapper: {ros__parameters: {p_hit: 0.5}}}\n'
+            '/r2/forward_grid_mapper: {ros__parameters: {p_hit: 0.6}}',
+            r'several namespaces \(r1/forward_grid_mapper, /r2/forward_grid_mapper\)',
+        ),
+        ('p_rand: 0.1\nforward_grid_mapper: {ros__parameters: {p_hit: 0.5}}', 'p_rand: no node reads what is outside'),
+        ('forward_grid_mapper: {p_rand: 0.1, ros__parameters: {p_hit: 0.5}}', r'forward_grid_mapper\.p_rand: no node'),
+        ('r1: {p_rand: 0.1, amcl: {ros__parameters: {p_hit: 0.5}}}', 'r1/p_rand: no node'),
         ('p_hit: [', 'not valid YAML'),
         ('? [a, b]\n: 1', 'not valid YAML|no parameter is called'),
         ('p_hit: !!python/object/apply:os.getcwd []', 'not valid YAML'),
