@@ -20,7 +20,6 @@ from ..core.tiled_mapping import TiledMapper
 from ..files.calibration_file import load_calibration
 from ..files.map_files import occupancy_values
 from ..files.output_folder import free_name, output_folder, readable
-from ..files.parameter_file import parse_sensor
 from ..files.picture import NOWHERE
 from ..files.quality_warning import NOT_CONVERGED
 from ..files.report import json_text, report_text
@@ -43,6 +42,7 @@ from .options import (
     chosen_parameters,
     chosen_part,
     chosen_poses,
+    chosen_sensors,
     not_empty,
 )
 
@@ -109,7 +109,7 @@ def parser() -> argparse.ArgumentParser:
 def process(options: argparse.Namespace) -> int:
     """Do what the command line asks for."""
     parameters, extrinsics, ignored = chosen_parameters(options)
-    extrinsics |= dict(parse_sensor(text) for text in options.sensor)
+    extrinsics |= chosen_sensors(options)
     if options.learn < 0:
         raise ParameterError('--learn: the number of rounds must not be negative')
     part, poses = chosen_part(options), chosen_poses(options)
@@ -206,7 +206,9 @@ def tell(options: argparse.Namespace, report: Mapping[str, Any], output: Path) -
 
 def _stem(words: Sequence[str]) -> str:
     """Return what the results of these bags are called."""
-    first = Path(words[0]).resolve().stem.replace('*', '').replace('?', '') or 'bags'
+    path = Path(words[0]).resolve()
+    # a dot is part of a folder's name
+    first = (path.name if path.is_dir() else path.stem).replace('*', '').replace('?', '') or 'bags'
     return first if len(words) == 1 else f'{first}_and_{len(words) - 1}_more'
 
 

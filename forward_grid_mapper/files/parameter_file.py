@@ -71,7 +71,7 @@ def load_parameters(path: Path | str) -> ParameterFile:
         document = yaml.load(text, _Loader)
         flat: dict[str, Any] = {}
         for section in _sections({} if document is None else document):
-            flat |= dict(_flatten(section))
+            _merge(flat, dict(_flatten(section)))
         return _sort_out(flat)
     except ParameterError as error:
         raise ParameterError(f'{path}: {error}') from error
@@ -218,6 +218,22 @@ def _flatten(section: Any, prefix: str = '') -> Iterator[tuple[str, Any]]:
                 raise ParameterError(f'{full} is given twice, nested and with dots')
             seen.add(full)
             yield full, leaf
+
+
+def _merge(flat: dict[str, Any], section: dict[str, Any]) -> None:
+    """Add what a section has, which wins; a slash before a frame makes no other sensor of it."""
+    frames: dict[str, str] = {}
+    for name in section:
+        if (mount := _MOUNT.fullmatch(name)) and (twin := frames.setdefault(_frame_of(mount), name)) != name:
+            raise ParameterError(f'{twin} and {name} are poses of one sensor; give one of them')
+    for name in list(flat):
+        if (mount := _MOUNT.fullmatch(name)) and _frame_of(mount) in frames:
+            del flat[name]
+    flat |= section
+
+
+def _frame_of(mount: re.Match[str]) -> str:
+    return mount['frame'].lstrip('/')
 
 
 def _sort_out(flat: dict[str, Any]) -> ParameterFile:
