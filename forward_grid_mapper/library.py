@@ -24,7 +24,7 @@ from .core.messages.rep117 import ODOMETRY_REASONS, REASONS, rejection_warnings
 from .files.pose_files import poses_from_csv, poses_from_tum
 from .files.quality_warning import data_warnings
 from .files.results import write_results
-from .recordings.drive import LogOddsMapOfAll, thinning_note
+from .recordings.drive import LogOddsMapOfAll, thinning_note, to_and_fro_note
 
 __all__ = ['Sonar', 'SonarMaps', 'make_maps', 'poses_from_csv', 'poses_from_tum']
 
@@ -208,6 +208,7 @@ def make_maps(
     before = [
         *_of_the_node(chosen),
         *arrays.twofold(odometry),
+        *to_and_fro_note(associator),
         *_told_of_poses(associator),
         *associator.limits.warnings(),
         *rejection_warnings(associator.rejected, len(values), 'ranges'),

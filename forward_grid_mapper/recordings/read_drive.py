@@ -19,7 +19,7 @@ from ..core.messages.pose_association import PoseAssociator
 from ..core.messages.rep117 import ODOMETRY_REASONS, REASONS, rejection_warnings
 from ..files.journal import drive_file
 from ..files.output_folder import readable
-from .drive import WHOLE, Drive, LogOddsMapOfAll, Part, Spans, length_of, thinning_note
+from .drive import WHOLE, Drive, LogOddsMapOfAll, Part, Spans, length_of, thinning_note, to_and_fro_note
 from .given_poses import GivenPoses
 from .journal_drive import read_journal
 
@@ -202,6 +202,7 @@ def _warnings(bag: Bag, associator: PoseAssociator, lookup: Extrinsics) -> list[
         warnings.append(
             f"odometry's clock jumped back {associator.time_jumps} times; what waited for a pose was dropped"
         )
+    warnings += to_and_fro_note(associator)
     warnings += associator.limits.warnings()
     for reason, count in associator.odometry_rejected.items():
         warnings.append(
