@@ -14,6 +14,10 @@ from .poses import BASE_FRAMES, ODOMETRY, POSES
 __all__ = ['ODOMETRY', 'RANGE', 'Topics', 'choose_topics']
 
 RANGE = 'sensor_msgs/msg/Range'
+
+WISHES = ('goal', 'initialpose', 'initial_pose')
+"""Parts of the names of topics whose poses say where the robot should be, or is believed to be once."""
+
 Contents = Mapping[str, tuple[str, int]]
 
 
@@ -76,7 +80,7 @@ def choose_topics(
         return Topics(mine.taken, topic, kind, mine.left_out)
     # stamped poses only where there is no odometry, since they may be goals; transforms only if asked for
     found = _of_type(contents, ODOMETRY) or [
-        t for kind in kinds if kind != TF_MESSAGE for t in _of_type(contents, kind)
+        t for kind in kinds if kind != TF_MESSAGE for t in _of_type(contents, kind) if not _is_wish(t)
     ]
     if not found:
         raise BagError(
@@ -114,6 +118,10 @@ def _choosing(odometry: str, found: Sequence[str], ranges: Sequence[str]) -> str
     mine = ranges_of(odometry, found, ranges)
     words = ['--odom-topic', odometry, *(['--range-topics', *mine.taken] if mine.left_out else [])]
     return ' '.join(map(quoted, words))
+
+
+def _is_wish(topic: str) -> bool:
+    return any(word in topic.lower() for word in WISHES)
 
 
 def _moving(contents: Contents, kinds: Sequence[str]) -> str:
