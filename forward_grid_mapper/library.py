@@ -11,19 +11,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from . import arrays
 from .core.common.errors import InputError
-from .core.common.parameters import Parameters
+from .core.common.parameters import TABLE, Parameters
 from .core.mapping import Mapper, Watch
 from .core.maps.map_set import MapSet
 from .core.messages.extrinsics import Mount
-from .core.messages.message_types import NANOSECONDS, OdometryMessage, Pose2, RangeMessage
+from .core.messages.message_types import Pose2, RangeMessage
 from .core.messages.mounts import FARTHEST, TURN
 from .core.messages.pose_association import PoseAssociator
 from .core.messages.rep117 import ODOMETRY_REASONS, REASONS, rejection_warnings
 from .files.pose_files import poses_from_csv, poses_from_tum
 from .files.quality_warning import data_warnings
 from .files.results import write_results
-from .recordings.drive import LogOddsMapOfAll, thinning_note
+from .recordings.drive import LogOddsMapOfAll, thinning_note, to_and_fro_note
 
 __all__ = ['Sonar', 'SonarMaps', 'make_maps', 'poses_from_csv', 'poses_from_tum']
 
@@ -121,42 +122,6 @@ class SonarMaps:
         return write_results(folder, self.maps, self.source, self.path, title, judged=self.judged)
 
 
-def _column(name: str, values: ArrayLike, length: int | None = None) -> NDArray[np.float64]:
-    """Return numbers as float64, shape (length,)."""
-    try:
-        if np.iscomplexobj(values):
-            raise InputError(f'{name} must be real numbers')
-        column = np.asarray(values, np.float64)
-    except (TypeError, ValueError) as error:
-        raise InputError(f'{name} must be numbers: {error}') from None
-    if column.ndim != 1 or (length is not None and len(column) != length):
-        wanted = '(N,)' if length is None else f'({length},)'
-        raise InputError(f'{name} has the shape {column.shape}, not {wanted}')
-    return column
-
-
-def _stamps(name: str, values: ArrayLike, length: int | None = None) -> NDArray[np.int64]:
-    """Return stamps in nanoseconds."""
-    seconds = _column(name, values, length)
-    if not np.isfinite(seconds).all() or (np.abs(seconds) > 2**62 / NANOSECONDS).any():
-        raise InputError(f'{name} must be seconds, all finite; nanoseconds must be divided by 1e9')
-    return np.round(seconds * NANOSECONDS).astype(np.int64)
-
-
-def _poses(stamps: NDArray[np.int64], poses: ArrayLike) -> list[OdometryMessage]:
-    try:
-        array = np.asarray(poses, np.float64)
-    except (TypeError, ValueError) as error:
-        raise InputError(f'poses must be numbers: {error}') from None
-    if array.shape != (len(stamps), 3):
-        raise InputError(f'poses has the shape {array.shape}, not ({len(stamps)}, 3): x, y and yaw of each stamp')
-    if not np.isfinite(array).all():
-        raise InputError(f'{int((~np.isfinite(array)).any(axis=1).sum())} poses are not finite; leave them out')
-    order = np.argsort(stamps, kind='stable')
-    rows = zip(stamps[order].tolist(), array[order].tolist(), strict=True)
-    return [OdometryMessage(stamp, 'map', 'base', Pose2(*row)) for stamp, row in rows]
-
-
 def make_maps(
     pose_stamps: ArrayLike,
     poses: ArrayLike,
@@ -175,11 +140,11 @@ def make_maps(
     Parameters
     ----------
     pose_stamps : float, shape (M,)
-        Seconds, of any clock that the ranges share, in any order.
+        Seconds, of any clock that the ranges share, in any order; or datetime64, or timedelta64.
     poses : float, shape (M, 3)
         x and y of the robot's base in metres and its yaw in radians, in the map frame (REP 103).
     range_stamps : float, shape (N,)
-        Seconds.
+        Seconds, or as `pose_stamps`.
     ranges : float, shape (N,)
         Metres.
     sensors : mapping of str to Sonar
@@ -203,14 +168,16 @@ def make_maps(
     """
     if not isinstance(sensors, Mapping) or not all(isinstance(sensor, Sonar) for sensor in sensors.values()):
         raise InputError('sensors must be a mapping from the name of each sensor to its Sonar')
+    if odd := [name for name in sensors if not isinstance(name, str)]:
+        raise InputError(f'the names of sensors must be strings, such as {str(odd[0])!r} in place of {odd[0]!r}')
     if not isinstance(parameters or {}, Mapping) or not all(isinstance(name, str) for name in parameters or {}):
         raise InputError('parameters must be a mapping from names to values, such as {"resolution": 0.05}')
     if not isinstance(sensor_of, (str, Sequence, np.ndarray)):
         raise InputError('sensor_of must be the name of a sensor, or one name for each range')
     chosen = Parameters.from_flat(parameters or {})
-    odometry = _poses(_stamps('pose_stamps', pose_stamps), poses)
-    stamps = _stamps('range_stamps', range_stamps)
-    values = _column('ranges', ranges, len(stamps))
+    odometry = arrays.poses_of(arrays.stamps('pose_stamps', pose_stamps), poses)
+    stamps = arrays.stamps('range_stamps', range_stamps)
+    values = arrays.column('ranges', ranges, len(stamps))
     names = [sensor_of] * len(values) if isinstance(sensor_of, str) else [str(name) for name in sensor_of]
     if len(names) != len(values):
         raise InputError(f'sensor_of has {len(names)} names for {len(values)} ranges')
@@ -239,6 +206,9 @@ def make_maps(
         )
     maps = live.on(Mapper(chosen).run(associator.readings, watch))
     before = [
+        *_of_the_node(chosen),
+        *arrays.twofold(odometry),
+        *to_and_fro_note(associator),
         *_told_of_poses(associator),
         *associator.limits.warnings(),
         *rejection_warnings(associator.rejected, len(values), 'ranges'),
@@ -250,6 +220,13 @@ def make_maps(
     counts = {'received': len(values), 'accepted': len(associator.buffer), 'rejected': rejected}
     source = {'counts': counts, 'warnings': before, 'extrinsics': mounted}
     return SonarMaps(maps, len(values), rejected, (*before, *judged), path, source, judged)
+
+
+def _of_the_node(parameters: Parameters) -> list[str]:
+    """Return a warning about parameters that have no effect here."""
+    values = parameters.flat()
+    names = [row.name for row in TABLE if row.group == 'node' and values[row.name] != row.default]
+    return [f'only the node has these parameters, and they are ignored: {", ".join(names)}'] if names else []
 
 
 def _told_of_poses(associator: PoseAssociator) -> list[str]:

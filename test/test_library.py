@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import forward_grid_mapper
-from forward_grid_mapper import Sonar, SonarMaps, library, make_maps, poses_from_tum
+from forward_grid_mapper import Sonar, SonarMaps, arrays, library, make_maps, poses_from_tum
 from forward_grid_mapper.core.common.errors import InputError, ParameterError
 from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.mapping import Mapper
@@ -151,11 +151,55 @@ def test_numpy_scalars_are_numbers() -> None:
         ({'sensor_of': ['sonar']}, 'sensor_of has 1 names for'),
         ({'sensor_of': 'sonar'}, 'no sensor is called sonar; there are: '),
         ({'pose_stamps': [], 'poses': np.zeros((0, 3))}, 'there are 0 poses'),
+        ({'sensors': {0: Sonar(0.0, 0.0, 0.0, 0.5, 3.0)}}, "must be strings, such as '0' in place of 0"),
+        ({'ranges': np.ma.array([1.0, 2.0], mask=[0, 1])}, 'ranges has 1 masked values; fill those with nan'),
+        ({'range_stamps': np.ma.array([1.0, 2.0], mask=[0, 1])}, 'range_stamps has 1 masked values; leave them out'),
+        ({'poses': np.ma.array(np.zeros((3, 3)), mask=np.eye(3))}, 'poses has 3 masked values; leave them out'),
+        ({'range_stamps': np.array([1.7e9, 1.7e9], np.float32)}, 'float32, whose numbers of this size are 128 s apart'),
+        ({'range_stamps': np.array([3.0, 40.0], np.float16)}, 'float16, whose numbers'),
+        ({'range_stamps': np.array(['NaT'], 'M8[ns]')}, 'range_stamps has 1 times that are NaT'),
+        ({'range_stamps': np.array([5], 'm8')}, 'range_stamps has the type timedelta64, which gives no stamps'),
+        ({'range_stamps': np.array(['9999-01-01'], 'M8[D]')}, 'which gives no stamps'),
+        ({'poses': np.zeros((3, 3), 'm8[s]')}, 'poses must be numbers, not of the type timedelta64[s]'),
     ],
 )
 def test_arrays_that_make_no_sense_are_named(change: dict[str, Any], said: str) -> None:
     with pytest.raises(InputError, match=re.escape(said)):
         make_maps(**{**given(), **change})
+
+
+@pytest.mark.parametrize('unit', ['M8[ns]', 'M8[us]', 'm8[ns]', 'm8[ms]'])
+def test_times_of_numpy_are_stamps(unit: str) -> None:
+    given_ms = np.array([1_700_000_000_123, 1_700_000_000_250, -5])
+    times = (np.array(0, 'M8[ms]') + given_ms.astype('m8[ms]')).astype(unit) if unit[0] == 'M' else None
+    exact = arrays.stamps('t', given_ms.astype('m8[ms]').astype(unit) if times is None else times)
+    assert exact.tolist() == (given_ms * 1_000_000).tolist()
+
+
+def test_stamps_that_are_fine_enough_may_have_any_type() -> None:
+    assert arrays.stamps('t', np.array([0.5, 100.25], np.float32)).tolist() == [500_000_000, 100_250_000_000]
+    assert arrays.stamps('t', [1, 2]).tolist() == [1_000_000_000, 2_000_000_000]
+    assert arrays.column('ranges', np.ma.array([1.0, 2.0], mask=[0, 0])).tolist() == [1.0, 2.0]
+    assert arrays.stamps('t', np.array([], np.float32)).tolist() == []
+
+
+def test_two_poses_of_one_stamp_are_told() -> None:
+    twice = given()
+    stamps, poses = np.repeat(twice['pose_stamps'], 2), np.repeat(np.array(twice['poses']), 2, axis=0)
+    same = make_maps(**{**twice, 'pose_stamps': stamps, 'poses': poses})
+    assert not any('two poses' in text for text in same.warnings)
+    poses[1::2] += [0.3, 0.4, 2 * math.pi]
+    found = make_maps(**{**twice, 'pose_stamps': stamps, 'poses': poses})
+    assert any(
+        text.startswith(f'{len(stamps) // 2} stamps have two poses that differ, by up to 0.50 m and 0°')
+        for text in found.warnings
+    )
+
+
+def test_parameters_of_the_node_are_told_to_have_no_effect() -> None:
+    found = make_maps(**given(), parameters={'refine_poses': True, 'journal': '/tmp/j', 'autostart': True})
+    (told,) = [text for text in found.warnings if 'ignored' in text]
+    assert 'refine_poses' in told and 'journal' in told and 'autostart' not in told
 
 
 def test_units_are_checked() -> None:

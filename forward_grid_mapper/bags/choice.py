@@ -6,21 +6,41 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 from ..core.common.errors import BagError
+from ..core.common.shell import quoted
 from .decoder import TF_MESSAGE
+from .namespaces import Parted, ranges_of
 from .poses import BASE_FRAMES, ODOMETRY, POSES
 
 __all__ = ['ODOMETRY', 'RANGE', 'Topics', 'choose_topics']
 
 RANGE = 'sensor_msgs/msg/Range'
+
+WISHES = ('goal', 'initialpose', 'initial_pose')
+"""Parts of the names of topics whose poses say where the robot should be, or is believed to be once."""
+
 Contents = Mapping[str, tuple[str, int]]
 
 
 class Topics(NamedTuple):
-    """The topics to map from, named as the bag names them; `odom_type` is one of `POSES`."""
+    """The topics to map from, named as the bag names them; `odom_type` is one of `POSES`.
+
+    `left_out` are topics of ranges that are taken for those of other robots.
+    """
 
     range_topics: tuple[str, ...]
     odom_topic: str
     odom_type: str = ODOMETRY
+    left_out: tuple[str, ...] = ()
+
+    def notes(self) -> list[str]:
+        """Return what the user should know of the choice."""
+        if not self.left_out:
+            return []
+        every = ' '.join(map(quoted, (*self.range_topics, *self.left_out)))
+        return [
+            f'the ranges of {", ".join(self.left_out)} are left out, since {self.odom_topic} is of another namespace; '
+            f'if one robot has them all, give `--range-topics {every}`'
+        ]
 
 
 def choose_topics(
@@ -31,6 +51,8 @@ def choose_topics(
     any_poses: bool = False,
 ) -> Topics:
     """Return the named topics, or where none is named those found by type.
+
+    Where robots have a namespace each, the ranges found are those of the namespace of the odometry.
 
     Parameters
     ----------
@@ -53,10 +75,12 @@ def choose_topics(
     kinds = tuple(POSES) if any_poses else (ODOMETRY,)
     if odom_topic is not None:
         topic = _named(contents, odom_topic, kinds, '--odom-topic')
-        return Topics(ranges, topic, contents[topic][0])
+        kind = contents[topic][0]
+        mine = Parted(ranges, ()) if range_topics is not None else ranges_of(topic, _of_type(contents, kind), ranges)
+        return Topics(mine.taken, topic, kind, mine.left_out)
     # stamped poses only where there is no odometry, since they may be goals; transforms only if asked for
     found = _of_type(contents, ODOMETRY) or [
-        t for kind in kinds if kind != TF_MESSAGE for t in _of_type(contents, kind)
+        t for kind in kinds if kind != TF_MESSAGE for t in _of_type(contents, kind) if not _is_wish(t)
     ]
     if not found:
         raise BagError(
@@ -64,7 +88,10 @@ def choose_topics(
             f'{_listing(contents)}'
         )
     if len(found) > 1:
-        lines = (f'\n  {topic}: {contents[topic][1]} messages, {frames_of(topic)}' for topic in found)
+        lines = (
+            f'\n  {topic}: {contents[topic][1]} messages, {frames_of(topic)}: `{_choosing(topic, found, ranges)}`'
+            for topic in found
+        )
         raise BagError('The bag has several odometry topics; choose one with `--odom-topic`:' + ''.join(lines))
     return Topics(ranges, found[0], contents[found[0]][0])
 
@@ -84,6 +111,17 @@ def choose_range_topics(contents: Contents, range_topics: Sequence[str] | None) 
     if not ranges:
         raise BagError(f'The bag has no sensor_msgs/Range messages to map from. {_listing(contents)}')
     return ranges
+
+
+def _choosing(odometry: str, found: Sequence[str], ranges: Sequence[str]) -> str:
+    """Return the options that choose an odometry topic, and the ranges of its robot where there are others."""
+    mine = ranges_of(odometry, found, ranges)
+    words = ['--odom-topic', odometry, *(['--range-topics', *mine.taken] if mine.left_out else [])]
+    return ' '.join(map(quoted, words))
+
+
+def _is_wish(topic: str) -> bool:
+    return any(word in topic.lower() for word in WISHES)
 
 
 def _moving(contents: Contents, kinds: Sequence[str]) -> str:

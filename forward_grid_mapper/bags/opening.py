@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path, PurePath
 from typing import Any, NamedTuple
 
@@ -16,7 +16,7 @@ from .bounds import LARGEST_METADATA, Budget, bounded, megabytes, most_unpacked
 from .mcap_chunks import indexed_messages
 from .salvage import Scan
 from .source import RosbagsSource, Source, one_line
-from .unpacking import UnpackedMessages, open_unpacked
+from .unpacking import NoSpaceError, UnpackedMessages, open_unpacked
 
 _KINDS: dict[bytes, tuple[str, type[Scan]]] = {
     scan_mcap.MAGIC: ('.mcap', scan_mcap.McapScan),
@@ -29,6 +29,9 @@ _REPAIR = {
     '.bag': 'rosbag reindex {0}',
 }
 _ZSTD_MAGIC = b'\x28\xb5\x2f\xfd'
+
+STORAGE_SUFFIXES = ('.mcap', '.db3', '.bag', '.mcap.zstd', '.db3.zstd')
+"""How the names of storage files end."""
 
 MOST_FILES = 100_000
 """Lines in which a list of files is looked for."""
@@ -94,27 +97,59 @@ def open_sources(path: Path) -> tuple[list[Source], str | None]:
 
 def _open_folder(folder: Path) -> tuple[list[Source], str | None]:
     metadata = _read_metadata(folder)
-    present = sorted((p for p in folder.iterdir() if p.suffix in ('.mcap', '.db3', '.bag')), key=_natural_order)
+    present = storage_files(folder)
     if metadata is None:
         if len(present) == 1:
             return [_open_file(present[0])], None
         if present:
-            bags = ', '.join(p.name for p in present[:10])
-            raise BagError(
-                f'{folder} has no metadata.yaml but several bag files; name one of them ({bags}) '
-                f'or run `ros2 bag reindex {quoted(folder)}`.'
-            )
+            raise BagError(_of_several(folder, present))
         inside = sorted(path.parent for path in folder.glob('*/metadata.yaml'))
         hint = f' There is one in it: {inside[0]}' if inside else ''
         if not inside and (deeper := sorted(path.parent.parent for path in folder.glob('*/*/metadata.yaml'))):
             hint = f' There are bags in {deeper[0]}'
         raise BagError(f'{folder} is not a bag: it has neither metadata.yaml nor a .mcap, .db3 or .bag file.{hint}')
     listed = _without_repetition(folder / name for name in metadata.files)
-    sources, problems = _open_each([p for p in listed if p.exists()] or present, metadata.compression)
+    there = [p for p in listed if p.exists()]
+    sources, problems = _open_each(there or present, metadata.compression)
     problems += [f'{p.name} is missing' for p in listed if not p.exists()]
+    problems += [f'{p.name} is not listed in metadata.yaml and was left out' for p in _unlisted(present, there)]
     if not sources:
         raise BagError('; '.join(problems) or f'{folder} is an empty bag: metadata.yaml lists no file.')
     return sources, '; '.join(problems) or None
+
+
+def is_storage_file(path: Path) -> bool:
+    """Return whether a path is called as the files of bags are."""
+    return path.name.endswith(STORAGE_SUFFIXES)
+
+
+def plain_name(path: Path) -> str:
+    """Return the name that a storage file has without compression."""
+    return path.name.removesuffix('.zstd')
+
+
+def storage_files(folder: Path) -> list[Path]:
+    """Return the storage files in a folder by name; a compressed one only where it was not unpacked beside itself."""
+    files = sorted(filter(is_storage_file, folder.iterdir()), key=_natural_order)
+    names = {file.name for file in files}
+    return [file for file in files if file.name == plain_name(file) or plain_name(file) not in names]
+
+
+def _of_several(folder: Path, present: Sequence[Path]) -> str:
+    bags = ', '.join(p.name for p in present[:10])
+    packed = [quoted(file) for file in present if file.name != plain_name(file)]
+    unpack = f'unpack with `zstd -d --rm {" ".join(packed)}` and ' if packed else ''
+    return (
+        f'{folder} has no metadata.yaml but several bag files; name one of them ({bags}) '
+        f'or {unpack}run `ros2 bag reindex {quoted(folder)}`.'
+    )
+
+
+def _unlisted(present: Sequence[Path], listed: Sequence[Path]) -> list[Path]:
+    """Return the storage files of a folder that are none of those listed, by whatever name; none if none is listed."""
+    names = {plain_name(file) for file in listed}
+    both = _without_repetition([*listed, *present])
+    return [file for file in both[len(listed) :] if listed and plain_name(file) not in names]
 
 
 def _without_repetition(files: Iterable[Path]) -> list[Path]:
@@ -134,6 +169,10 @@ def _open_each(files: list[Path], compression: str) -> tuple[list[Source], list[
     for file in files:
         try:
             sources.append(_open_listed(file, compression))
+        except NoSpaceError:
+            for source in sources:
+                source.close()
+            raise
         except BagError as error:  # the other files of a split bag are still worth having
             problems.append(str(error).rstrip('.'))
     return sources, problems
@@ -147,10 +186,15 @@ def _open_single(file: Path) -> Source:
 
 
 def _open_listed(file: Path, compression: str) -> Source:
-    if compression == 'file':
+    # some that unpack a bag leave its metadata as they were
+    if compression == 'file' and not _is_plain(file):
         return open_unpacked(file, _open_file)
     source = _open_file(file)
     return UnpackedMessages(source) if compression == 'message' else source
+
+
+def _is_plain(file: Path) -> bool:
+    return file.is_file() and any(map(_magic(file).startswith, _KINDS))
 
 
 def _open_file(file: Path) -> Source:

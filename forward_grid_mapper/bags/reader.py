@@ -17,6 +17,7 @@ from ..core.messages.message_types import OdometryMessage, RangeMessage, range_m
 from .choice import ODOMETRY, RANGE, Topics, choose_range_topics, choose_topics
 from .columns import Columns
 from .decoder import TF_MESSAGE, decoder_of
+from .namespaces import by_precedence
 from .opening import open_sources, repair_hint
 from .poses import POSES
 from .source import Channel, RawMessage, Source, one_line
@@ -199,15 +200,25 @@ class Bag:
                     yield channels, columns, held
                     held = []
 
-    def static_transforms(self) -> StaticTransforms:
-        """Return all transforms on `/tf_static`, and on the `tf_static` of any namespace."""
-        transforms = StaticTransforms()
+    def static_transforms(self, topics: Topics | None = None) -> StaticTransforms:
+        """Return the transforms on `/tf_static` and on the `tf_static` of namespaces, as `by_precedence` has them.
+
+        Parameters
+        ----------
+        topics : Topics, optional
+            What is mapped from; without it, `/tf_static` is believed more than any namespace.
+        """
+        parts: dict[str, StaticTransforms] = {}
         for channel, message in self._static():
+            part = parts.setdefault(channel.topic, StaticTransforms(channel.topic))
             try:
                 for item in message.transforms:
-                    _add_transform(transforms, item)
+                    _add_transform(part, item)
             except (AttributeError, TypeError, ValueError):
                 self._count_undecodable(channel)
+        transforms = StaticTransforms()
+        for topic in by_precedence(parts, [] if topics is None else [topics.odom_topic, *topics.range_topics]):
+            transforms.take(parts[topic])
         return transforms
 
     def originals(self, topics: Topics) -> Iterator[tuple[str, Any]]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from itertools import takewhile
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +14,10 @@ from ..core.messages.extrinsics import Mount, mount_of
 from ..core.messages.quaternions import STEEPEST, rotation_of
 
 Transform = NDArray[np.float64]  # homogeneous, shape (4, 4)
+
+
+SAME = 1e-6
+"""Metres, and sines of angles, that two numbers of one pose may differ by: some publishers have single precision."""
 
 
 class SteepSensorError(InputError):
@@ -26,11 +31,16 @@ class StaticTransforms:
     ----------
     rejected : dict
         Child frames whose transform was not usable, and why; they matter only when one of them is looked up.
+    contradicted : dict
+        Child frames that two topics place differently, and which topic is believed; they matter as little.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, topic: str = '/tf_static') -> None:
         self.rejected: dict[str, str] = {}
+        self.contradicted: dict[str, str] = {}
+        self._topic = topic
         self._parents: dict[str, tuple[str, Transform]] = {}
+        self._topics: dict[str, str] = {}
 
     def __len__(self) -> int:
         return len(self._parents)
@@ -64,6 +74,28 @@ class StaticTransforms:
         transform[:3, 3] = translation_xyz
         self._parents[child] = parent, transform
         self.rejected.pop(child, None)
+
+    def take(self, other: StaticTransforms) -> None:
+        """Add the transforms of another topic, which is believed where this one says something else."""
+        for child, (parent, transform) in other._parents.items():
+            known = self._parents.get(child)
+            if known is not None and not (known[0] == parent and np.allclose(known[1], transform, atol=SAME)):
+                self.contradicted[child] = (
+                    f'{self._topics.get(child, self._topic)} and {other._topic} give different poses of {child!r}; '
+                    f'that of {other._topic} is taken. If it is the one of another robot, give --sensor'
+                )
+            self._parents[child] = parent, transform
+            self._topics[child] = other._topic
+        self.rejected |= {child: why for child, why in other.rejected.items() if child not in self._parents}
+        self.rejected = {child: why for child, why in self.rejected.items() if child not in self._parents}
+
+    def doubts(self, base_frame: str, sensor_frame: str) -> list[str]:
+        """Return what `contradicted` has about the frames that join a sensor to the robot."""
+        to_base, to_sensor = self._ancestors(_plain(base_frame)), self._ancestors(_plain(sensor_frame))
+        # what lies above the frame that both have is not on the way
+        common = next((frame for frame in to_sensor if frame in to_base), None)
+        way = [*takewhile(common.__ne__, to_sensor), *takewhile(common.__ne__, to_base)]
+        return [self.contradicted[frame] for frame in way if frame in self.contradicted]
 
     def lookup(self, base_frame: str, sensor_frame: str) -> Mount | None:
         """Return the pose of the sensor on the robot, projected on the base frame's plane.

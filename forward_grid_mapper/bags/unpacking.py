@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import shutil
 import tempfile
 from collections.abc import Callable, Collection, Iterator
@@ -16,6 +17,14 @@ from .source import RawMessage, Source, one_line
 
 _PIECE = 1 << 20
 """Bytes that are unpacked at once."""
+
+
+NO_SPACE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+"""Errors of a disk, or a user's part of it, that is full."""
+
+
+class NoSpaceError(BagError):
+    """What a compressed bag holds does not fit the temporary folder; nothing is wrong with the bag."""
 
 
 class UnpackedMessages:
@@ -76,17 +85,19 @@ def open_unpacked(file: Path, open_file: Callable[[Path], Source]) -> Source:
 
     Raises
     ------
+    NoSpaceError
+        If it does not fit the temporary folder.
     BagError
-        Naming the file, if it is damaged, or unpacks to more than is admitted or the disk holds.
+        Naming the file, if it is damaged, or unpacks to more than is admitted.
     """
     if not file.is_file():
         raise BagError(f'{file} is no regular file; give a bag folder or a .mcap, .db3 or .bag file.')
-    folder = Path(tempfile.mkdtemp(prefix='forward_grid_mapper_'))
+    folder = _temporary_folder(file)
     try:
         unpacked = folder / file.stem
         _unpack(file, unpacked)
         return _InFolder(open_file(unpacked), folder)
-    except PermissionError:
+    except (PermissionError, NoSpaceError):
         shutil.rmtree(folder, ignore_errors=True)
         raise
     except BaseException as error:
@@ -101,12 +112,36 @@ def open_unpacked(file: Path, open_file: Callable[[Path], Source]) -> Source:
         ) from error
 
 
+def _temporary_folder(file: Path) -> Path:
+    try:
+        return Path(tempfile.mkdtemp(prefix='forward_grid_mapper_'))
+    except OSError as error:
+        raise NoSpaceError(
+            f'{file} is compressed, and there is no temporary folder to unpack it in ({one_line(error)}); set TMPDIR '
+            f'to a folder that you can write.'
+        ) from error
+
+
 def _unpack(packed: Path, unpacked: Path) -> None:
-    most = min(most_unpacked(packed.stat().st_size), shutil.disk_usage(unpacked.parent).free)
+    most, free = most_unpacked(packed.stat().st_size), shutil.disk_usage(unpacked.parent).free
     done = 0
-    with zstd.open(packed, 'rb') as source, unpacked.open('wb') as target:
-        while piece := source.read(_PIECE):
-            done += len(piece)
-            if done > most:
-                raise BagError(f'it unpacks to more than {megabytes(most)}')
-            target.write(piece)
+    try:
+        with zstd.open(packed, 'rb') as source, unpacked.open('wb') as target:
+            while piece := source.read(_PIECE):
+                done += len(piece)
+                if done > most:
+                    raise BagError(f'it unpacks to more than {megabytes(most)}')
+                if done > free:
+                    raise _no_space(packed, free)
+                target.write(piece)
+    except OSError as error:
+        if error.errno not in NO_SPACE:
+            raise
+        raise _no_space(packed, free) from error
+
+
+def _no_space(packed: Path, free: int) -> NoSpaceError:
+    return NoSpaceError(
+        f'{packed} is compressed, and what it holds does not fit {tempfile.gettempdir()}, where {megabytes(free)} were '
+        f'free; set TMPDIR to a folder on a disk with more space.'
+    )

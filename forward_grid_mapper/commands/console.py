@@ -56,7 +56,9 @@ def run(
         # of the work's files the work takes care; what remains is the output itself, or the working directory
         problem = str(error) if _still_printing() else f'standard output: {error}'
     except Cancelled as cancelled:
-        print(cancelled_line(parser.prog, cancelled.left), file=sys.stderr)
+        # with SIGHUP the terminal is gone
+        with suppress(OSError):
+            print(cancelled_line(parser.prog, cancelled.left), file=sys.stderr)
         return cancelled.code
     except KeyboardInterrupt:
         print(cancelled_line(parser.prog), file=sys.stderr)

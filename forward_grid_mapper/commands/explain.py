@@ -25,6 +25,7 @@ from .console import run
 from .options import add_json_option
 
 COMMAND = 'explain'
+ARCHIVE = 'maps.npz'
 STATES = {1: 'occupied', 0: 'free', -1: 'not observed'}
 SHOWN = 5
 COUNTS = ('-n', '--readings')
@@ -44,7 +45,7 @@ def parser() -> argparse.ArgumentParser:
         'there and which against it, by how much, and what would change it.',
         epilog='example: explain MY_BAG_maps 1.75 -0.4',
     )
-    made.add_argument('maps', metavar='MAPS', help='folder that process_bag or save_maps wrote')
+    made.add_argument('maps', metavar='MAPS', help=f'folder that process_bag or save_maps wrote, or its {ARCHIVE}')
     made.add_argument('x', type=float, help='in the map frame, metres')
     made.add_argument('y', type=float)
     made.add_argument(
@@ -56,8 +57,9 @@ def parser() -> argparse.ArgumentParser:
 
 def explain(options: argparse.Namespace) -> int:
     """Do what the command line asks for."""
-    folder = Path(options.maps)
-    maps = read_npz(folder / 'maps.npz')
+    given = Path(options.maps)
+    folder = given.parent if given.name == ARCHIVE and given.is_file() else given
+    maps = read_npz(folder / ARCHIVE)
     readings, normals = read_readings(folder / 'readings.npz', maps)
     left, right, bottom, top = maps.grid.extent
     if not _on_map(maps, options.x, options.y):

@@ -17,7 +17,7 @@ from ..core.joint_learning import learn_jointly
 from ..core.learning.sensor_health import health_warning, sensor_health
 from ..files.learned_text import learned_data, learned_text, parameter_file_text, write_new_file
 from ..files.output_folder import readable
-from ..files.parameter_file import load_parameters, parse_sensor
+from ..files.parameter_file import load_parameters
 from ..files.quality_warning import reading_warnings
 from ..files.report import json_text
 from ..recordings.drives import read_drives
@@ -31,6 +31,7 @@ from .options import (
     chosen_parameters,
     chosen_part,
     chosen_poses,
+    chosen_sensors,
     not_empty,
 )
 
@@ -73,7 +74,7 @@ def parser() -> argparse.ArgumentParser:
 def learn(options: argparse.Namespace) -> int:
     """Do what the command line asks for."""
     parameters, extrinsics, ignored = chosen_parameters(options)
-    extrinsics |= dict(parse_sensor(text) for text in options.sensor)
+    extrinsics |= chosen_sensors(options)
     if options.rounds < 1:
         raise ParameterError('--rounds must be a positive number')
     output = Path(options.output) if options.output else None

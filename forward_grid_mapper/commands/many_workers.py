@@ -91,7 +91,8 @@ def with_workers(
     work = WorkFolder(str(Path(options.work or f'{output}.work').resolve()))
     memory = int((options.memory_per_worker or MEMORY) * 1e9)
     size = TILE if options.tiles is None else options.tiles
-    paths, repeated = without_repetition(find_recordings(options.bags))
+    meant = find_recordings(options.bags)
+    paths, repeated = without_repetition(meant.paths)
     of_all = dataclasses.replace(parameters, association=dataclasses.replace(parameters.association, max_readings=0))
     recordings = Recordings(
         tuple(str(path.resolve()) for path in paths),
@@ -111,7 +112,7 @@ def with_workers(
                     going_on = ', and going on with what was done before' if again else ''
                     print(f'mapping in tiles of {size:g} m in {readable(work.path)}{going_on}{told}', file=sys.stderr)
                 job = Job(work, _for_worker(of_all, cluster.memory or memory), size, versions())
-                found = ScaledMapper(cluster, job, ticker.say).run(recordings, [*repeated, *ignored])
+                found = ScaledMapper(cluster, job, ticker.say).run(recordings, [*repeated, *meant.skipped, *ignored])
                 title = f'{readable(Path(*paths[0].resolve().parts[-2:]))}'
                 title += f' and {len(paths) - 1} more' if len(paths) > 1 else ''
                 report = write_output(folder, job, found, cluster, parameters, title, ticker.say)
@@ -149,6 +150,7 @@ def _check(options: argparse.Namespace) -> None:
     given = (
         ('--learn', options.learn),
         ('--refine-poses', options.refine_poses),
+        ('--odometry-calibration', options.odometry_calibration),
         ('--bag', options.write_bag),
         ('--show', options.show),
         ('--rerun', options.rerun),

@@ -14,7 +14,7 @@ from ..core.common.parameters import Parameters, find
 from ..core.common.shell import quoted
 from ..core.messages.message_types import Pose2
 from ..files.output_folder import readable
-from ..files.parameter_file import load_parameters, parse_setting
+from ..files.parameter_file import load_parameters, parse_sensor, parse_setting
 from ..files.parameter_text import dump_parameters
 from ..recordings.drive import Part
 from ..recordings.given_poses import GivenPoses, read_given_poses
@@ -139,6 +139,22 @@ def add_bag_options(parser: argparse.ArgumentParser) -> None:
         metavar='FRAME=X,Y,YAW',
         help='pose of a sensor on the robot in metres and radians (or 90deg); wins over /tf_static; may be repeated',
     )
+
+
+def chosen_sensors(options: argparse.Namespace) -> dict[str, Pose2]:
+    """Return the poses of `--sensor`, by frame.
+
+    Raises
+    ------
+    ParameterError
+        If one is wrong, or a sensor has two different ones.
+    """
+    found: dict[str, Pose2] = {}
+    for text in options.sensor:
+        frame, pose = parse_sensor(text)
+        if found.setdefault(frame.lstrip('/'), pose) != pose:
+            raise ParameterError(f'--sensor gives two poses of {frame}; give one of them')
+    return found
 
 
 def chosen_poses(options: argparse.Namespace) -> GivenPoses | None:

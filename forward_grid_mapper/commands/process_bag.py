@@ -20,8 +20,8 @@ from ..core.tiled_mapping import TiledMapper
 from ..files.calibration_file import load_calibration
 from ..files.map_files import occupancy_values
 from ..files.output_folder import free_name, output_folder, readable
-from ..files.parameter_file import parse_sensor
 from ..files.picture import NOWHERE
+from ..files.quality_warning import NOT_CONVERGED
 from ..files.report import json_text, report_text
 from ..files.rerun_recording import NAME as RECORDING
 from ..files.rerun_recording import check_rerun, write_rerun
@@ -42,6 +42,7 @@ from .options import (
     chosen_parameters,
     chosen_part,
     chosen_poses,
+    chosen_sensors,
     not_empty,
 )
 
@@ -108,20 +109,20 @@ def parser() -> argparse.ArgumentParser:
 def process(options: argparse.Namespace) -> int:
     """Do what the command line asks for."""
     parameters, extrinsics, ignored = chosen_parameters(options)
-    extrinsics |= dict(parse_sensor(text) for text in options.sensor)
+    extrinsics |= chosen_sensors(options)
     if options.learn < 0:
         raise ParameterError('--learn: the number of rounds must not be negative')
     part, poses = chosen_part(options), chosen_poses(options)
     if options.tiles is not None and not (math.isfinite(options.tiles) and options.tiles >= SMALLEST_TILE):
         raise ParameterError(f'--tiles {options.tiles:g}: give the edge of a tile in metres, {SMALLEST_TILE:g} or more')
+    if parameters.association.odometry_noise and not options.refine_poses:
+        ignored.append('odometry_noise has an effect with --refine-poses alone, which is not given')
     if options.workers is not None or options.scheduler is not None:
         return with_workers(options, parameters, extrinsics, ignored, part, f'{_stem(options.bags)}_maps', tell)
     if options.work is not None or options.memory_per_worker is not None:
         raise ParameterError('--work and --memory-per-worker are for --workers or --scheduler, which are not given')
     if options.rerun:
         check_rerun()
-    if parameters.association.odometry_noise and not options.refine_poses:
-        ignored.append('odometry_noise has an effect with --refine-poses alone, which is not given')
     mapper = Mapper if options.tiles is None else partial(TiledMapper, size=options.tiles)
     given = _given(options.odometry_calibration)
     output = Path(options.output) if options.output else free_name(Path.cwd(), f'{_stem(options.bags)}_maps')
@@ -159,7 +160,7 @@ def process(options: argparse.Namespace) -> int:
         if options.learn:
             source['warnings'].append(_learned(maps))
         if not maps.statistics['converged']:
-            source['warnings'].append('the search ended at max_iterations before it converged; raise max_iterations')
+            source['warnings'].append(NOT_CONVERGED)
         path, before = along.path_xy, NOWHERE
         more: dict[str, Any] = {}
         if refined is not None:
@@ -205,7 +206,9 @@ def tell(options: argparse.Namespace, report: Mapping[str, Any], output: Path) -
 
 def _stem(words: Sequence[str]) -> str:
     """Return what the results of these bags are called."""
-    first = Path(words[0]).resolve().stem.replace('*', '').replace('?', '') or 'bags'
+    path = Path(words[0]).resolve()
+    # a dot is part of a folder's name
+    first = (path.name if path.is_dir() else path.stem).replace('*', '').replace('?', '') or 'bags'
     return first if len(words) == 1 else f'{first}_and_{len(words) - 1}_more'
 
 

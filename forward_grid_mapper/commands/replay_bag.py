@@ -69,6 +69,8 @@ def replay(options: argparse.Namespace, ros_arguments: Sequence[str]) -> int:
     """Do what the command line asks for."""
     with StopSignal() as stop, Bag(options.bag) as bag, Ticker(options.quiet) as ticker:
         topics = bag.choose_topics(options.range_topics, options.odom_topic)
+        for note in topics.notes():
+            _print_warning(note)
         sensors = {**dict.fromkeys(topics.range_topics, RANGE), topics.odom_topic: ODOMETRY}
         clock = {CLOCK: CLOCK_TYPE} if options.clock else {}
         with Publishers(ros_arguments, options.reliable, stop) as publishers:

@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM, from the first import to the last line: one line of text and an exit code, never a traceback.
+"""Ctrl-C, SIGTERM and SIGHUP, from the first import to the last line: one line and an exit code, never a traceback.
 
 This module imports little, since it is to be ready before anything that takes long to import.
 """
@@ -11,10 +11,11 @@ import signal
 import sys
 import threading
 import time
+from contextlib import suppress
 from types import FrameType, TracebackType
 from typing import Any, NoReturn
 
-SIGNALS = (signal.SIGINT, signal.SIGTERM)
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 GRACE = 5.0
 """Seconds after a first signal in which further ones are ignored, so that nothing interrupts the clean-up: a terminal
@@ -63,7 +64,9 @@ def leave_at_once(command: str) -> None:
     """
 
     def leave(number: int, frame: FrameType | None) -> NoReturn:
-        os.write(2, f'{cancelled_line(command)}\n'.encode())
+        # with SIGHUP the terminal is gone
+        with suppress(OSError):
+            os.write(2, f'{cancelled_line(command)}\n'.encode())
         os._exit(128 + number)
 
     _install(leave)

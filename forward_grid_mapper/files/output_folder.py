@@ -122,6 +122,9 @@ def output_folder(path: Path | str) -> Iterator[Path]:
             else:
                 staging.rename(final)
         done = True
+    except OutputError as error:
+        # the temporary name means nothing to anybody
+        raise OutputError(str(error).replace(str(staging), str(final))) from error
     except OSError as error:
         if error.errno in _WRITE_ONLY:
             raise _output_error(final, error) from error

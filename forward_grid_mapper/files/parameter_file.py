@@ -50,14 +50,15 @@ class ParameterFile(NamedTuple):
 def load_parameters(path: Path | str) -> ParameterFile:
     """Read a ROS 2 parameter YAML, or a flat mapping of names to values.
 
-    Names may be nested or dotted. In a ROS file the sections `/**` and `forward_grid_mapper` (in any namespace) count,
+    Names may be nested or dotted. In a ROS file the sections `/**` and `forward_grid_mapper` (in one namespace) count,
     the latter first; a section of another name counts if it is the only one, as for a node that was renamed, with a
     warning in the log; one whose name looks misspelt does not.
 
     Raises
     ------
     ParameterError
-        Naming the file, if it cannot be read, or holds an unknown or repeated name or a bad value.
+        Naming the file, if it cannot be read, or holds an unknown or repeated name or a bad value, values outside of
+        its sections, or sections of `forward_grid_mapper` in several namespaces.
     """
     path = Path(path)
     try:
@@ -70,7 +71,7 @@ def load_parameters(path: Path | str) -> ParameterFile:
         document = yaml.load(text, _Loader)
         flat: dict[str, Any] = {}
         for section in _sections({} if document is None else document):
-            flat |= dict(_flatten(section))
+            _merge(flat, dict(_flatten(section)))
         return _sort_out(flat)
     except ParameterError as error:
         raise ParameterError(f'{path}: {error}') from error
@@ -159,9 +160,18 @@ def _sections(document: Any) -> list[dict[str, Any]]:
     found = {name: section or {} for name, section in _ros_sections(document, '')}
     if not found:
         return [document]
+    if stray := list(_outside(document)):
+        raise ParameterError(
+            f'{", ".join(stray[:6])}: no node reads what is outside of ros__parameters; put it into one of '
+            f'the sections {", ".join(found)}'
+        )
     wildcards = [s for name, s in found.items() if name.strip('/') in ('*', '**')]
-    own = [s for name, s in found.items() if name.rpartition('/')[2] == NODE_NAME]
-    if chosen := wildcards + own:
+    own = [name for name in found if name.rpartition('/')[2] == NODE_NAME]
+    if len(own) > 1:
+        raise ParameterError(
+            f'it has {NODE_NAME} in several namespaces ({", ".join(own)}); give a file with the section of one of them'
+        )
+    if chosen := wildcards + [found[name] for name in own]:
         return chosen
     if len(found) > 1:
         raise ParameterError(f'it has no section for {NODE_NAME} or /**; there are: {", ".join(found)}')
@@ -183,6 +193,19 @@ def _ros_sections(document: dict[Any, Any], prefix: str) -> Iterator[tuple[str, 
                 yield from _ros_sections(value, f'{prefix}{key}/')
 
 
+def _outside(document: dict[Any, Any], prefix: str = '') -> Iterator[str]:
+    """Yield the names of values that are in no section of a ROS file."""
+    for key, value in document.items():
+        name = f'{prefix}{key}'
+        if not isinstance(value, dict):
+            if value is not None:
+                yield name
+        elif 'ros__parameters' in value:
+            yield from (f'{name}.{other}' for other in value if other != 'ros__parameters')
+        elif value:
+            yield from _outside(value, f'{name}/')
+
+
 def _flatten(section: Any, prefix: str = '') -> Iterator[tuple[str, Any]]:
     if not isinstance(section, dict):
         raise ParameterError('ros__parameters must hold names with values, such as "p_hit: 0.6"')
@@ -195,6 +218,22 @@ def _flatten(section: Any, prefix: str = '') -> Iterator[tuple[str, Any]]:
                 raise ParameterError(f'{full} is given twice, nested and with dots')
             seen.add(full)
             yield full, leaf
+
+
+def _merge(flat: dict[str, Any], section: dict[str, Any]) -> None:
+    """Add what a section has, which wins; a slash before a frame makes no other sensor of it."""
+    frames: dict[str, str] = {}
+    for name in section:
+        if (mount := _MOUNT.fullmatch(name)) and (twin := frames.setdefault(_frame_of(mount), name)) != name:
+            raise ParameterError(f'{twin} and {name} are poses of one sensor; give one of them')
+    for name in list(flat):
+        if (mount := _MOUNT.fullmatch(name)) and _frame_of(mount) in frames:
+            del flat[name]
+    flat |= section
+
+
+def _frame_of(mount: re.Match[str]) -> str:
+    return mount['frame'].lstrip('/')
 
 
 def _sort_out(flat: dict[str, Any]) -> ParameterFile:

@@ -19,6 +19,8 @@ from ..core.messages.message_types import Pose2
 TOO_MANY = 0.5
 """Fraction of unexplained readings above which a warning is due."""
 
+NOT_CONVERGED = 'the search ended at max_iterations before it converged; raise max_iterations'
+
 ENOUGH = 20
 """Readings below which nothing can be said."""
 
@@ -55,8 +57,18 @@ def reading_warnings(readings: Readings, source: Mapping[str, Any], parameters: 
 
 
 def _of_one(readings: Readings, extrinsics: Mapping[str, Pose2], parameters: Parameters) -> Iterator[str]:
+    yield from _deaf(readings)
     yield from input_warnings(readings)
     yield from consistency_warnings(readings, extrinsics, parameters)
+
+
+def _deaf(readings: Readings) -> Iterator[str]:
+    """Yield a warning where no sensor hears anything; where only one does not, its health tells."""
+    if len(readings) >= ENOUGH and not readings.echo.any():
+        yield (
+            f'none of {len(readings)} readings has an echo: do the sensors work, is max_range the one of their data '
+            f'sheet in metres, and does the driver publish ranges in metres? The maps show free space alone'
+        )
 
 
 def quality_warning(maps: MapSet) -> str:

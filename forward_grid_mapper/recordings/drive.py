@@ -17,11 +17,17 @@ from ..core.messages.message_batch import MessageBatch
 from ..core.messages.message_types import NANOSECONDS, Pose2
 from ..core.messages.pose_association import PoseAssociator
 from ..core.messages.robot_path import RobotPath
-from ..core.trajectory.jumps import too_far
+from ..core.trajectory.jumps import FASTEST, too_far
 from ..files.quality_warning import thinned
 
 MOST_JUMPED = 0.1
 """Part of the steps that are jumps, from which on poses are in another unit, or none of a robot."""
+
+LEAST_JUMP = 0.1
+"""Metres that poses of one source may be off without any motion."""
+
+FEWEST_RETURNS = 4
+"""Steps to and fro below which they may be outliers."""
 
 
 @dataclass(frozen=True)
@@ -185,6 +191,25 @@ def jumps_note(associator: PoseAssociator) -> list[str]:
         f'odometry jumps {often} by {steps[first]:.1f} m after {steps[:first].sum():.0f} m of driving: the map has '
         f'what comes after it in another place; --refine-poses puts it where readings fit, or map a part alone with '
         f'--start and --duration'
+    ]
+
+
+def to_and_fro_note(associator: PoseAssociator) -> list[str]:
+    """Return a warning where poses jump to another place and at once back, as those of two sources do in turn."""
+    stamp, pose = associator.record.snapshot()
+    if len(stamp) < 3:
+        return []
+    steps = np.hypot(*np.diff(pose[:, :2], axis=0).T)
+    jumped = steps > LEAST_JUMP + FASTEST * np.diff(stamp) / NANOSECONDS
+    back = np.hypot(*(pose[2:, :2] - pose[:-2, :2]).T)
+    returned = jumped[:-1] & jumped[1:] & (back < np.minimum(steps[:-1], steps[1:]) / 2)
+    both = np.append(returned, False) | np.append(False, returned)
+    count = int(np.count_nonzero(both))
+    if count < max(MOST_JUMPED * len(steps), FEWEST_RETURNS):
+        return []
+    return [
+        f'poses jump to and fro, by {np.median(steps[both]):.2f} m in {count} of {len(steps)} steps; do two nodes '
+        f'publish on this topic? Record the poses of one of them, or the map has everything in two places'
     ]
 
 

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..bags.opening import is_storage_file
 from ..core.common.errors import BagError, InputError, MapperError
 from ..core.common.parameters import Parameters
 from ..core.common.readings import Readings, in_canonical_order, of_drives
@@ -22,7 +23,7 @@ from ..files.output_folder import readable
 from ..files.quality_warning import thinned
 from .contradictions import Described, check_frames, contradictions, limits_of, listed, shared_echoes
 from .drive import WHOLE, Drive, Part, thinning_note
-from .finding import SUFFIXES, find_recordings
+from .finding import find_recordings
 from .given_poses import GivenPoses
 from .read_drive import read_drive
 
@@ -117,7 +118,9 @@ def read_drives(
     BagError, InputError
         If one of them cannot be read or mapped, or they are not in one map frame; names it.
     """
-    paths, repeated = without_repetition(find_recordings(words))
+    meant = find_recordings(words)
+    paths, repeated = without_repetition(meant.paths)
+    repeated += meant.skipped
     if len(paths) == 1:
         drive = read_drive(paths[0], parameters, extrinsics, range_topics, odom_topic, progress, part, poses)
         drive.source['warnings'] += repeated
@@ -167,7 +170,7 @@ def _files(path: Path) -> list[object]:
     folder = path.parent if path.name == 'metadata.yaml' else path
     try:
         if folder.is_dir():
-            files = [entry for entry in folder.iterdir() if entry.suffix in (*SUFFIXES, '.journal')]
+            files = [entry for entry in folder.iterdir() if is_storage_file(entry) or entry.suffix == '.journal']
         else:
             files = [folder]
         states = [file.stat() for file in files]

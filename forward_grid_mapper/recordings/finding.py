@@ -6,17 +6,31 @@ import glob
 import re
 from collections.abc import Sequence
 from pathlib import Path
+from typing import NamedTuple
 
+from ..bags.opening import plain_name, storage_files
 from ..core.common.errors import BagError
 from ..files.journal import drive_file
-
-SUFFIXES = ('.mcap', '.db3', '.bag')
+from ..files.output_folder import readable
 
 _PART = re.compile(r'_\d+$')
 """How rosbag2 ends the names of the files of one bag."""
 
+_UNFINISHED = '.bag.active'
+"""How `rosbag record` calls a bag that it has not finished."""
 
-def find_recordings(words: Sequence[Path | str]) -> list[Path]:
+_RESULTS = 'report.json'
+"""A file that folders of maps have, whose bags hold maps."""
+
+
+class Recordings(NamedTuple):
+    """Paths of bags and journals, and warnings about what looks like one but is not among them."""
+
+    paths: list[Path]
+    skipped: list[str]
+
+
+def find_recordings(words: Sequence[Path | str]) -> Recordings:
     """Return the bags and journals that are meant, in the order given, those of a folder by name.
 
     A word that names nothing, or something else than a bag, is returned as it is: what reads it says best what is
@@ -27,38 +41,70 @@ def find_recordings(words: Sequence[Path | str]) -> list[Path]:
     BagError
         If a pattern fits nothing.
     """
-    found: list[Path] = []
+    found = Recordings([], [])
     for word in words:
         path = Path(word)
+        matches = [path]
         if not path.exists() and glob.has_magic(str(word)):
             matches = [Path(name) for name in sorted(glob.glob(str(word)), key=_natural)]  # noqa: PTH207 (absolute too)
             if not matches:
                 raise BagError(f'no file or folder fits {word}')
-            found += [bag for match in matches for bag in _bags_of(match) or [match]]
-        else:
-            found += _bags_of(path) or [path]
+        for match in matches:
+            bags, skipped = _bags_of(match)
+            found.paths.extend(bags or [match])
+            found.skipped.extend(skipped)
     return found
 
 
-def _bags_of(path: Path) -> list[Path]:
-    """Return the bags in a folder that is no bag itself; empty if `path` is anything else."""
+def _bags_of(path: Path) -> Recordings:
+    """Return the bags in a folder that is no bag itself; none if `path` is anything else."""
+    nothing = Recordings([], [])
     if not path.is_dir() or (path / 'metadata.yaml').is_file():
-        return []
+        return nothing
     try:
         if drive_file(path) is not None:
-            return []
+            return nothing
         inside = sorted(path.iterdir(), key=lambda entry: _natural(entry.name))
+        files = _files_in(path)
+        below = [entry for entry in inside if entry.is_dir() and not entry.name.startswith('.')]
+        folders = [entry for entry in below if _is_bag(entry)]
+        skipped = [entry for entry in below if entry not in folders and _holds_recordings(entry)]
     except OSError:
-        return []
-    files = [entry for entry in inside if entry.suffix in SUFFIXES and entry.is_file()]
-    folders = [entry for entry in inside if entry.is_dir() and (entry / 'metadata.yaml').is_file()]
-    # files of one bag that lost its metadata are not several drives
-    stems = {_PART.sub('', file.stem) for file in files}
-    if len(files) == 1 and not folders:
-        return []
-    if len(files) > 1 and len(stems) == 1:
-        return []
-    return [*folders, *files]
+        return nothing
+    skipped += [entry for entry in inside if entry.name.endswith(_UNFINISHED)]
+    told = [_left_out(path, skipped)] if skipped else []
+    # a file alone, and files of one bag that lost its metadata, are no folder of drives
+    if _is_one(files) and (len(files) > 1 or not folders):
+        return Recordings([], told)
+    return Recordings([*folders, *files], told)
+
+
+def _files_in(folder: Path) -> list[Path]:
+    return [entry for entry in storage_files(folder) if entry.is_file()]
+
+
+def _is_bag(folder: Path) -> bool:
+    """Return whether a folder is a bag, with its metadata or without."""
+    if (folder / 'metadata.yaml').is_file():
+        return True
+    return _is_one(_files_in(folder))
+
+
+def _is_one(files: Sequence[Path]) -> bool:
+    """Return whether files are of one bag, by their names."""
+    return len({_PART.sub('', Path(plain_name(file)).stem) for file in files}) == 1
+
+
+def _holds_recordings(folder: Path) -> bool:
+    """Return whether a folder that is no bag is a journal, or a folder of bags."""
+    if (folder / _RESULTS).is_file():
+        return False
+    return drive_file(folder) is not None or bool(_files_in(folder)) or any(folder.glob('*/metadata.yaml'))
+
+
+def _left_out(path: Path, skipped: Sequence[Path]) -> str:
+    names = ', '.join(entry.name for entry in skipped)
+    return f'of {readable(path)} these are left out: {names}; if they are recordings, name them on the command line too'
 
 
 def _natural(name: str) -> list[tuple[int, str]]:

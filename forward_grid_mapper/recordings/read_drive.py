@@ -19,7 +19,7 @@ from ..core.messages.pose_association import PoseAssociator
 from ..core.messages.rep117 import ODOMETRY_REASONS, REASONS, rejection_warnings
 from ..files.journal import drive_file
 from ..files.output_folder import readable
-from .drive import WHOLE, Drive, LogOddsMapOfAll, Part, Spans, length_of, thinning_note
+from .drive import WHOLE, Drive, LogOddsMapOfAll, Part, Spans, length_of, thinning_note, to_and_fro_note
 from .given_poses import GivenPoses
 from .journal_drive import read_journal
 
@@ -39,6 +39,7 @@ class Extrinsics:
         self.steep: dict[str, str] = {}
         self.used: dict[str, str] = {}
         self.unusable: dict[str, str] = {}
+        self.doubts: dict[str, None] = {}
 
     def __call__(self, base_frame: str, frame: str, stamp: int) -> Pose2 | str | None:
         """Return the pose of a sensor, as `ExtrinsicsLookup` has it; static transforms are so at any stamp."""
@@ -62,6 +63,7 @@ class Extrinsics:
             return None
         if pose is not None:
             self.used[frame] = '/tf_static'
+            self.doubts.update(dict.fromkeys(self._transforms.doubts(base_frame, frame)))
         return pose
 
     @property
@@ -133,7 +135,7 @@ def read_drive(
             topics = bag.choose_topics(range_topics, odom_topic, any_poses=True)
         else:
             topics = bag.choose_range_topics(range_topics)
-        lookup = Extrinsics(extrinsics, bag.static_transforms())
+        lookup = Extrinsics(extrinsics, bag.static_transforms(topics))
         associator = BatchAssociator(lookup, parameters)
         live = LogOddsMapOfAll(associator, parameters)
         # the poses before and after a reading place it
@@ -148,7 +150,7 @@ def read_drive(
             associator.add_batch(batch_of(list(enumerate(given))))
         associator.finish()
         undecodable = dict(bag.undecodable)
-        warnings = _warnings(bag, associator, lookup)
+        warnings = topics.notes() + _warnings(bag, associator, lookup)
     if not len(associator.buffer):
         if not associator.received and spans.left_out:
             first, last = spans.left_out
@@ -191,7 +193,7 @@ def _warnings(bag: Bag, associator: PoseAssociator, lookup: Extrinsics) -> list[
         warnings.append(f'{count} messages on {topic} do not fit their type and were skipped')
     if associator.unknown_frames:
         warnings.append(lookup.advice(associator.base_frame, sorted(associator.unknown_frames)))
-    warnings += lookup.steep.values()
+    warnings += [*lookup.steep.values(), *lookup.doubts]
     if unused := lookup.unused:
         warnings.append(
             f'poses were given for {", ".join(unused)}, but no reading has such a frame; is the name right?'
@@ -200,6 +202,7 @@ def _warnings(bag: Bag, associator: PoseAssociator, lookup: Extrinsics) -> list[
         warnings.append(
             f"odometry's clock jumped back {associator.time_jumps} times; what waited for a pose was dropped"
         )
+    warnings += to_and_fro_note(associator)
     warnings += associator.limits.warnings()
     for reason, count in associator.odometry_rejected.items():
         warnings.append(

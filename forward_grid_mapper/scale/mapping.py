@@ -29,6 +29,7 @@ from ..core.messages.message_types import Pose2
 from ..core.sensor.cone_table import check_size
 from ..core.tiles.schedule import Schedule
 from ..core.tiles.tiling import Tiling
+from ..files.quality_warning import NOT_CONVERGED
 from ..recordings.contradictions import Described, check_frames, contradictions
 from ..recordings.drives import same_drive, source_of_all, unreadable
 from .cluster import Cluster, Work
@@ -130,6 +131,8 @@ class ScaledMapper:
             'cpu_seconds': sum(seconds for _, _, seconds, _ in self._tasks),
             'peak_memory_of_a_worker': self._peak,
         }
+        if not searches['converged']:
+            found.source['warnings'].append(NOT_CONVERGED)
         found.tasks, found.peak = self._tasks, self._peak
         found.statistics['seconds'] = self._seconds
         return found

@@ -16,6 +16,7 @@ from ..core.tiles.mosaic import FIRST_AROUND
 from ..core.tiles.tiling import boxes_of, by_tile, edge_of, widest_of
 from ..files.quality_warning import reading_warnings
 from ..recordings.contradictions import echoes_of, limits_of
+from ..recordings.drive import jumps_note
 from ..recordings.drives import digest_of
 from ..recordings.read_drive import read_drive
 from .job import Job, Recordings, task
@@ -44,7 +45,7 @@ def place(job: Job, number: int, recordings: Recordings) -> dict[str, Any]:
     except (BagError, InputError) as error:
         return {'error': str(error), 'kind': type(error).__name__}
     source, points = drive.source, drive.path_xy
-    source['warnings'] += reading_warnings(readings, source, p)
+    source['warnings'] += [*reading_warnings(readings, source, p), *jumps_note(drive.associator)]
     del drive
     boxes = boxes_of(readings, p)
     known = {

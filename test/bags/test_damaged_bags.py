@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import errno
 import random
+import shutil
+import tempfile
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
+from backports import zstd
 from bag_samples import COUNT, SUFFIXES, sample_messages, storage_file, write_many_chunks, write_sample
 
 from forward_grid_mapper.bags.choice import Topics
@@ -139,3 +144,77 @@ def test_a_damaged_file_of_a_split_bag_costs_only_itself(tmp_path: Path) -> None
     messages, truncated = read(bag)
     assert messages == sample_messages()
     assert truncated is not None and 'second.mcap' in truncated
+
+
+def test_a_file_that_the_metadata_do_not_list_is_told(tmp_path: Path) -> None:
+    bag = write_sample(tmp_path, 'mcap')
+    shutil.copy(bag / 'bag.mcap', bag / 'bag_1.mcap')
+    messages, truncated = read(bag)
+    assert messages == sample_messages()
+    assert truncated is not None and 'bag_1.mcap is not listed in metadata.yaml and was left out' in truncated
+    assert 'ros2 bag reindex' in truncated
+
+
+@pytest.mark.parametrize('kind', ['mcap', 'sqlite3'])
+def test_a_plain_file_whose_metadata_say_that_it_is_compressed(tmp_path: Path, kind: str) -> None:
+    bag = write_sample(tmp_path, kind)
+    metadata = bag / 'metadata.yaml'
+    metadata.write_text(metadata.read_text().replace("compression_mode: ''", 'compression_mode: FILE'))
+    assert 'FILE' in metadata.read_text()
+    assert read(bag) == (sample_messages(), None)
+    # unpacked beside the packed one, which it leaves listed or not
+    file = storage_file(bag)
+    (bag / f'{file.name}.zstd').write_bytes(zstd.compress(file.read_bytes()))
+    assert read(bag) == (sample_messages(), None)
+    metadata.unlink()
+    assert read(bag) == (sample_messages(), None)
+
+
+def test_a_compressed_file_without_metadata_is_seen(tmp_path: Path) -> None:
+    bag = write_sample(tmp_path, 'mcap')
+    (bag / 'metadata.yaml').unlink()
+    (bag / 'bag_1.mcap.zstd').write_bytes(zstd.compress((bag / 'bag.mcap').read_bytes()))
+    with pytest.raises(BagError, match=r'several bag files.*bag_1\.mcap\.zstd\) or unpack.*zstd -d.*reindex'), Bag(bag):
+        pass
+    (bag / 'bag.mcap').unlink()
+    with pytest.raises(BagError, match=r'bag_1\.mcap\.zstd is compressed; unpack it with `zstd -d'), Bag(bag):
+        pass
+
+
+def packed_and_split(folder: Path) -> Path:
+    bag = write_sample(folder, 'mcap')
+    file = storage_file(bag)
+    for number in range(2):
+        (bag / f'bag_{number}.mcap.zstd').write_bytes(zstd.compress(file.read_bytes()))
+    file.unlink()
+    metadata = bag / 'metadata.yaml'
+    text = metadata.read_text().replace('- bag.mcap', '- bag_0.mcap.zstd\n  - bag_1.mcap.zstd', 1)
+    metadata.write_text(text.replace("compression_mode: ''", 'compression_mode: FILE'))
+    return bag
+
+
+@pytest.mark.parametrize('full', ['before', 'while it is written', 'no folder'])
+def test_want_of_space_is_no_damage(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, full: str) -> None:
+    bag = packed_and_split(tmp_path)
+    assert read(bag) == (sample_messages() * 2, None)
+    size = len(zstd.decompress((bag / 'bag_0.mcap.zstd').read_bytes()))
+    temporary = tmp_path / 'temporary'
+    temporary.mkdir()
+    monkeypatch.setattr(tempfile, 'tempdir', str(temporary))
+    real = Path.open
+
+    def opened(path: Path, *arguments: object) -> object:
+        if path.suffix == '.mcap' and arguments == ('wb',) and '_1' in path.name:
+            raise OSError(errno.ENOSPC, 'No space left on device')
+        return real(path, *arguments)
+
+    if full == 'before':
+        monkeypatch.setattr(shutil, 'disk_usage', lambda _: SimpleNamespace(free=size - 1))
+    elif full == 'no folder':
+        temporary.rmdir()
+    else:
+        monkeypatch.setattr(Path, 'open', opened)
+    with pytest.raises(BagError, match='set TMPDIR') as caught, Bag(bag):
+        pass
+    assert 'damaged' not in str(caught.value) and str(bag) in str(caught.value)
+    assert full == 'no folder' or list(temporary.iterdir()) == []

@@ -40,6 +40,14 @@ def place(archive: MapArchive, state: int) -> tuple[float, float]:
     return round(float(x[columns[k]]), 3), round(float(y[rows[k]]), 3)
 
 
+def test_the_file_means_its_folder(maps: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = []
+    for given in (maps, maps / 'maps.npz'):
+        assert code_of(explain.main, given, *place(read_npz(maps / 'maps.npz'), 1)) == 0
+        words.append(capsys.readouterr().out)
+    assert words[0] == words[1]
+
+
 @pytest.mark.parametrize(('state', 'word'), [(1, 'occupied'), (0, 'free'), (-1, 'not observed')])
 def test_a_cell_is_explained(maps: Path, state: int, word: str, capsys: pytest.CaptureFixture[str]) -> None:
     archive = read_npz(maps / 'maps.npz')

@@ -15,7 +15,7 @@ from drive_samples import code_of, mapped, tape, write_tape
 from forward_grid_mapper import __version__
 from forward_grid_mapper.__main__ import COMMANDS
 from forward_grid_mapper.commands import demo, experiment, learn, process_bag, replay_bag, simulate
-from forward_grid_mapper.commands.options import chosen_parameters, chosen_part
+from forward_grid_mapper.commands.options import chosen_parameters, chosen_part, chosen_sensors
 from forward_grid_mapper.core.common.errors import ParameterError
 from forward_grid_mapper.core.common.parameters import TABLE
 from forward_grid_mapper.files import drawing
@@ -35,6 +35,21 @@ def bag(tmp_path: Path) -> str:
 def bags_of(options: argparse.Namespace) -> list[str]:
     """The bags that were found, of commands that take one or several."""
     return options.bags if hasattr(options, 'bags') else [options.bag]
+
+
+@pytest.mark.parametrize('command', [process_bag, learn])
+def test_two_poses_of_one_sensor(command: ModuleType, bag: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert code_of(command.main, bag, '--sensor', 'a=0,0,1', '--sensor', '/a=0,0,2') == 1
+    assert '--sensor gives two poses of /a; give one of them' in capsys.readouterr().err
+    options = command.parser().parse_args([bag, '--sensor', 'a=0,0,1', '--sensor', '/a=0,0,1', '--sensor', 'b=0,0,2'])
+    assert chosen_sensors(options) == {'a': (0.0, 0.0, 1.0), 'b': (0.0, 0.0, 2.0)}
+
+
+def test_the_results_of_a_folder_with_a_dot_have_its_whole_name(tmp_path: Path) -> None:
+    (tmp_path / 'bag_1.5').mkdir()
+    (tmp_path / 'one.mcap').touch()
+    named = {name: process_bag._stem([str(tmp_path / name)]) for name in ('bag_1.5', 'one.mcap', 'day_*')}
+    assert named == {'bag_1.5': 'bag_1.5', 'one.mcap': 'one', 'day_*': 'day_'}
 
 
 @pytest.mark.parametrize('parser', PARSERS)

@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM at any moment: one line, exit code 128 plus the signal, nothing and nobody left behind."""
+"""Ctrl-C, SIGTERM and SIGHUP at any moment: one line, exit code 128 plus the signal, nothing and nobody left behind."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def interrupted(
     )
 
 
-@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 @pytest.mark.parametrize('command', sorted(COMMANDS))
 def test_while_the_command_is_imported(tmp_path: Path, command: str, number: signal.Signals) -> None:
     module = {'mapper': 'forward_grid_mapper.node.main'}.get(command, 'numpy')
@@ -78,14 +78,14 @@ def test_while_the_command_is_imported(tmp_path: Path, command: str, number: sig
     assert everything_in(tmp_path) == []
 
 
-@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 @pytest.mark.parametrize('module', ['numba', 'yaml', 'rosbags', 'argparse'])
 def test_at_other_imports(tmp_path: Path, module: str, number: signal.Signals) -> None:
     done = interrupted(tmp_path, module, number, 'process_bag', 'bag')
     assert (done.returncode, done.stderr) == (128 + number, 'process_bag: cancelled; nothing was written\n')
 
 
-@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_in_the_middle_of_the_work(tmp_path: Path, number: signal.Signals) -> None:
     """Matplotlib is imported when the maps have been written into the temporary folder."""
     bag = write_tape(tmp_path / 'bag', tape())

@@ -114,7 +114,9 @@ def test_nothing_is_overwritten(tmp_path: Path, capsys: pytest.CaptureFixture[st
 
 def test_a_sqlite3_bag_that_cannot_be_there(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert code_of(simulate.main, *SMALL, '--format', 'sqlite3', '-o', tmp_path / 'what?') == 1
-    assert 'cannot have ?, # or %' in capsys.readouterr().err
+    err = capsys.readouterr().err
+    assert 'cannot have ?, # or %' in err
+    assert err.startswith(f'simulate: error: {tmp_path / "what?" / "bag"}: ')
     assert everything_in(tmp_path) == []
 
 

@@ -117,6 +117,18 @@ def test_the_specific_section_wins(tmp_path: Path) -> None:
         assert load(tmp_path, text) == ParameterFile({'p_hit': 0.5}, {}, {'use_sim_time': True})
 
 
+def test_the_specific_section_wins_for_a_frame_with_a_slash(tmp_path: Path) -> None:
+    own = 'forward_grid_mapper: {ros__parameters: {sensors./a.pose: [0.5, 0.0, 0.0]}}\n'
+    common = '/**: {ros__parameters: {sensors.a.pose: [0.1, 0.0, 0.0], sensors.b.pose: [0.2, 0.0, 0.0]}}\n'
+    assert load(tmp_path, own + common).extrinsics == {'/a': (0.5, 0.0, 0.0), 'b': (0.2, 0.0, 0.0)}
+
+
+def test_a_section_of_all_nodes_goes_with_one_in_a_namespace(tmp_path: Path) -> None:
+    common = '/**: {ros__parameters: {p_hit: 0.3, p_rand: 0.2}}\nother:\n'
+    own = '/r1: {forward_grid_mapper: {ros__parameters: {p_hit: 0.5}}}'
+    assert load(tmp_path, common + own).values == {'p_hit': 0.5, 'p_rand': 0.2}
+
+
 def test_parameters_of_ros_itself_pass(tmp_path: Path) -> None:
     assert load(tmp_path, 'qos_overrides: {/odom: {subscription: {depth: 5}}}').node == {
         'qos_overrides./odom.subscription.depth': 5
@@ -136,6 +148,7 @@ def test_parameters_of_ros_itself_pass(tmp_path: Path) -> None:
         ('over_range: keep', 'not one of no_echo, discard'),
         ('p_hit: 0.3\np_hit: 0.4', 'p_hit is given twice'),
         ('sensors.a.pose: [0, 0, 0]\nsensors: {a: {pose: [0, 0, 1]}}', 'sensors.a.pose is given twice'),
+        ('sensors.a.pose: [0, 0, 0]\nsensors./a.pose: [0, 0, 1]', r'sensors\.a\.pose and sensors\./a\.pose are'),
         ('sensors.a.pose: [0, 0]', 'sensors.a.pose: .* three finite numbers'),
         ('sensors.a.pose: [0, 0, 0, 0]', 'three finite numbers'),
         ('sensors.a.pose: [0, 0, .nan]', 'three finite numbers'),
@@ -151,6 +164,14 @@ def test_parameters_of_ros_itself_pass(tmp_path: Path) -> None:
         ('- p_hit', 'names with values'),
         ('/**: {ros__parameters: [1]}', 'names with values'),
         ('amcl: {ros__parameters: {a: 1}}\nother: {ros__parameters: {a: 1}}', 'there are: amcl, other'),
+        (
+            'r1: {forward_grid_mapper: {ros__parameters: {p_hit: 0.5}}}\n'
+            '/r2/forward_grid_mapper: {ros__parameters: {p_hit: 0.6}}',
+            r'several namespaces \(r1/forward_grid_mapper, /r2/forward_grid_mapper\)',
+        ),
+        ('p_rand: 0.1\nforward_grid_mapper: {ros__parameters: {p_hit: 0.5}}', 'p_rand: no node reads what is outside'),
+        ('forward_grid_mapper: {p_rand: 0.1, ros__parameters: {p_hit: 0.5}}', r'forward_grid_mapper\.p_rand: no node'),
+        ('r1: {p_rand: 0.1, amcl: {ros__parameters: {p_hit: 0.5}}}', 'r1/p_rand: no node'),
         ('p_hit: [', 'not valid YAML'),
         ('? [a, b]\n: 1', 'not valid YAML|no parameter is called'),
         ('p_hit: !!python/object/apply:os.getcwd []', 'not valid YAML'),

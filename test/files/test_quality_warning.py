@@ -9,7 +9,7 @@ import numpy as np
 
 from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.mapping import Mapper
-from forward_grid_mapper.files.quality_warning import quality_warning
+from forward_grid_mapper.files.quality_warning import data_warnings, quality_warning
 from forward_grid_mapper.files.results import write_results
 from forward_grid_mapper.simulation.drive import door_drive
 
@@ -26,3 +26,13 @@ def test_readings_that_no_map_explains(tmp_path: Path) -> None:
     assert 'are the poses of the sensors' in warning
     report = write_results(tmp_path / 'maps', wild, {}, np.zeros((0, 2)), 'wild')
     assert warning in report['warnings']
+
+
+def test_sensors_none_of_which_hears_anything() -> None:
+    drive = door_drive(1).readings
+    deaf = Mapper(Parameters()).run(dataclasses.replace(drive, z=drive.z_max))
+    assert any(text.startswith(f'none of {len(drive)} readings has an echo') for text in data_warnings(deaf, {}))
+    one = drive.z_max.copy()
+    one[0] /= 2
+    hears = Mapper(Parameters()).run(dataclasses.replace(drive, z=one))
+    assert not any('has an echo' in text for text in data_warnings(hears, {}))

@@ -107,6 +107,16 @@ def test_several_topics_of_poses_are_named(tmp_path: Path) -> None:
         drive_of(written(tmp_path / 'bag', POSE, ('/a', '/b')))
 
 
+@pytest.mark.parametrize('wish', ['/goal_pose', '/move_base_simple/goal', '/initialpose', '/r1/Goal'])
+def test_goals_are_no_poses_of_the_robot(tmp_path: Path, wish: str) -> None:
+    for kind in (POSE, POSE_WITH_COVARIANCE):
+        path = written(tmp_path / kind.rpartition('/')[2], kind, (wish,))
+        with pytest.raises(BagError, match=r'no nav_msgs/Odometry'):
+            drive_of(path)
+        assert len(drive_of(path, wish).associator.readings) == 59
+    assert drive_of(written(tmp_path / 'both', POSE, (wish, '/where'))).source['odom_topic'] == '/where'
+
+
 def test_transforms_are_taken_only_if_asked_for(tmp_path: Path) -> None:
     path = written(tmp_path / 'bag', TF, ('/tf',))
     with pytest.raises(BagError, match='--odom-topic /tf` takes those of base_link from its transforms'):

@@ -9,7 +9,7 @@ import pytest
 
 from forward_grid_mapper.core.messages.message_types import OdometryMessage, Pose2
 from forward_grid_mapper.core.messages.pose_association import PoseAssociator
-from forward_grid_mapper.recordings.drive import jumps_note, length_of, path_of
+from forward_grid_mapper.recordings.drive import jumps_note, length_of, path_of, to_and_fro_note
 
 
 def drive(order: np.ndarray, stamps: np.ndarray) -> PoseAssociator:
@@ -85,3 +85,29 @@ def test_neither_driving_nor_poses_in_another_unit_are_jumps() -> None:
             # a second each: fast, and far too fast
             associator.add_odometry(OdometryMessage((k + 1) * 10**9, 'odom', 'base_link', Pose2(metres * k, 0.0, 0.0)))
         assert jumps_note(associator) == []
+
+
+def poses_of(points: list[tuple[float, float]], period: float = 0.05) -> PoseAssociator:
+    associator = PoseAssociator(lambda base, frame, stamp: None, patient=True)
+    for k, (x, y) in enumerate(points):
+        stamp = int((k + 1) * period * 1e9)
+        associator.add_odometry(OdometryMessage(stamp, 'odom', 'base_link', Pose2(x, y, 0.0)))
+    return associator
+
+
+@pytest.mark.parametrize(('every', 'steps'), [(2, 99), (5, 40), (15, 14)])
+def test_two_sources_of_poses_on_one_topic_are_told(every: int, steps: int) -> None:
+    points = [(0.02 * k, 0.5 * (k % every == every // 2)) for k in range(100)]
+    (note,) = to_and_fro_note(poses_of(points))
+    assert f'by 0.50 m in {steps} of 99 steps; do two nodes publish' in note
+
+
+def test_what_is_no_second_source_is_not_told() -> None:
+    generator = np.random.default_rng(0)
+    fast = [(2.9 * 0.05 * (k if k < 50 else 100 - k), 0.0) for k in range(100)]
+    noisy = [(0.02 * k + e, 0.0) for k, e in enumerate(generator.normal(0.0, 0.03, 100).tolist())]
+    in_millimetres = [(50.0 * k, 0.0) for k in range(100)]
+    one_outlier = [(0.02 * k + 2.0 * (k == 3), 0.0) for k in range(10)]
+    jumped_once = [(0.02 * k + 2.0 * (k > 40), 0.0) for k in range(100)]
+    for points in (fast, noisy, in_millimetres, one_outlier, jumped_once, [(0.0, 0.0)], []):
+        assert to_and_fro_note(poses_of(points)) == []

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import errno
 import json
 import os
@@ -22,6 +23,7 @@ from forward_grid_mapper.commands import process_bag
 from forward_grid_mapper.commands.simulate import write_bag
 from forward_grid_mapper.core.common.errors import ClusterError, OutputError
 from forward_grid_mapper.core.common.parameters import Parameters
+from forward_grid_mapper.core.messages.message_types import OdometryMessage
 from forward_grid_mapper.files import drawing
 from forward_grid_mapper.files.map_archive import read_npz
 from forward_grid_mapper.files.map_files import read_map
@@ -87,8 +89,9 @@ class Here:
             yield number, work(job, number, *more)
 
 
-def job_in(folder: Path) -> Job:
-    job = Job(WorkFolder(str(folder)), Parameters.from_flat({'max_readings': 0, 'threads': 1}), TILE, versions())
+def job_in(folder: Path, **values: Any) -> Job:
+    parameters = Parameters.from_flat({'max_readings': 0, 'threads': 1, **values})
+    job = Job(WorkFolder(str(folder)), parameters, TILE, versions())
     job.folder.begin({'a': 'job'})
     return job
 
@@ -117,11 +120,11 @@ def assert_same(folder: Path, other: Path) -> None:
     assert reports[0]['warnings'] == reports[1]['warnings']
 
 
-def made_here(drives: Path, tmp_path: Path, cluster: Here, turned: bool = False) -> Path:
+def made_here(drives: Path, tmp_path: Path, cluster: Here, turned: bool = False, **values: Any) -> Path:
     from forward_grid_mapper.scale.mapping import ScaledMapper
     from forward_grid_mapper.scale.output import write_output
 
-    job, folder = job_in(tmp_path / 'work'), tmp_path / 'maps'
+    job, folder = job_in(tmp_path / 'work', **values), tmp_path / 'maps'
     found = ScaledMapper(cluster, job).run(recordings(drives, turned))
     folder.mkdir()
     write_output(folder, job, found, cluster, Parameters(), 'drives', lambda text: None)
@@ -402,6 +405,36 @@ def test_a_scheduler_that_exists(monkeypatch: pytest.MonkeyPatch) -> None:
             pass
 
 
+@scaled
+def test_warnings_are_those_of_one_process(tmp_path: Path) -> None:
+    drive = campus_drive(0, 1, 900, sonars=front_array())
+    middle = drive.odometry[len(drive.odometry) // 2].stamp
+
+    def jumped(message: OdometryMessage) -> OdometryMessage:
+        assert message.pose is not None
+        return message._replace(pose=message.pose._replace(x=message.pose.x + 5.0 * (message.stamp > middle)))
+
+    jumping = dataclasses.replace(drive, odometry=[jumped(message) for message in drive.odometry])
+    write_bag(tmp_path / 'drives' / 'drive', jumping, 'mcap', False)
+    made_here(tmp_path / 'drives', tmp_path, Here(), max_iterations=1)
+    told = json.loads((tmp_path / 'maps' / 'report.json').read_text())['warnings']
+    assert any(text.startswith('odometry jumps once, by 5.0 m') for text in told)
+    assert any('raise max_iterations' in text for text in told)
+
+
+@scaled
+def test_workers_are_told_what_has_no_effect(drives: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    told: list[str] = []
+
+    def with_workers(options: Any, parameters: Any, extrinsics: Any, ignored: list[str], *_: Any) -> int:
+        told.extend(ignored)
+        return 0
+
+    monkeypatch.setattr(process_bag, 'with_workers', with_workers)
+    assert code_of(drives, '--workers', 2, '--set', 'odometry_noise=2deg') == 0
+    assert told == ['odometry_noise has an effect with --refine-poses alone, which is not given']
+
+
 # ---- errors
 
 
@@ -426,6 +459,7 @@ def test_without_the_extra_it_says_what_to_install(
         (('--workers', 2, '--scheduler', 'tcp://a:1'), 'leave out --workers'),
         (('--workers', 2, '--memory-per-worker', 0.1), '--memory-per-worker'),
         (('--workers', 2, '--refine-poses'), '--refine-poses'),
+        (('--workers', 2, '--odometry-calibration', 'wheels.yaml'), '--odometry-calibration'),
         (('--workers', 2, '--learn', 1), '--learn'),
         (('--work', 'here'), '--work'),
     ],

@@ -1,0 +1,52 @@
+"""Which recordings a folder holds, and what of it is named as left out."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from forward_grid_mapper.recordings.finding import find_recordings
+
+
+def made(folder: Path, *names: str) -> Path:
+    for name in names:
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).touch()
+    return folder
+
+
+def names_of(folder: Path) -> list[str]:
+    return [str(path.relative_to(folder)) for path in find_recordings([folder]).paths]
+
+
+def test_bags_without_metadata_are_bags_as_they_are_alone(tmp_path: Path) -> None:
+    folder = made(tmp_path, 'a/metadata.yaml', 'b/b_0.mcap', 'c/c_0.db3', 'c/c_1.db3', 'd/d_0.mcap.zstd', 'e.bag')
+    assert names_of(folder) == ['a', 'b', 'c', 'd', 'e.bag']
+    assert find_recordings([folder]).skipped == []
+
+
+def test_what_is_left_out_is_named(tmp_path: Path) -> None:
+    folder = made(
+        tmp_path,
+        'a/metadata.yaml',
+        'journal/drive_000001.journal',
+        'robots/one.mcap',
+        'robots/other.mcap',
+        'week/monday/metadata.yaml',
+        'night.bag.active',
+        'maps/report.json',
+        'maps/maps.mcap_bag/metadata.yaml',
+        'notes/read.txt',
+        '.hidden/b_0.mcap',
+    )
+    assert names_of(folder) == ['a']
+    (told,) = find_recordings([folder]).skipped
+    assert ': journal, robots, week, night.bag.active; if they are recordings' in told
+
+
+def test_one_bag_is_no_folder_of_bags(tmp_path: Path) -> None:
+    for number, names in enumerate((['a_0.mcap', 'a_1.mcap.zstd'], ['a.mcap'], ['a.mcap', 'a.mcap.zstd'])):
+        folder = made(tmp_path / str(number), *names)
+        assert find_recordings([folder]) == ([folder], [])
+    # files of a split bag are not several drives, whatever lies beside them
+    folder = made(tmp_path / 'split', 'a_0.mcap', 'a_1.mcap', 'b/metadata.yaml')
+    assert names_of(folder) == ['.']
