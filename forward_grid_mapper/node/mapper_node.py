@@ -140,6 +140,7 @@ class MapperNode(ManagedNode):
         self.workers += [part.worker for part in (self.saver, self.online, trajectory.following, kernels) if part]
         health = Health()
         self.intake = Intake(self, self.parameters, self.associator, self._map_frame, health.taken)
+        trajectory.listening = lambda: self.intake.listening
         self.reporter = Reporter(
             self,
             health,
