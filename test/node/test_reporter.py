@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -79,6 +80,68 @@ def test_a_stamp_of_odometry_that_stands_still_is_told_of(monkeypatch: pytest.Mo
         now += 1.0
         quiet.odometry(0.0)
         assert 'header.stamp' not in judged(quiet, health)[1]
+
+
+def seconds(robot: Taking, clock: Any, health: Health, count: int, every: int, frame: str) -> list[tuple[bytes, str]]:
+    """Verdicts of so many seconds, in which a sensor sends every few seconds; odometry comes all the time."""
+    found = []
+    for k in range(count):
+        clock.now += 1.0
+        stamp = robot.associator.odometry_stamp or 100 * 10**9
+        robot.odometry(stamp / 1e9 + 1.0)
+        if k % every == 0:
+            robot.range(stamp / 1e9 + 1.0, frame)
+        found.append(judged(robot, health))
+    return found
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> Any:
+    made = SimpleNamespace(now=50.0)
+    monkeypatch.setattr(diagnostics.time, 'monotonic', lambda: made.now)
+    return made
+
+
+def test_a_sensor_that_measures_rarely_has_one_verdict(clock: Any) -> None:
+    robot, health = Taking(), Health()
+    robot.intake.begin()
+    told = seconds(robot, clock, health, 20, 3, '')
+    assert {level for level, _ in told} == {WARN}
+    assert 'readings were rejected in the last 10 s, most of them as empty_frame_id' in told[-1][1]
+    # good ones show within some seconds
+    told = seconds(robot, clock, health, 24, 3, 'sonar')
+    assert told[-1] == (OK, 'mapping')
+    # a good sensor that sends fast does not hide the frame that nobody knows
+    robot.associator.rejected['unknown_extrinsics'] += 1
+    robot.associator.unknown_frames.add('ghost')
+    told = seconds(robot, clock, health, 5, 1, 'sonar')
+    assert {text for _, text in told} == {'no pose on the robot for ghost'}
+
+
+def test_where_nothing_was_accepted_it_does_not_say_mapping(clock: Any) -> None:
+    robot, health = Taking(), Health()
+    robot.intake.begin()
+    seconds(robot, clock, health, 5, 1, '')
+    robot.intake.paused = True
+    seconds(robot, clock, health, 12, 1, 'sonar')
+    robot.intake.paused = False
+    robot.odometry(200.0)
+    # messages come, and wait for odometry
+    for _ in range(2):
+        robot.range(300.0)
+        level, text = judged(robot, health)
+    assert level == WARN
+    assert text.startswith('no reading has been accepted so far: 5 were rejected, most of them as empty_frame_id')
+
+
+def test_what_was_rejected_during_a_pause_is_no_fault_after_it(clock: Any) -> None:
+    robot, health = Taking(), Health()
+    robot.intake.begin()
+    seconds(robot, clock, health, 5, 1, 'sonar')
+    robot.intake.paused = True
+    assert {text for _, text in seconds(robot, clock, health, 5, 1, 'sonar')} == {'paused'}
+    robot.intake.paused = False
+    assert seconds(robot, clock, health, 3, 1, 'sonar') == [(OK, 'mapping')] * 3
 
 
 def reporter_of(robot: Taking) -> Any:
