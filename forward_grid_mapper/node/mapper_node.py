@@ -89,6 +89,7 @@ class MapperNode(ManagedNode):
         self._lacks = {'journal', 'kernels'}
         self._fed = {'live': 0, 'online': 0}
         self.workers: list[Worker] = []
+        self._calls: list[DeferredService] = []
 
     def configure(self) -> None:
         """Create topics and services, read the journal, and compile; messages are taken once it is active.
@@ -160,8 +161,8 @@ class MapperNode(ManagedNode):
             ('~/save_maps', self.saver.save_maps),
             ('~/reset', self.reset),
         ):
-            DeferredService(self, Trigger, name, partial(self._when, handler))
-        DeferredService(self, SetBool, '~/pause', self.pause)
+            self._calls.append(DeferredService(self, Trigger, name, partial(self._when, handler)))
+        self._calls += [DeferredService(self, SetBool, '~/pause', self.pause), *self.maps.services]
         self.create_timer(1.0, self.reporter.report, clock=self._steady)
         self._live_timer = self.create_timer(1.0 / node.publish_rate, self.publish_live, clock=self._steady)
         self._started = True
@@ -207,6 +208,10 @@ class MapperNode(ManagedNode):
         # kernels are compiled to the end, whoever needs them next
         for worker in self.workers[:-1]:
             worker.close(0.5)
+        # what they wait for does not come any more
+        for service in self._calls:
+            service.end('the node is being cleaned up')
+        self._calls.clear()
 
     def _undo(self) -> None:
         super()._undo()
