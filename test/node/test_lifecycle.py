@@ -27,6 +27,7 @@ from lifecycle_msgs.msg import State, Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 from nav_msgs.msg import Odometry
 from rclpy.lifecycle.node import TransitionCallbackReturn
+from rclpy.parameter import Parameter
 from robot import LATCHED, MAPS, Robot, environment
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Range
@@ -111,6 +112,7 @@ def test_a_manager_starts_pauses_and_ends_it(start: Any, robot: Robot, manager: 
     robot.until(lambda: robot.diagnostics.get('readings', {}).get('message') == 'inactive: nothing is received')
     assert robot.range_out.get_subscription_count() == 0
     node.wait_for('kernels of the EM are ready')
+    node.wait_for('ready: the live map follows the readings; activate the node to have them received')
     assert 'no Range message has come on /sonar' in robot.call('run_em').message
     assert manager.change(Transition.TRANSITION_ACTIVATE)
     robot.meet()
@@ -287,6 +289,27 @@ def test_simulated_time_that_was_set_while_it_ran_goes_on_after_a_clean_up(
     for turn in (node.trigger_deactivate, node.trigger_cleanup, node.trigger_configure, node.trigger_activate):
         assert turn() == TransitionCallbackReturn.SUCCESS
     robot.until(lambda: comes(200), 20.0)
+
+
+def test_what_configure_reads_is_set_between_cleanup_and_configure(inside: Callable[..., Inside]) -> None:
+    robot = inside()
+    node = robot.node
+    node.start()
+    changes = {'resolution': 0.2, 'range_topics': ['left', 'right'], 'sensors.sonar.pose': [0.5, 0.0, 0.0]}
+    for name, value in changes.items():
+        (result,) = node.set_parameters([Parameter(name, value=value)])
+        assert not result.successful and f'{name} is read-only while the node is configured' in result.reason
+    assert node.trigger_deactivate() == node.trigger_cleanup() == TransitionCallbackReturn.SUCCESS
+    robot.set(**changes)
+    (result,) = node.set_parameters([Parameter('sensors.sonar.pose', value=[0.5, 0.0])])
+    assert not result.successful, 'that is no pose'
+    assert node.trigger_configure() == node.trigger_activate() == TransitionCallbackReturn.SUCCESS
+    assert sorted(topic for topic in node.intake.subscriptions if topic != '/odom') == ['/left', '/right']
+    robot.until(lambda: node.mapping)
+    robot.odometry(100.0)
+    robot.range(100.0)
+    assert node.associator.readings.x == pytest.approx([0.5])
+    assert node.live.grid.resolution == 0.2
 
 
 def test_who_waits_for_an_answer_has_one_when_the_node_is_cleaned_up(
