@@ -65,7 +65,7 @@ ALLOWED = {
     'global_frame: odom': 'a setting of Nav2',
     '/robot1/forward_grid_mapper/run_em': 'a service of a node in a namespace',
     'mkdocs serve': 'a command of mkdocs',
-    'pip install --break-system-packages rosbags': 'a command of pip',
+    "pip install --break-system-packages 'rosbags>=0.11.9,<0.12'": 'a command of pip',
     'tasks.csv': 'a file that process_bag writes',
     'maps.zarr': 'a folder that process_bag writes',
     'index.json': 'a file that process_bag writes',

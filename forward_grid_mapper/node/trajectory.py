@@ -64,7 +64,7 @@ class _Jump(NamedTuple):
     def __str__(self) -> str:
         return (
             f'odometry jumped by {self.far:.1f} m: where the robot is on the map is not known until run_em has found '
-            f'it, and what it reads goes to a wrong place; where it was carried away (kidnapped), call reset'
+            f'it, and new readings are placed wrongly; where it was carried away (kidnapped), call reset'
         )
 
 
