@@ -116,11 +116,13 @@ class Health:
                 f'odometry comes, but its stamp has been {stamp / NANOSECONDS:.3f} s for {stuck:.0f} s, so that no '
                 'reading gets a pose; have its driver fill in header.stamp'
             )
-        if silent_ranges > SILENCE:
+        if silent_ranges > max(SILENCE, intake.heard.patience):
             return DiagnosticStatus.WARN, f'no Range for {silent_ranges:.0f} s{_and_no_pose(associator)}'
         if associator.unknown_frames and nowhere < RECENT:
             return DiagnosticStatus.WARN, f'no pose on the robot for {listed(associator.unknown_frames)}'
         if new and new_rejected > 0.2 * new:
+            # some of them may have waited since before
+            new = max(new, new_rejected)
             return DiagnosticStatus.WARN, (
                 f'{new_rejected} of {new} readings were rejected in the last {time_span}{_main_reason(by_reason)}'
             )
@@ -129,6 +131,8 @@ class Health:
             return DiagnosticStatus.WARN, (
                 f'no reading has been accepted so far: {wrong.total()} were rejected{_main_reason(wrong)}'
             )
+        if received and not len(associator.buffer):
+            return DiagnosticStatus.OK, 'no reading has been accepted so far: they wait for their poses'
         bound = associator.parameters.max_readings
         if bound and NEARLY * bound < len(associator.buffer) <= bound:
             return DiagnosticStatus.WARN, (

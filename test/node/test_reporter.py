@@ -15,6 +15,7 @@ from forward_grid_mapper.core.common.grid import Grid
 from forward_grid_mapper.node import diagnostics
 from forward_grid_mapper.node.diagnostics import Health
 from forward_grid_mapper.node.frames import Extrinsics, Transforms
+from forward_grid_mapper.node.heard import USUAL
 from forward_grid_mapper.node.reporter import Reporter
 
 OK, WARN = b'\x00', b'\x01'
@@ -22,9 +23,9 @@ OK, WARN = b'\x00', b'\x01'
 
 def judged(robot: Taking, health: Health) -> tuple[bytes, str]:
     """Level and message of the readings, once a second of the test has passed."""
-    robot.intake.subscribe()
+    if not robot.intake.listening:
+        robot.intake.subscribe()
     found = health.statuses('mapper', robot.intake, robot.associator, None, 'none yet', Grid(0.1, 0, 0, 1, 1), {})[0]
-    robot.intake.unsubscribe()
     return found.level, found.message
 
 
@@ -118,6 +119,16 @@ def test_a_sensor_that_measures_rarely_has_one_verdict(clock: Any) -> None:
     assert {text for _, text in told} == {'no pose on the robot for ghost'}
 
 
+def test_a_sensor_that_sends_every_five_seconds_is_not_silent_in_between(clock: Any) -> None:
+    robot, health = Taking(), Health()
+    robot.intake.begin()
+    seconds(robot, clock, health, 10, 5, 'sonar')
+    told = seconds(robot, clock, health, 20, 5, 'sonar')
+    assert set(told) == {(OK, 'mapping')}
+    told = seconds(robot, clock, health, int(5 * USUAL) + 5, 1000, 'sonar')
+    assert told[-1][0] == WARN and told[-1][1].startswith('no Range for ')
+
+
 def test_where_nothing_was_accepted_it_does_not_say_mapping(clock: Any) -> None:
     robot, health = Taking(), Health()
     robot.intake.begin()
@@ -126,12 +137,38 @@ def test_where_nothing_was_accepted_it_does_not_say_mapping(clock: Any) -> None:
     seconds(robot, clock, health, 12, 1, 'sonar')
     robot.intake.paused = False
     robot.odometry(200.0)
+    assert 'were rejected' in judged(robot, health)[1]
     # messages come, and wait for odometry
     for _ in range(2):
         robot.range(300.0)
         level, text = judged(robot, health)
     assert level == WARN
     assert text.startswith('no reading has been accepted so far: 5 were rejected, most of them as empty_frame_id')
+
+
+def test_while_readings_wait_it_does_not_say_mapping_either(clock: Any) -> None:
+    robot, health = Taking(), Health()
+    robot.intake.begin()
+    robot.odometry(100.0)
+    robot.range(100.5)
+    assert judged(robot, health) == (OK, 'no reading has been accepted so far: they wait for their poses')
+    robot.odometry(101.0)
+    assert judged(robot, health) == (OK, 'mapping')
+
+
+def test_more_rejected_than_came(clock: Any) -> None:
+    """Readings that came before, and waited."""
+    robot, health = Taking(), Health()
+    robot.intake.begin()
+    robot.odometry(100.0)
+    for k in range(20):
+        robot.range(101.0 + 0.01 * k)
+    judged(robot, health)
+    for k in range(12):
+        robot.range(102.0 + 0.01 * k)
+    robot.odometry(104.0)
+    clock.now += 1.0
+    assert '32 of 32 readings were rejected in the last second' in judged(robot, health)[1]
 
 
 def test_what_was_rejected_during_a_pause_is_no_fault_after_it(clock: Any) -> None:
