@@ -70,7 +70,7 @@ ALLOWED = {
     'raw': 'a mode of map_server',
     '/robot1/forward_grid_mapper/run_em': 'a service of a node in a namespace',
     'mkdocs serve': 'a command of mkdocs',
-    'pip install --break-system-packages rosbags': 'a command of pip',
+    "pip install --break-system-packages 'rosbags>=0.11.9,<0.12'": 'a command of pip',
     'tasks.csv': 'a file that process_bag writes',
     'maps.zarr': 'a folder that process_bag writes',
     'index.json': 'a file that process_bag writes',

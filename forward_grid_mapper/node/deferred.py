@@ -36,6 +36,7 @@ class Reply:
             if self._response is not None:
                 return
             self._response, header = response, self._header
+        self._service.open.discard(self)
         if header is not None:
             self._service.transmit(response, header)
 
@@ -67,10 +68,16 @@ class DeferredService:
 
     An `async` handler would do the same with rclpy's own means, but its executor then spins at full load until the
     answer is there.
+
+    Attributes
+    ----------
+    open : set of Reply
+        Those that nobody has answered yet.
     """
 
     def __init__(self, node: Node, kind: Any, name: str, handler: Callable[[Reply], None]) -> None:
         self.kind = kind
+        self.open: set[Reply] = set()
         self._handler = handler
         self._log = node.get_logger().error
         self._service: Service = node.create_service(kind, name, self._accept, qos_profile=CALLS)
@@ -79,11 +86,17 @@ class DeferredService:
 
     def _accept(self, request: Any, response: Any) -> Reply:
         reply = Reply(self, request)
+        self.open.add(reply)
         answered(self._handler, reply, self._log)
         return reply
 
     def _send(self, reply: Reply, header: Any) -> None:
         reply.arrived(header)
+
+    def end(self, why: str) -> None:
+        """Tell those who still wait that there will be no answer, and why."""
+        for reply in list(self.open):
+            reply.fail(why)
 
     def transmit(self, response: Any, header: Any) -> None:
         """Send a response to the client; any thread."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Collection, Mapping
 from typing import Any
 
@@ -20,6 +20,13 @@ SILENCE = 3.0
 """Seconds without odometry, or without ranges, that are worth a warning."""
 
 
+RECENT = 10.0
+"""Seconds for which a sensor that measures rarely is judged by the readings that it has sent, so that the status does
+not change with each of them."""
+
+ENOUGH = 10
+"""Readings by which the last second alone is judged."""
+
 NEARLY = 0.9
 """Fraction of `max_readings` from which on a warning says that readings will go."""
 
@@ -33,9 +40,8 @@ class Health:
     def __init__(self) -> None:
         self._begin = time.monotonic()
         self._last: dict[str, tuple[int, float]] = {}
-        self._rejected = 0
-        self._received = self._refused = 0
-        self._by_reason: Counter[str] = Counter()
+        self._recent = _Recent()
+        self._refused = 0
         self._slowest = 0
 
     def taken(self, sent: int) -> None:
@@ -82,11 +88,11 @@ class Health:
         ]
 
     def _judge(self, associator: PoseAssociator, intake: Intake, map_frame: str) -> tuple[bytes, str]:
-        received, rejected = intake.received, sum(associator.rejected.values())
-        new, new_rejected = received - self._received, rejected - self._rejected
-        self._received, self._rejected = received, rejected
+        received = intake.received
         # looked at each time: a reset begins to count anew
-        by_reason, self._by_reason = associator.rejected - self._by_reason, associator.rejected.copy()
+        new, by_reason, time_span = self._recent.look(received, associator.rejected)
+        new_rejected = sum(by_reason.values())
+        nowhere = self._silence('frames without a pose', associator.rejected['unknown_extrinsics'])
         refused = sum(associator.odometry_rejected.values())
         silent_odometry = self._silence('odometry', associator.odometry_received - refused)
         refused_now, self._refused = refused - self._refused, refused
@@ -96,6 +102,7 @@ class Health:
         if not intake.listening:
             return DiagnosticStatus.OK, 'inactive: nothing is received'
         if intake.paused:
+            self._recent.begin_anew()
             return DiagnosticStatus.OK, 'paused'
         if silent_odometry > SILENCE and refused_now > 0:
             reason = max(associator.odometry_rejected, key=lambda key: associator.odometry_rejected[key])
@@ -109,14 +116,23 @@ class Health:
                 f'odometry comes, but its stamp has been {stamp / NANOSECONDS:.3f} s for {stuck:.0f} s, so that no '
                 'reading gets a pose; have its driver fill in header.stamp'
             )
-        if silent_ranges > SILENCE:
+        if silent_ranges > max(SILENCE, intake.heard.patience):
             return DiagnosticStatus.WARN, f'no Range for {silent_ranges:.0f} s{_and_no_pose(associator)}'
-        if associator.unknown_frames and new_rejected:
+        if associator.unknown_frames and nowhere < RECENT:
             return DiagnosticStatus.WARN, f'no pose on the robot for {listed(associator.unknown_frames)}'
         if new and new_rejected > 0.2 * new:
+            # some of them may have waited since before
+            new = max(new, new_rejected)
             return DiagnosticStatus.WARN, (
-                f'{new_rejected} of {new} readings were rejected in the last second{_main_reason(by_reason)}'
+                f'{new_rejected} of {new} readings were rejected in the last {time_span}{_main_reason(by_reason)}'
             )
+        wrong = associator.rejected - Counter(paused=associator.rejected['paused'])
+        if wrong and not len(associator.buffer):
+            return DiagnosticStatus.WARN, (
+                f'no reading has been accepted so far: {wrong.total()} were rejected{_main_reason(wrong)}'
+            )
+        if received and not len(associator.buffer):
+            return DiagnosticStatus.OK, 'no reading has been accepted so far: they wait for their poses'
         bound = associator.parameters.max_readings
         if bound and NEARLY * bound < len(associator.buffer) <= bound:
             return DiagnosticStatus.WARN, (
@@ -133,6 +149,31 @@ class Health:
             last, since = count, now
         self._last[stream] = last, since
         return now - since
+
+
+class _Recent:
+    """The readings of the last second, or of as many seconds as it takes to have `ENOUGH` of them."""
+
+    def __init__(self) -> None:
+        self._looks: deque[tuple[float, int, Counter[str]]] = deque([(time.monotonic(), 0, Counter())])
+
+    def look(self, received: int, rejected: Counter[str]) -> tuple[int, Counter[str], str]:
+        """Take the counts of now; return how many came, those that were rejected by reason, and the time in words."""
+        now, looks = time.monotonic(), self._looks
+        if received < looks[-1][1]:
+            # a reset
+            last = looks[-1][0]
+            looks.clear()
+            looks.append((last, 0, Counter()))
+        looks.append((now, received, rejected.copy()))
+        while len(looks) > 2 and (received - looks[1][1] >= ENOUGH or now - looks[1][0] >= RECENT):
+            looks.popleft()
+        begin, before, counts = looks[0]
+        return received - before, rejected - counts, 'second' if len(looks) == 2 else f'{now - begin:.0f} s'
+
+    def begin_anew(self) -> None:
+        """Leave out of account what came so far."""
+        self._looks = deque([self._looks[-1]])
 
 
 def add_faults(made: DiagnosticStatus, faults: list[str]) -> None:

@@ -10,8 +10,8 @@ from typing import Any
 
 from ..core.messages.extrinsics import LATE, LATER, Later, mount_of
 from ..core.messages.message_types import NANOSECONDS, OdometryMessage, Pose2, planar_pose
-from ..core.messages.pose_association import JUMP
 from ..core.messages.quaternions import rotation_of
+from ..core.messages.stamp_order import GOES_ON, JUMP, JUMPED_BACK, StampOrder
 
 TF, TF_STATIC = '/tf', '/tf_static'
 
@@ -53,7 +53,7 @@ class Transforms:
         self._buffer, self._error = buffer, error
         self.topics = topics
         self._missing: dict[tuple[str, str], float] = {}
-        self._newest: int | None = None
+        self._order = StampOrder()
 
     @classmethod
     def of(cls, node: Any) -> Transforms:
@@ -73,18 +73,23 @@ class Transforms:
         """Whether there is any TF to ask."""
         return self._buffer is not None
 
-    def heed(self, stamp: int) -> None:
+    def heed(self, stamp: int) -> str:
         """Take the stamp of a message in nanoseconds; where the clock jumped back, forget the transforms of before.
 
         TF refuses transforms that are much older than those it has, and joins others with those of the time before the
         jump. Static transforms stay: tf2 never forgets them.
+
+        Returns
+        -------
+        str
+            What the stamp says of those before it (`stamp_order.order_of`).
         """
-        if self._newest is not None and stamp < self._newest - JUMP:
-            self._newest = stamp
+        order = self._order.take(stamp)
+        if order == JUMPED_BACK:
             self._missing.clear()
             if self._buffer is not None:
                 self._buffer.clear()
-        self._newest = stamp if self._newest is None else max(stamp, self._newest)
+        return order
 
     def lookup(self, target: str, source: str, stamp: int) -> Any | Later:
         """Return the `geometry_msgs/Transform` of `source` in `target` at `stamp` in nanoseconds, or a `Later`."""
@@ -196,13 +201,13 @@ class MapFrame:
 
         Others wait for the next call.
         """
-        self._transforms.heed(message.stamp)
+        order = self._transforms.heed(message.stamp)
         if not self._map_frame or message.frame_id.lstrip('/') == self._map_frame.lstrip('/'):
             return [message]
-        # the associator sorts in what only overtook
-        if self._held and message.stamp < self._held[-1].stamp - JUMP:
-            self.dropped += len(self._held)
-            self._held.clear()
+        # the associator sorts in what only overtook; a stamp that was ahead would keep all others waiting
+        while order != GOES_ON and self._held and (order == JUMPED_BACK or self._held[-1].stamp > message.stamp + JUMP):
+            self.dropped += 1
+            self._held.pop()
         self._held.append(message)
         self._newest, self._frame = time.monotonic(), message.frame_id
         if len(self._held) > MOST_HELD:

@@ -52,6 +52,11 @@ class Heard:
         elif len(self._sensors) < MOST_FRAMES and frame.isprintable() and 0 < len(frame) <= LONGEST_NAME:
             self._sensors[frame] = now, 0.0
 
+    @property
+    def patience(self) -> float:
+        """Seconds after which all are silent if nothing came."""
+        return min((_patience(usual) for _, usual in self._sensors.values()), default=TIME_OUT)
+
     def silent(self) -> dict[str, float]:
         """Return the sensors that are silent, and for how many seconds."""
         now, newest = time.monotonic(), self._newest

@@ -16,6 +16,7 @@ from sensor_msgs.msg import Range
 from ..core.common.parameters import Parameters
 from ..core.messages.message_types import OdometryMessage, RangeMessage, odometry_message, range_message
 from ..core.messages.pose_association import MOST_WAITING, PoseAssociator
+from .clocks import OdometryClock, SensorClocks
 from .frames import MapFrame
 from .heard import Heard
 from .losses import LASTING, Losses
@@ -71,6 +72,8 @@ class Intake:
         self.paused = self._ready = False
         self.reliable = own.range_reliability == 'reliable'
         self.heard = Heard()
+        self._odometry_clock = OdometryClock(associator, node.get_logger().warning)
+        self._sensor_clocks = SensorClocks(node.get_logger().warning)
         self._held: deque[tuple[RangeMessage | OdometryMessage | _InMapFrame, int, bool]] = deque()
         self._ranges_held = self._refused = self._told_of = 0
         self._last_refused: RangeMessage | None = None
@@ -90,11 +93,16 @@ class Intake:
         return bool(self._subscribed)
 
     def subscribe(self) -> None:
-        """Take messages from here on."""
+        """Take messages from here on; if a topic fails, from none."""
         own = self._own
-        for topic, losses in zip(self._topics, self.range_losses, strict=True):
-            self._subscribe(Range, topic, own.range_reliability, partial(self.on_range, losses), losses)
-        self._subscribe(Odometry, own.odom_topic, own.odom_reliability, self.on_odometry, self._odometry_losses)
+        try:
+            for topic, losses in zip(self._topics, self.range_losses, strict=True):
+                self._subscribe(Range, topic, own.range_reliability, partial(self.on_range, losses), losses)
+            self._subscribe(Odometry, own.odom_topic, own.odom_reliability, self.on_odometry, self._odometry_losses)
+        except BaseException:
+            # or else the next call would have messages taken twice
+            self.unsubscribe()
+            raise
 
     def unsubscribe(self) -> None:
         """Take no messages any more; what is missing when they are taken again was not lost."""
@@ -102,9 +110,14 @@ class Intake:
             self._node.destroy_subscription(subscription)
         self._subscribed.clear()
         self.subscriptions.clear()
-        self.heard.clear()
+        self._forget_senders()
         for losses in (*self.range_losses, self._odometry_losses):
             losses.begin_anew()
+
+    def _forget_senders(self) -> None:
+        self.heard.clear()
+        self._odometry_clock.forget()
+        self._sensor_clocks.clear()
 
     def _losses(self, topic: str) -> Losses:
         return Losses(lambda: int(self._node.count_publishers(self._node.resolve_topic_name(topic))))
@@ -140,6 +153,10 @@ class Intake:
 
     def faults(self) -> list[str]:
         """Return what to warn of; the log is told as well, now and then."""
+        clocks = [*self._odometry_clock.faults(), *self._sensor_clocks.faults(self._associator.odometry_stamp)]
+        return [*self._loss_faults(), *clocks]
+
+    def _loss_faults(self) -> list[str]:
         now = time.monotonic()
         recent = max(losses.recent for losses in (*self.range_losses, self._odometry_losses))
         if now > recent + LASTING:
@@ -228,7 +245,7 @@ class Intake:
         for losses in (*self.range_losses, self._odometry_losses):
             losses.clear()
         self._told_of = 0
-        self.heard.clear()
+        self._forget_senders()
 
     @property
     def busy(self) -> bool:
@@ -258,13 +275,12 @@ class Intake:
         elif paused:
             self._associator.reject(message, 'paused')
         else:
+            self._sensor_clocks.note(message.frame_id, message.stamp, self._associator.odometry_stamp)
             self._associator.add_range(message, sent)
 
     def _add_odometry(self, message: OdometryMessage, sent: int) -> None:
-        jumps = self._associator.time_jumps
         self._associator.add_odometry(message, sent)
-        if self._associator.time_jumps != jumps:
-            self._node.get_logger().warning('the clock jumped back: readings that waited were dropped, the map is kept')
+        self._odometry_clock.look()
 
     def _wake(self) -> None:
         if self._ready and self.busy:

@@ -6,6 +6,8 @@ import traceback
 from collections.abc import Callable
 from typing import Any
 
+from rosgraph_msgs.msg import Clock
+
 from ..core.common.errors import MapperError
 from .complaints import of_ros
 
@@ -24,7 +26,8 @@ class ManagedNode(Base):
     """Turns transitions into four methods, and destroys after the last what was created since the first.
 
     A subclass has `configure`, `activate`, `deactivate` and `close`. What they raise refuses the transition, and is
-    logged; the node is then unconfigured.
+    logged; the node is then as it was before. What a `configure` that failed has created is destroyed here, what an
+    `activate` that failed has created it destroys itself.
     """
 
     def __init__(self, name: str, **options: Any) -> None:
@@ -162,7 +165,9 @@ class ManagedNode(Base):
 
     def create_subscription(self, *arguments: Any, **options: Any) -> Any:
         """Create a subscription, as `Node` does."""
-        return self._noted(super().create_subscription(*arguments, **options), self.destroy_subscription)
+        made = super().create_subscription(*arguments, **options)
+        # rclpy's own, made when use_sim_time is set: without it the clock would stand still for good
+        return made if made.msg_type is Clock else self._noted(made, self.destroy_subscription)
 
     def create_service(self, *arguments: Any, **options: Any) -> Any:
         """Create a service, as `Node` does."""

@@ -33,6 +33,7 @@ class MapPublishers:
         How often maps were forgotten; maps of an earlier one are not published any more.
     latest : dict of name → nav_msgs/OccupancyGrid
         What was published last.
+    services : list of DeferredService
     """
 
     def __init__(
@@ -76,8 +77,7 @@ class MapPublishers:
         self._ml_map = self._nothing
         nothing = Grid(resolution, 0, 0, 0, 0)
         self.latest = {name: self._message(nothing, np.zeros(nothing.shape, np.int8)) for name in MAPS}
-        for name in MAPS:
-            DeferredService(node, GetMap, f'~/get_{name}', partial(self._get, name))
+        self.services = [DeferredService(node, GetMap, f'~/get_{name}', partial(self._get, name)) for name in MAPS]
 
     def publish(self, name: str, generation: int, grid: Grid, values: NDArray[Any]) -> None:
         """Have a map of a generation published, instead of one of the same name that still waits for it; any thread.

@@ -72,11 +72,11 @@ class MapperNode(ManagedNode):
             If a parameter given at start is not admitted.
         """
         super().__init__(NAME, automatically_declare_parameters_from_overrides=True, **options)
-        self.parameters, self._given_extrinsics, warnings = ros_parameters.declare(self)
+        self.parameters, _, warnings = ros_parameters.declare(self)
         for warning in warnings:
             self.get_logger().warning(warning)
         self.add_pre_set_parameters_callback(ros_parameters.with_points)
-        self.add_on_set_parameters_callback(ros_parameters.validator(lambda: self.parameters, self._accept))
+        self.add_on_set_parameters_callback(self._validator())
         self.failure = ''
         self.when_failed: Callable[[], object] = lambda: None
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
@@ -89,6 +89,7 @@ class MapperNode(ManagedNode):
         self._lacks = {'journal', 'kernels'}
         self._fed = {'live': 0, 'online': 0}
         self.workers: list[Worker] = []
+        self._calls: list[DeferredService] = []
 
     def configure(self) -> None:
         """Create topics and services, read the journal, and compile; messages are taken once it is active.
@@ -112,7 +113,7 @@ class MapperNode(ManagedNode):
         if odometry in ranges:
             raise MapperError(f'{odometry} cannot be a topic of Range and of odometry: set range_topics or odom_topic')
         transforms = Transforms.of(self)
-        extrinsics = Extrinsics(self._given_extrinsics, transforms)
+        extrinsics = Extrinsics(ros_parameters.mounts(self), transforms)
         # with refine_poses it is this node that gives the transform
         looked_up = '' if node.refine_poses else node.map_frame
         self._map_frame = MapFrame(looked_up, transforms, self.parameters.association.pose_timeout)
@@ -140,6 +141,7 @@ class MapperNode(ManagedNode):
         self.workers += [part.worker for part in (self.saver, self.online, trajectory.following, kernels) if part]
         health = Health()
         self.intake = Intake(self, self.parameters, self.associator, self._map_frame, health.taken)
+        trajectory.listening = lambda: self.intake.listening
         self.reporter = Reporter(
             self,
             health,
@@ -159,8 +161,8 @@ class MapperNode(ManagedNode):
             ('~/save_maps', self.saver.save_maps),
             ('~/reset', self.reset),
         ):
-            DeferredService(self, Trigger, name, partial(self._when, handler))
-        DeferredService(self, SetBool, '~/pause', self.pause)
+            self._calls.append(DeferredService(self, Trigger, name, partial(self._when, handler)))
+        self._calls += [DeferredService(self, SetBool, '~/pause', self.pause), *self.maps.services]
         self.create_timer(1.0, self.reporter.report, clock=self._steady)
         self._live_timer = self.create_timer(1.0 / node.publish_rate, self.publish_live, clock=self._steady)
         self._started = True
@@ -206,6 +208,10 @@ class MapperNode(ManagedNode):
         # kernels are compiled to the end, whoever needs them next
         for worker in self.workers[:-1]:
             worker.close(0.5)
+        # what they wait for does not come any more
+        for service in self._calls:
+            service.end('the node is being cleaned up')
+        self._calls.clear()
 
     def _undo(self) -> None:
         super()._undo()
@@ -235,7 +241,8 @@ class MapperNode(ManagedNode):
             self._map()
         self._lacks.discard(what)
         if not self._lacks:
-            self.get_logger().info('ready: the live map follows the readings')
+            then = '' if self.intake.listening else '; activate the node to have them received'
+            self.get_logger().info(f'ready: the live map follows the readings{then}')
 
     def _map(self) -> None:
         """Answer those who waited, once what was held back is taken."""
@@ -263,6 +270,9 @@ class MapperNode(ManagedNode):
         self._aside.put(work, lambda why: self.inbox.put(lambda: done(None)))
 
     # parameters
+
+    def _validator(self) -> Callable[[Any], Any]:
+        return ros_parameters.validator(lambda: self.parameters, self._accept, lambda: self._started)
 
     def _accept(self, parameters: Parameters) -> None:
         refine = self.parameters.node.refine_poses, parameters.node.refine_poses

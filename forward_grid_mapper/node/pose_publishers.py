@@ -1,12 +1,14 @@
 """The robot's pose on the map for others: the transform from the map to odometry, and the path.
 
-As SLAM nodes do it: the transform goes out again and again, stamped a little later than the odometry that it is good
-for, so that whoever asks for the pose of now need not wait for the next one.
+The transform is stamped a little later than the odometry that it is good for, as that of SLAM nodes is, so that whoever
+asks for the pose of now need not wait for the next one. While odometry is silent it is repeated, so that whoever starts
+then has the map's frame as well; a transform for a later time would say what nobody knows.
 """
 
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Callable
 from typing import Any
 
@@ -16,11 +18,15 @@ from nav_msgs.msg import Path
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from ..core.messages.message_types import NANOSECONDS, Pose2
+from ..core.messages.stamp_order import JUMP
 from ..core.trajectory.poses import Floats
 from ..core.trajectory.windows import Odometry
 
 PERIOD = 0.05
 """Seconds between two transforms."""
+
+REPEAT = 1.0
+"""Seconds after which a transform is sent again where nothing is new."""
 
 TOLERANCE = NANOSECONDS // 5
 """Nanoseconds that a transform's stamp is later than odometry's."""
@@ -63,14 +69,17 @@ class PosePublishers:
         self._pose = None if self._send else node.create_publisher(PoseWithCovarianceStamped, '~/pose', 10)
         self._path = node.create_publisher(Path, '~/path', LATCHED)
         self._sent: tuple[int, tuple[float, ...]] = (-1, ())
+        self._due = 0.0
 
     @property
     def by_tf(self) -> bool:
         """Whether the transform goes to TF."""
         return self._send is not None
 
-    def send(self, frames: tuple[str, str, str], correction: Floats, newest: tuple[int, Pose2]) -> None:
-        """Send the transform, or the pose, if odometry or the correction is new.
+    def send(
+        self, frames: tuple[str, str, str], correction: Floats, newest: tuple[int, Pose2], repeat: bool = True
+    ) -> None:
+        """Send the transform, or the pose, if odometry or the correction is new, or as a repetition.
 
         Parameters
         ----------
@@ -80,16 +89,20 @@ class PosePublishers:
             The pose of odometry's frame in the map frame.
         newest : (int, Pose2)
             The last pose of odometry.
+        repeat : bool
+            Whether it is sent again after `REPEAT` seconds.
         """
         stamp, pose = newest
         x, y, yaw = correction.tolist()
         sent_stamp, sent = self._sent
-        if stamp <= sent_stamp:
-            if sent == (x, y, yaw):
+        now = time.monotonic()
+        # a stamp that is far behind what was sent is right, and the one that was sent was wrong
+        if sent_stamp - JUMP <= stamp <= sent_stamp:
+            if sent == (x, y, yaw) and not (repeat and now >= self._due):
                 return
-            # TF takes no second transform of the same stamp, and odometry may have ended
+            # TF warns of a second transform of the same stamp, and odometry may have ended
             stamp = sent_stamp + 1
-        self._sent = stamp, (x, y, yaw)
+        self._sent, self._due = (stamp, (x, y, yaw)), now + REPEAT
         map_frame, odom_frame, _ = (frame.lstrip('/') for frame in frames)
         if self._send is not None:
             transform = TransformStamped(child_frame_id=odom_frame)

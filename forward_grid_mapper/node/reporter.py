@@ -97,10 +97,10 @@ class Reporter:
         found = {frame: seconds for frame, seconds in self._intake.heard.silent().items() if frame in counts}
         log = self._node.get_logger()
         if new := found.keys() - self._quiet:
-            log.warning(f'sensors that send nothing any more, while others do: {diagnostics.listed(new)}')
+            log.warning(f'these sensors have stopped sending: {diagnostics.listed(new)}')
         # a reset forgets who was silent, too
         if back := [frame for frame in self._quiet - found.keys() if frame in self._intake.heard]:
-            log.info(f'sensors that send again: {diagnostics.listed(back)}')
+            log.info(f'these sensors send again: {diagnostics.listed(back)}')
         self._quiet = set(found)
         return found
 
@@ -109,7 +109,7 @@ class Reporter:
         fault = self._map_frame.fault()
         if fault and not self._no_map_frame:
             self._no_map_frame = True
-            self._node.get_logger().warning(f'no reading gets a pose: {fault}')
+            self._node.get_logger().warning(f'readings are not mapped: {fault}')
         elif self._no_map_frame and self._map_frame.found:
             self._no_map_frame = False
             self._node.get_logger().info('the transform to map_frame is there')

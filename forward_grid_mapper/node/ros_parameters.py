@@ -20,15 +20,24 @@ from ..core.messages.mounts import mount_from
 
 ROS_OWN = ('use_sim_time', 'start_type_description_service', 'qos_overrides')
 NAMES = {row.name for row in TABLE}
+CONFIGURED = {row.name for row in TABLE if row.read_only}
+"""Parameters that `configure` reads, as it does the poses of sensors."""
+
+AT_START = ('autostart',)
+"""Of these, what only the start of the process asks for."""
 
 
 def descriptor(row: Parameter) -> ParameterDescriptor:
     """Return the ROS descriptor of a row of the table."""
+    constraints = [
+        '' if row.type in (int, float) else row.range,
+        'read when the node is configured' if row.read_only else '',
+    ]
     made = ParameterDescriptor(
         name=row.name,
         description=f'{row.help} [{row.unit}]' if row.unit else row.help,
-        additional_constraints='' if row.type in (int, float) else row.range,
-        read_only=row.read_only,
+        additional_constraints='; '.join(filter(None, constraints)),
+        read_only=row.name in AT_START,
     )
     if row.type is float and math.isfinite(row.low) and math.isfinite(row.high):
         made.floating_point_range = [FloatingPointRange(from_value=row.low, to_value=row.high)]
@@ -64,7 +73,22 @@ def declare(node: Node) -> tuple[Parameters, dict[str, Pose2], list[str]]:
     return Parameters.from_flat(values), _extrinsics(given), _strangers(given)
 
 
-def validator(current: Callable[[], Parameters], accept: Callable[[Parameters], None]) -> Callable[[Any], Any]:
+def mounts(node: Node) -> dict[str, Pose2]:
+    """Return the poses of sensors that parameters give.
+
+    Raises
+    ------
+    ParameterError
+        If a value is no pose.
+    """
+    return _extrinsics(node.get_parameters_by_prefix(''))
+
+
+def validator(
+    current: Callable[[], Parameters],
+    accept: Callable[[Parameters], None],
+    configured: Callable[[], bool] = lambda: True,
+) -> Callable[[Any], Any]:
     """Return a callback that checks parameters before they are set.
 
     Parameters
@@ -73,13 +97,19 @@ def validator(current: Callable[[], Parameters], accept: Callable[[Parameters], 
         Returns the parameters in force.
     accept : callable
         Takes the new ones when all are admitted.
+    configured : callable
+        Returns whether the node has read those that it reads when it is configured.
     """
 
     def check(changes: list[RosParameter]) -> SetParametersResult:
         try:
             for change in changes:
-                if change.name.startswith('sensors.'):
-                    raise ParameterError(f'{change.name} is read at start only; restart the node with it')
+                if configured() and (change.name in CONFIGURED or change.name.startswith('sensors.')):
+                    raise ParameterError(
+                        f'{change.name} is read-only while the node is configured: restart the node with it, or set it '
+                        'between cleanup and configure'
+                    )
+            _extrinsics({change.name: change for change in changes})
             known = {change.name: change.value for change in changes if change.name in NAMES}
             accept(Parameters.from_flat(known, base=current()))
         except ParameterError as error:

@@ -101,4 +101,8 @@ class Surroundings:
         own = self._node.get_name(), self._node.get_namespace()
         count = sum(pair == own for pair in self._node.get_node_names_and_namespaces())
         name = self._node.get_fully_qualified_name()
-        return [f'{count} nodes are called {name}: their maps and services mix; remap __node or __ns'] * (count > 1)
+        text = (
+            f'{count} nodes are called {name}: their maps and services mix; start each with a name of its own, '
+            '--ros-args -r __node:=NAME'
+        )
+        return [text] * (count > 1)

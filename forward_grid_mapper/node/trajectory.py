@@ -7,6 +7,7 @@ correction, applied wherever they go to a map; without one they go there as they
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -35,6 +36,9 @@ MAP = 'map'
 """Name of the map frame where `map_frame` gives none (REP 105)."""
 
 
+LASTING = 1.0
+"""Seconds after which a stamp of odometry that is far ahead of the one before counts, though none has followed it."""
+
 GROWS = 0.5
 """Metres of driving after which the path is published again."""
 
@@ -60,7 +64,7 @@ class _Jump(NamedTuple):
     def __str__(self) -> str:
         return (
             f'odometry jumped by {self.far:.1f} m: where the robot is on the map is not known until run_em has found '
-            f'it, and what it reads goes to a wrong place; where it was carried away (kidnapped), call reset'
+            f'it, and new readings are placed wrongly; where it was carried away (kidnapped), call reset'
         )
 
 
@@ -82,6 +86,8 @@ class Trajectory:
         readings in it.
     refine : callable
         Called when the drive has grown by `refine_every`; returns whether a run was begun.
+    listening : callable
+        Returns whether the node is active: one that is not leaves the transform to others, such as AMCL.
     following : Following or None
         Goes on with what was found while the robot drives; None where this is not wanted.
     driven : float
@@ -99,9 +105,11 @@ class Trajectory:
         self.found: Found | None = None
         self.changed: Callable[[LogOddsMap | None, int], object] = lambda live, count: None
         self.refine: Callable[[], bool] = lambda: False
+        self.listening: Callable[[], bool] = lambda: True
         self.following: Following | None = None
         self.driven = self._refined_at = self._shown_at = 0.0
         self._at: tuple[int, Pose2] | None = None
+        self._ahead: tuple[int, float] | None = None
         self._jump: _Jump | None = None
         self._since = -1
         self._showing = False
@@ -243,9 +251,17 @@ class Trajectory:
             self._jumps, self._since = associator.time_jumps, -1
             self._at = self._jump = None
             self._out.forget()
+        if associator.odometry_ahead and not self._lasts(newest[0]):
+            return
         frames = self.frame, associator.map_frame, associator.base_frame
-        self._out.send(frames, self._correction_at(newest[0]), newest)
+        self._out.send(frames, self._correction_at(newest[0]), newest, self.listening())
         self._drive_on(*newest)
+
+    def _lasts(self, stamp: int) -> bool:
+        """Return whether a stamp has been the newest for a while: TF never forgets one that was wrong and far ahead."""
+        if self._ahead is None or self._ahead[0] != stamp:
+            self._ahead = stamp, time.monotonic()
+        return time.monotonic() - self._ahead[1] > LASTING
 
     def _correction_at(self, stamp: int) -> NDArray[np.float64]:
         """Return the pose of odometry's frame on the map, shape (3,), as readings of a stamp are moved."""

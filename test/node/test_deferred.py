@@ -110,3 +110,20 @@ def test_a_handler_that_fails_keeps_nobody_waiting() -> None:
     node.call('three')
     assert [response.message for response, _ in node.sent] == ['done']
     assert 'there is not enough memory' in node.logged[0]
+
+
+def test_who_still_waits_is_told_when_the_service_ends() -> None:
+    node, replies = Serving(), list[Reply]()
+    service = DeferredService(node, Trigger, 'later', replies.append)
+    for header in ('first', 'second'):
+        node.call(header)
+    replies[0].send(True, 'done')
+    service.end('it ends')
+    assert [(r.success, r.message, header) for r, header in node.sent] == [
+        (True, 'done', 'first'),
+        (False, 'it ends', 'second'),
+    ]
+    # an answer that comes too late goes nowhere
+    replies[1].send(True, 'done')
+    service.end('it ends')
+    assert len(node.sent) == 2 and not service.open

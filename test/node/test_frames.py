@@ -353,6 +353,22 @@ def test_what_waits_is_dropped_by_a_jump_and_by_no_less(transforms: Transforms, 
         assert frame.dropped == dropped
 
 
+def test_one_stamp_from_the_future_keeps_the_transforms_and_nobody_waiting(
+    buffer: Buffer, transforms: Transforms
+) -> None:
+    buffer.known['map', 'odom'] = transform(1.0, 0.0)
+    frame = MapFrame('map', transforms, 1.0)
+    taken: list[int] = []
+    for stamp in (1, 2, 3600, 3, 4):
+        # TF has no transform of times to come
+        buffer.until = 10 * NANOSECONDS
+        made = frame.convert(OdometryMessage(stamp * NANOSECONDS, 'odom', 'base', Pose2(0, 0, 0)))
+        taken += [each.stamp // NANOSECONDS for each in made]
+    assert taken == [1, 2, 3, 4]
+    assert frame.dropped == 1 and frame.found
+    assert buffer.known, 'nothing was forgotten'
+
+
 @pytest.mark.parametrize('name', ['earth', 'zone', '/zone'])
 def test_odometry_of_any_other_frame_is_converted(buffer: Buffer, transforms: Transforms, name: str) -> None:
     buffer.known[name.lstrip('/'), 'odom'] = transform(1.0, 2.0)

@@ -123,8 +123,8 @@ def test_diagnostics_name_the_silent_sensor(inside: Callable[..., Inside], monke
     robot.call(robot.node.reset)
     drive(200, 'other')
     assert robot.status('sensors')['level'] == OK
-    assert [line for line in told if 'sensors that' in line] == [
-        'sensors that send nothing any more, while others do: other',
-        'sensors that send again: other',
-        'sensors that send nothing any more, while others do: sonar',
+    assert [line for line in told if 'these sensors' in line] == [
+        'these sensors have stopped sending: other',
+        'these sensors send again: other',
+        'these sensors have stopped sending: sonar',
     ]

@@ -285,3 +285,23 @@ def test_odometry_that_waited_for_the_map_frame_is_no_clock_that_jumped() -> Non
     assert robot.associator.rejected.total() <= 26
     assert len(robot.associator.buffer) >= 34
     assert robot.associator.readings.x.min() > 5.0
+
+
+def test_a_subscription_that_fails_leaves_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Or else the readings of the others came twice when it is tried again."""
+    robot = Taking()
+    create, failing = robot.node.create_subscription, ['/odom', 'odom']
+
+    def broken(kind: Any, topic: str, *arguments: Any, **options: Any) -> str:
+        if topic in failing:
+            raise RuntimeError('no more memory')
+        return create(kind, topic, *arguments, **options)
+
+    monkeypatch.setattr(robot.node, 'create_subscription', broken)
+    with pytest.raises(RuntimeError, match='no more memory'):
+        robot.intake.subscribe()
+    assert robot.node.subscribed == {} and robot.intake.subscriptions == {}
+    assert not robot.intake.listening
+    failing.clear()
+    robot.intake.subscribe()
+    assert len(robot.node.subscribed) == 2 and robot.intake.listening

@@ -8,7 +8,7 @@ import subprocess
 import sys
 import threading
 import weakref
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -18,16 +18,24 @@ import pytest
 pytest.importorskip('rclpy', reason='the tests of the node need rclpy')
 pytest.importorskip('lifecycle_msgs', reason='the tests of the lifecycle need lifecycle_msgs')
 
+import rclpy
 import yaml
+from builtin_interfaces.msg import Time
 from fault_samples import circle
 from inside import Inside
 from lifecycle_msgs.msg import State, Transition
 from lifecycle_msgs.srv import ChangeState, GetState
+from nav_msgs.msg import Odometry
 from rclpy.lifecycle.node import TransitionCallbackReturn
+from rclpy.parameter import Parameter
 from robot import LATCHED, MAPS, Robot, environment
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import Range
+from std_srvs.srv import Trigger
 from test_mapper_node import RELIABLE
 
 from forward_grid_mapper.core.common.parameters import find
+from forward_grid_mapper.node.intake import Intake
 from forward_grid_mapper.node.kernels import Kernels
 
 OPTIONS = (*RELIABLE, '-p', 'sensors.sonar.pose:=[0.0, 0.0, 0.0]')
@@ -104,6 +112,7 @@ def test_a_manager_starts_pauses_and_ends_it(start: Any, robot: Robot, manager: 
     robot.until(lambda: robot.diagnostics.get('readings', {}).get('message') == 'inactive: nothing is received')
     assert robot.range_out.get_subscription_count() == 0
     node.wait_for('kernels of the EM are ready')
+    node.wait_for('ready: the live map follows the readings; activate the node to have them received')
     assert 'no Range message has come on /sonar' in robot.call('run_em').message
     assert manager.change(Transition.TRANSITION_ACTIVATE)
     robot.meet()
@@ -246,6 +255,109 @@ def test_a_clean_up_leaves_neither_readings_nor_threads(inside: Callable[..., In
         gc.collect()
         assert [part() for part in parts] == [None] * len(parts)
         robot.until(lambda: {*threading.enumerate()} <= others)
+
+
+@pytest.fixture
+def peer(inside: Callable[..., Inside]) -> Iterator[Callable[[Inside], Any]]:
+    """Make another node beside one, whose executor the test turns."""
+    made = []
+
+    def beside(robot: Inside) -> Any:
+        made.append(rclpy.create_node('peer', context=robot.context))
+        robot.executor.add_node(made[-1])
+        return made[-1]
+
+    yield beside
+    for node in made:
+        node.destroy_node()
+
+
+def test_simulated_time_that_was_set_while_it_ran_goes_on_after_a_clean_up(
+    inside: Callable[..., Inside], peer: Callable[[Inside], Any]
+) -> None:
+    robot = inside()
+    robot.node.start()
+    out = peer(robot).create_publisher(Clock, '/clock', 10)
+
+    def comes(seconds: int) -> bool:
+        out.publish(Clock(clock=Time(sec=seconds)))
+        return bool(robot.node.get_clock().now().nanoseconds == seconds * 10**9)
+
+    robot.set(use_sim_time=True)
+    robot.until(lambda: comes(100), 20.0)
+    node = robot.node
+    for turn in (node.trigger_deactivate, node.trigger_cleanup, node.trigger_configure, node.trigger_activate):
+        assert turn() == TransitionCallbackReturn.SUCCESS
+    robot.until(lambda: comes(200), 20.0)
+
+
+def test_what_configure_reads_is_set_between_cleanup_and_configure(inside: Callable[..., Inside]) -> None:
+    robot = inside()
+    node = robot.node
+    node.start()
+    changes = {'resolution': 0.2, 'range_topics': ['left', 'right'], 'sensors.sonar.pose': [0.5, 0.0, 0.0]}
+    for name, value in changes.items():
+        (result,) = node.set_parameters([Parameter(name, value=value)])
+        assert not result.successful and f'{name} is read-only while the node is configured' in result.reason
+    assert node.trigger_deactivate() == node.trigger_cleanup() == TransitionCallbackReturn.SUCCESS
+    robot.set(**changes)
+    (result,) = node.set_parameters([Parameter('sensors.sonar.pose', value=[0.5, 0.0])])
+    assert not result.successful, 'that is no pose'
+    assert node.trigger_configure() == node.trigger_activate() == TransitionCallbackReturn.SUCCESS
+    assert sorted(topic for topic in node.intake.subscriptions if topic != '/odom') == ['/left', '/right']
+    robot.until(lambda: node.mapping)
+    robot.odometry(100.0)
+    robot.range(100.0)
+    assert node.associator.readings.x == pytest.approx([0.5])
+    assert node.live.grid.resolution == 0.2
+
+
+def test_who_waits_for_an_answer_has_one_when_the_node_is_cleaned_up(
+    inside: Callable[..., Inside], peer: Callable[[Inside], Any]
+) -> None:
+    robot = inside().start()
+    node = robot.node
+
+    def hold(stop: Callable[[], bool]) -> None:
+        while not stop():
+            threading.Event().wait(0.02)
+
+    node.em.worker._prepare = hold
+    other = peer(robot)
+    asked = []
+    for name in ('run_em', 'save_maps'):
+        client = other.create_client(Trigger, f'/forward_grid_mapper/{name}')
+        robot.until(client.service_is_ready, 20.0)
+        asked.append(client.call_async(Trigger.Request()))
+    robot.until(lambda: node.em.current and len(node.em.current.waiting) == 3, 20.0)
+    assert node.trigger_deactivate() == node.trigger_cleanup() == TransitionCallbackReturn.SUCCESS
+    robot.until(lambda: all(call.done() for call in asked), 20.0)
+    for call in asked:
+        assert (call.result().success, call.result().message) == (False, 'the node is being cleaned up')
+
+
+def test_an_activation_that_fails_has_nothing_taken_twice(
+    inside: Callable[..., Inside], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    robot = inside()
+    node = robot.node
+    node.start()
+    assert node.trigger_deactivate() == TransitionCallbackReturn.SUCCESS
+    subscribe, failing = Intake._subscribe, [Odometry]
+
+    def broken(intake: Any, kind: Any, *rest: Any) -> None:
+        if kind in failing:
+            raise RuntimeError('no more memory')
+        subscribe(intake, kind, *rest)
+
+    monkeypatch.setattr(Intake, '_subscribe', broken)
+    assert node.trigger_activate() == TransitionCallbackReturn.FAILURE
+    failing.clear()
+    assert node.trigger_activate() == TransitionCallbackReturn.SUCCESS
+    assert sorted(each.topic_name for each in node.subscriptions if each.msg_type in (Range, Odometry)) == [
+        '/odom',
+        '/sonar',
+    ]
 
 
 def test_a_topic_under_two_names_is_taken_once(inside: Callable[..., Inside]) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Callable
 from types import ModuleType
@@ -19,6 +20,8 @@ from sensor_msgs.msg import MultiDOFJointState
 
 from forward_grid_mapper.core.trajectory.poses import compose
 from forward_grid_mapper.core.trajectory.windows import Odometry
+from forward_grid_mapper.node import pose_publishers, trajectory
+from forward_grid_mapper.node.pose_publishers import REPEAT
 
 OK, WARN = b'\x00', b'\x01'
 
@@ -85,8 +88,9 @@ def seconds_of(transform: Any) -> float:
 
 
 def test_the_transform_from_map_to_odom_is_sent(
-    inside: Callable[..., Inside], quick: Any, tf2_ros: type[Broadcaster]
+    inside: Callable[..., Inside], quick: Any, tf2_ros: type[Broadcaster], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(pose_publishers, 'REPEAT', math.inf)
     robot = inside(refine_poses=True).start()
     robot.drive(0, 200)
     newest = 100.0 + 0.05 * 199
@@ -113,6 +117,65 @@ def test_the_transform_from_map_to_odom_is_sent(
     robot.call(robot.node.reset)
     robot.drive(210, 1)
     robot.until(lambda: numbers(tf2_ros.sent[-1]) == (0.0, 0.0, 0.0))
+
+
+def test_while_odometry_is_silent_the_transform_is_repeated(
+    inside: Callable[..., Inside], tf2_ros: type[Broadcaster], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """For those who start later; of another stamp, since TF warns of the same, and of no later time."""
+    now = 1000.0
+    monkeypatch.setattr(pose_publishers.time, 'monotonic', lambda: now)
+    robot = inside(refine_poses=True)
+    robot.node.start()
+    robot.until(lambda: robot.node.mapping)
+    robot.odometry(100.0)
+    tick, sent = robot.node.trajectory._tick, tf2_ros.sent
+    for k in range(4):
+        for _ in range(5):
+            tick()
+        assert len(sent) == 1 + k
+        now += REPEAT
+    stamps = [transform.header.stamp.sec * 10**9 + transform.header.stamp.nanosec for transform in sent]
+    assert stamps == [100_200_000_000 + k for k in range(4)]
+    assert all(numbers(transform) == (0.0, 0.0, 0.0) for transform in sent)
+    # an inactive node leaves the frame to others, but for what is new
+    robot.node.deactivate()
+    tick()
+    assert len(sent) == 4
+    robot.odometry(100.1)
+    tick()
+    assert seconds_of(sent[-1]) == pytest.approx(100.3) and len(sent) == 5
+
+
+def test_one_stamp_from_the_future_does_not_go_to_tf(
+    inside: Callable[..., Inside], tf2_ros: type[Broadcaster], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now = 1000.0
+    monkeypatch.setattr(trajectory.time, 'monotonic', lambda: now)
+    robot = inside(refine_poses=True)
+    robot.node.start()
+    robot.until(lambda: robot.node.mapping)
+    tick, sent = robot.node.trajectory._tick, tf2_ros.sent
+    path: list[Any] = []
+    monkeypatch.setattr(robot.node.trajectory._out, 'publish_path', lambda frame, made, stamp: path.append(made))
+    for k in range(100):
+        robot.odometry(100.0 + 0.1 * k + (1e8 if k == 50 else 0.0), 0.05 * k)
+        tick()
+    assert max(map(seconds_of, sent)) < 111.0
+    assert len(sent) == 99
+    assert robot.node.trajectory.driven == pytest.approx(4.95)
+    robot.until(lambda: path and len(path[-1].stamp) > 90)
+    assert path[-1].stamp[0] == 100 * 10**9 and len(path[-1].stamp) < 100
+    # where it lasts, it counts; and is taken back if it was wrong all the same
+    robot.odometry(1000.0, 5.0)
+    tick()
+    assert seconds_of(sent[-1]) < 111.0
+    now += trajectory.LASTING + 0.1
+    tick()
+    assert seconds_of(sent[-1]) == pytest.approx(1000.2)
+    robot.odometry(110.0, 5.0)
+    tick()
+    assert seconds_of(sent[-1]) == pytest.approx(110.2)
 
 
 def test_after_the_clock_jumped_back_the_transform_is_that_of_readings_of_its_stamp(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -14,6 +15,7 @@ from forward_grid_mapper.core.common.grid import Grid
 from forward_grid_mapper.node import diagnostics
 from forward_grid_mapper.node.diagnostics import Health
 from forward_grid_mapper.node.frames import Extrinsics, Transforms
+from forward_grid_mapper.node.heard import USUAL
 from forward_grid_mapper.node.reporter import Reporter
 
 OK, WARN = b'\x00', b'\x01'
@@ -21,9 +23,9 @@ OK, WARN = b'\x00', b'\x01'
 
 def judged(robot: Taking, health: Health) -> tuple[bytes, str]:
     """Level and message of the readings, once a second of the test has passed."""
-    robot.intake.subscribe()
+    if not robot.intake.listening:
+        robot.intake.subscribe()
     found = health.statuses('mapper', robot.intake, robot.associator, None, 'none yet', Grid(0.1, 0, 0, 1, 1), {})[0]
-    robot.intake.unsubscribe()
     return found.level, found.message
 
 
@@ -79,6 +81,104 @@ def test_a_stamp_of_odometry_that_stands_still_is_told_of(monkeypatch: pytest.Mo
         now += 1.0
         quiet.odometry(0.0)
         assert 'header.stamp' not in judged(quiet, health)[1]
+
+
+def seconds(robot: Taking, clock: Any, health: Health, count: int, every: int, frame: str) -> list[tuple[bytes, str]]:
+    """Verdicts of so many seconds, in which a sensor sends every few seconds; odometry comes all the time."""
+    found = []
+    for k in range(count):
+        clock.now += 1.0
+        stamp = robot.associator.odometry_stamp or 100 * 10**9
+        robot.odometry(stamp / 1e9 + 1.0)
+        if k % every == 0:
+            robot.range(stamp / 1e9 + 1.0, frame)
+        found.append(judged(robot, health))
+    return found
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> Any:
+    made = SimpleNamespace(now=50.0)
+    monkeypatch.setattr(diagnostics.time, 'monotonic', lambda: made.now)
+    return made
+
+
+def test_a_sensor_that_measures_rarely_has_one_verdict(clock: Any) -> None:
+    robot, health = Taking(), Health()
+    robot.intake.begin()
+    told = seconds(robot, clock, health, 20, 3, '')
+    assert {level for level, _ in told} == {WARN}
+    assert 'readings were rejected in the last 10 s, most of them as empty_frame_id' in told[-1][1]
+    # good ones show within some seconds
+    told = seconds(robot, clock, health, 24, 3, 'sonar')
+    assert told[-1] == (OK, 'mapping')
+    # a good sensor that sends fast does not hide the frame that nobody knows
+    robot.associator.rejected['unknown_extrinsics'] += 1
+    robot.associator.unknown_frames.add('ghost')
+    told = seconds(robot, clock, health, 5, 1, 'sonar')
+    assert {text for _, text in told} == {'no pose on the robot for ghost'}
+
+
+def test_a_sensor_that_sends_every_five_seconds_is_not_silent_in_between(clock: Any) -> None:
+    robot, health = Taking(), Health()
+    robot.intake.begin()
+    seconds(robot, clock, health, 10, 5, 'sonar')
+    told = seconds(robot, clock, health, 20, 5, 'sonar')
+    assert set(told) == {(OK, 'mapping')}
+    told = seconds(robot, clock, health, int(5 * USUAL) + 5, 1000, 'sonar')
+    assert told[-1][0] == WARN and told[-1][1].startswith('no Range for ')
+
+
+def test_where_nothing_was_accepted_it_does_not_say_mapping(clock: Any) -> None:
+    robot, health = Taking(), Health()
+    robot.intake.begin()
+    seconds(robot, clock, health, 5, 1, '')
+    robot.intake.paused = True
+    seconds(robot, clock, health, 12, 1, 'sonar')
+    robot.intake.paused = False
+    robot.odometry(200.0)
+    assert 'were rejected' in judged(robot, health)[1]
+    # messages come, and wait for odometry
+    for _ in range(2):
+        robot.range(300.0)
+        level, text = judged(robot, health)
+    assert level == WARN
+    assert text.startswith('no reading has been accepted so far: 5 were rejected, most of them as empty_frame_id')
+
+
+def test_while_readings_wait_it_does_not_say_mapping_either(clock: Any) -> None:
+    robot, health = Taking(), Health()
+    robot.intake.begin()
+    robot.odometry(100.0)
+    robot.range(100.5)
+    assert judged(robot, health) == (OK, 'no reading has been accepted so far: they wait for their poses')
+    robot.odometry(101.0)
+    assert judged(robot, health) == (OK, 'mapping')
+
+
+def test_more_rejected_than_came(clock: Any) -> None:
+    """Readings that came before, and waited."""
+    robot, health = Taking(), Health()
+    robot.intake.begin()
+    robot.odometry(100.0)
+    for k in range(20):
+        robot.range(101.0 + 0.01 * k)
+    judged(robot, health)
+    for k in range(12):
+        robot.range(102.0 + 0.01 * k)
+    robot.odometry(104.0)
+    clock.now += 1.0
+    assert '32 of 32 readings were rejected in the last second' in judged(robot, health)[1]
+
+
+def test_what_was_rejected_during_a_pause_is_no_fault_after_it(clock: Any) -> None:
+    robot, health = Taking(), Health()
+    robot.intake.begin()
+    seconds(robot, clock, health, 5, 1, 'sonar')
+    robot.intake.paused = True
+    assert {text for _, text in seconds(robot, clock, health, 5, 1, 'sonar')} == {'paused'}
+    robot.intake.paused = False
+    assert seconds(robot, clock, health, 3, 1, 'sonar') == [(OK, 'mapping')] * 3
 
 
 def reporter_of(robot: Taking) -> Any:

@@ -62,7 +62,11 @@ def test_descriptors_have_words_and_bounds() -> None:
     )
     assert not hit.integer_range and hit.additional_constraints == '' and not hit.read_only
     resolution = descriptor(ROWS['resolution'])
-    assert resolution.read_only and resolution.description == f'{ROWS["resolution"].help} [m]'
+    assert resolution.description == f'{ROWS["resolution"].help} [m]'
+    assert not resolution.read_only and resolution.additional_constraints == 'read when the node is configured'
+    reliability = descriptor(ROWS['odom_reliability']).additional_constraints
+    assert 'best_effort' in reliability and reliability.endswith('; read when the node is configured')
+    assert descriptor(ROWS['autostart']).read_only
     rounds = descriptor(ROWS['max_iterations'])
     assert (rounds.integer_range[0].from_value, rounds.integer_range[0].step) == (1, 1)
     assert rounds.integer_range[0].to_value == ROWS['max_iterations'].high and not rounds.floating_point_range
@@ -128,17 +132,35 @@ def test_what_is_set_at_run_time_is_checked_as_a_whole() -> None:
     assert result.successful and accepted == [Parameters.from_flat({'p_hit': 0.7})]
     for changes, why in (
         ([('p_hit', 0.5), ('p_rand', 7.0)], 'p_rand'),
-        ([('sigma', 0.1), ('sensors.front.pose', [0.0, 0.0, 0.0])], 'sensors.front.pose is read at start only'),
+        (
+            [('sigma', 0.1), ('sensors.front.pose', [0.0, 0.0, 0.0])],
+            'sensors.front.pose is read-only while the node is configured',
+        ),
     ):
         result = check([RosParameter(name, value=value) for name, value in changes])
         assert not result.successful and why in result.reason
     assert len(accepted) == 1
+    for name, value in (('resolution', 0.05), ('range_topics', ['a', 'b'])):
+        result = check([RosParameter(name, value=value)])
+        assert not result.successful and f'{name} is read-only while the node is configured' in result.reason
 
     def refuse(parameters: Parameters) -> None:
         raise ParameterError('not now')
 
     result = validator(lambda: now, refuse)([RosParameter('p_hit', value=0.7)])
     assert (result.successful, result.reason) == (False, 'not now')
+
+
+def test_what_configure_reads_can_be_set_before_it() -> None:
+    accepted: list[Parameters] = []
+    check = validator(Parameters, accepted.append, lambda: False)
+    changes = {'resolution': 0.05, 'range_topics': ['a', 'b'], 'sensors.front.pose': [0.1, 0.0, 0.0]}
+    assert check([RosParameter(name, value=value) for name, value in changes.items()]).successful
+    assert accepted == [Parameters.from_flat({'resolution': 0.05, 'range_topics': ('a', 'b')})]
+    for name, value in (('resolution', 0.0), ('sensors.front.pose', [0.1, 0.0])):
+        result = check([RosParameter(name, value=value)])
+        assert not result.successful and name in result.reason
+    assert len(accepted) == 1
 
 
 def test_a_whole_number_is_taken_for_a_double_where_one_is_wanted() -> None:

@@ -31,3 +31,4 @@ def test_a_publisher_that_does_not_fit_and_a_namesake(start: Any, robot: Robot) 
     other = start(*options)
     node.wait_for('2 nodes are called /forward_grid_mapper', 20.0)
     other.wait_for('2 nodes are called /forward_grid_mapper', 20.0)
+    assert 'start each with a name of its own, --ros-args -r __node:=NAME' in other.output

@@ -257,7 +257,7 @@ def test_the_log_tells_once_of_a_map_frame_without_its_transform_and_of_its_end(
     robot.until(lambda: (drive(), frame.fault())[1])
     for _ in range(3):
         robot.status('readings')
-    assert told.count('no reading gets a pose: TF has no transform from map (map_frame) to odom') == 1
+    assert told.count('readings are not mapped: TF has no transform from map (map_frame) to odom') == 1
     # the robot stands still for a while: that is no transform
     robot.until(lambda: not frame.fault())
     robot.status('readings')

@@ -56,7 +56,7 @@ class Constant:
 class Parameter:
     """One row of the table; `low` and `high` are infinite where there is no bound.
 
-    `type` is float, int, bool, str or tuple (of str); `read_only` rows cannot change while the node runs.
+    `type` is float, int, bool, str or tuple (of str); `read_only` rows cannot change while the node is configured.
     """
 
     name: str

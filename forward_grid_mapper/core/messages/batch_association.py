@@ -21,9 +21,10 @@ from .extrinsics import ExtrinsicsLookup, Later, Mount, project_all
 from .map_extent import possible
 from .message_batch import Ints, MessageBatch, Odometry
 from .message_types import Pose2, RangeMessage
-from .pose_association import JUMP, MOST_FRAMES, PoseAssociator
+from .pose_association import MOST_FRAMES, PoseAssociator
 from .pose_history import Poses
 from .rep117 import LONGEST_NAME, Measurement, Measurements, measure_all
+from .stamp_order import JUMP
 
 NEVER = np.iinfo(np.int64).max
 """The place of a message that does not come."""

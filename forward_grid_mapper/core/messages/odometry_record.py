@@ -95,6 +95,15 @@ class OdometryRecord:
         if self._most and self._size > self._most:
             self._thin()
 
+    def drop(self, stamp: int) -> None:
+        """Forget the pose of the last stamp; snapshots keep it."""
+        self._late.pop(stamp, None)
+        if self._size and self._stamp[self._size - 1] == stamp:
+            self._size -= 1
+            self._stamp, self._pose = self._stamp[: self._size].copy(), self._pose[: self._size].copy()
+        if self._before == stamp:
+            self._before = int(self._stamp[self._size - 1]) if self._size else np.iinfo(np.int64).min
+
     def extend(self, stamps: Sequence[int], poses: Sequence[Pose2]) -> None:
         """Add many poses, whose stamps increase; without a bound, and later than all before, in no time."""
         size, end = self._size, self._size + len(stamps)

@@ -25,9 +25,7 @@ from .pose_history import PoseHistory
 from .reading_buffer import ReadingBuffer
 from .rep117 import LONGEST_NAME, Measurement, measure
 from .robot_path import RobotPath
-
-JUMP = NANOSECONDS
-"""Odometry older than the newest by more than this means that the clock jumped back, not that messages overtook."""
+from .stamp_order import JUMP, JUMPED_BACK, WAS_AHEAD, order_of
 
 RETRY = NANOSECONDS // 20
 """How often, in message time or by the clock, a pose that may still become known is asked for again."""
@@ -134,6 +132,12 @@ class PoseAssociator:
         return self._history.newest
 
     @property
+    def odometry_ahead(self) -> bool:
+        """Whether the newest stamp of odometry is far after the one before, and may turn out to be wrong."""
+        newest, before = self._history.newest, self._history.before
+        return newest is not None and before is not None and newest - before > JUMP
+
+    @property
     def path(self) -> list[tuple[float, float]]:
         """Where the robot drove, (x, y) in metres (`robot_path`)."""
         return self._path.points
@@ -219,9 +223,11 @@ class PoseAssociator:
             return
         self._other_frame = False
         self.extend_path(message.pose[:2])
-        newest = self._history.newest
-        if newest is not None and message.stamp < newest - JUMP:
-            self._jump_back(newest)
+        order = order_of(message.stamp, self._history.newest, self._history.before)
+        if order == WAS_AHEAD:
+            self._drop_ahead()
+        elif order == JUMPED_BACK:
+            self._jump_back()
         newest = self._history.newest
         self._history.add(message.stamp, message.pose)
         if self._history.newest != newest:
@@ -280,8 +286,16 @@ class PoseAssociator:
             self.unknown_frames.add(measured.frame_id)
         self._reject(measured.frame_id, reason)
 
-    def _jump_back(self, newest: int) -> None:
-        self._settle_up_to(newest)
+    def _drop_ahead(self) -> None:
+        """Forget the newest pose, whose stamp was ahead of those before and after it; what it settled stays settled."""
+        self._history.drop_newest()
+        self.odometry_rejected['ahead_of_others'] += 1
+        # time goes on by the stamps that are left
+        self._next_try = self._next_look = 0
+
+    def _jump_back(self) -> None:
+        assert self._history.newest is not None
+        self._settle_up_to(self._history.newest)
         self.time_jumps += 1
         for frame_id, count in Counter(
             m.frame_id for m in (*self._waiting, *(held for held, _, _ in self._held))

@@ -82,6 +82,11 @@ class PoseHistory:
         """The latest stamp; None while there is none."""
         return self._stamps[-1] if self._stamps else None
 
+    @property
+    def before(self) -> int | None:
+        """The stamp before the latest; None while there is none."""
+        return self._stamps[-2] if len(self._stamps) > 1 else None
+
     def clear(self) -> None:
         """Forget every pose, those of the record too."""
         self.record.clear()
@@ -103,6 +108,11 @@ class PoseHistory:
             stamps.insert(at, stamp)
             poses.insert(at, pose)
 
+    def drop_newest(self) -> None:
+        """Forget the pose of the latest stamp, that of the record too."""
+        self.record.drop(self._stamps.pop())
+        self._poses.pop()
+
     def extend(self, stamps: Sequence[int], poses: Sequence[Pose2]) -> None:
         """Add many poses, whose stamps increase and are later than all before."""
         self.record.extend(stamps, poses)
@@ -112,10 +122,10 @@ class PoseHistory:
     def trim(self) -> None:
         """Forget poses older than `HISTORY`, and the older half of more than `MOST_POSES`.
 
-        They go by halves, so that the cost of a message is constant.
+        They go by halves, so that the cost of a message is constant. The newest stamp may be wrong, and far ahead.
         """
         stamps = self._stamps
-        old = bisect_left(stamps, stamps[-1] - HISTORY) if len(stamps) < MOST_POSES else MOST_POSES // 2
+        old = bisect_left(stamps, stamps[-2:][0] - HISTORY) if len(stamps) < MOST_POSES else MOST_POSES // 2
         if old > FEWEST and old >= len(stamps) // 2:
             del stamps[: old - 1], self._poses[: old - 1]
 
@@ -140,7 +150,7 @@ class PoseHistory:
             jumped = len(before) > 0 and all(self._jumped(k, after) for k in before)
             return 'pose_jump' if jumped else poses[after]
         if after == 0:
-            return 'before_odometry'
+            return 'before_odometry' if stamp else 'zero_stamp'
         gap = stamps[after] - stamps[after - 1]
         if gap > max_gap * NANOSECONDS:
             return 'pose_gap'
@@ -165,7 +175,7 @@ class PoseHistory:
         two = [k + begin < 2 or self._jumped(k + begin - 2, k + begin) for k in which.tolist()]
         reason[exact] = np.where(one[exact] & np.array(two, np.bool_)[of], 'pose_jump', '')
         between = ~exact & (after + begin > 0)
-        reason[~exact & ~between] = 'before_odometry'
+        reason[~exact & ~between] = np.where(stamp[~exact & ~between] == 0, 'zero_stamp', 'before_odometry')
         last, before = after[between], after[between] - 1
         gap = stamps[last] - stamps[before]
         found = np.where(one[between], 'pose_jump', '')

@@ -31,6 +31,7 @@ REASONS = {
     'late_transform': 'TF knows this frame, but no transform for the stamp arrived within pose_timeout',
     'steep_sensor': 'the sensor looks up or down, by more than 60° or straight so with a part of its cone',
     'before_odometry': 'the stamp is before the first odometry, or the message came minutes late',
+    'zero_stamp': 'header.stamp is 0: have the driver fill it in',
     'after_odometry': 'the recording ended before odometry reached the stamp',
     'no_odometry': 'odometry, or its transform to map_frame, did not reach the stamp within pose_timeout',
     'pose_gap': 'odometry has a gap longer than max_pose_gap here',
@@ -55,6 +56,8 @@ ODOMETRY_REASONS = {
     'bad_pose': 'the pose is not finite, absurdly far away or tilted too far, or its quaternion is not normalised',
     'long_frame_id': 'the frame_id or child_frame_id has more than 255 characters',
     'unprintable_frame_id': 'the frame_id or child_frame_id has characters that cannot be printed',
+    'ahead_of_others': 'the stamp is more than a second ahead of those before and after it: do two nodes publish '
+    'odometry, or was a clock set?',
     'other_frame': 'the frame_id or child_frame_id is not that of the first odometry message; reset takes the new',
 }
 """Why an odometry message is rejected, in words."""

@@ -57,6 +57,8 @@ def drive(seed: int, count: int, trouble: float) -> list[Message]:
         x, y = x + rng.uniform(-0.1, 0.1), y + rng.uniform(-0.1, 0.1)
         if rng.random() < 0.3:
             stamp = now - (rng.randrange(0, 3 * NANOSECONDS) if bad(0.2) else 0)
+            if bad(0.2):
+                stamp += rng.choice([1_500_000_000, 3600 * NANOSECONDS])
             pose: Pose2 | None = Pose2(x, y, rng.uniform(-4, 4))
             if bad(0.1):
                 pose = rng.choice([None, Pose2(1e9, 0.0, 0.0), Pose2(x + 300.0, y, 0.0)])
@@ -66,6 +68,8 @@ def drive(seed: int, count: int, trouble: float) -> list[Message]:
         stamp = now - rng.randrange(0, 50_000_000) + (rng.randrange(-2, 2) * NANOSECONDS if bad() else 0)
         if found and bad():
             stamp = found[-1].stamp
+        if bad(0.1):
+            stamp = 0
         measured = rng.choice(RANGES) if bad() else rng.uniform(0.2, 4.2)
         limits = rng.choice([(4.0, 4.0), (0.0, math.inf), (5.0, 4.0), (0.1, 40.0)]) if bad() else (0.1, 4.0)
         angle = rng.choice([0.0, math.nan, 2.6, 3.2]) if bad() else 0.3
@@ -147,6 +151,26 @@ def test_a_drive_without_trouble_is_taken_at_once(monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(BatchAssociator, 'add_odometry', never)
     made = in_batches(drive(1, 500, 0.0), Parameters(), 1)
     assert len(made.buffer) > 200
+
+
+@pytest.mark.parametrize('at', [99, 100, 101])
+def test_a_stamp_ahead_at_the_end_of_a_batch_is_dropped_by_the_next(at: int) -> None:
+    messages: list[Message] = []
+    for k in range(200):
+        stamp = (100 + k) * NANOSECONDS // 10
+        messages.append(
+            OdometryMessage(stamp + (9 * NANOSECONDS if k == at else 0), 'odom', 'base', Pose2(k, 0.0, 0.0))
+        )
+        messages.append(RangeMessage(stamp if k % 50 else 0, 'front', 1.0, 0.1, 4.0, 0.3))
+    whole, parts = one_by_one(messages, Parameters()), BatchAssociator(mount_of)
+    for part in (messages[:201], messages[201:]):
+        parts.add_batch(batch_of(list(enumerate(part))))
+    for made in (whole, parts):
+        made.finish()
+        assert made.odometry_rejected == {'ahead_of_others': 1}
+        assert made.time_jumps == 0 and made.rejected['zero_stamp'] == 4
+    assert told(whole) == told(parts)
+    assert equal(whole.readings, parts.readings)
 
 
 def test_readings_that_wait_for_given_poses() -> None:

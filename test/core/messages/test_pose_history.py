@@ -43,7 +43,8 @@ def test_poses_in_any_order_and_the_last_of_one_stamp() -> None:
 
 def test_reasons_why_there_is_no_pose() -> None:
     made = history((1.0, Pose2(0, 0, 0)), (3.0, Pose2(0, 0, 0)), (3.1, Pose2(11.5, 0, 0)), (3.2, Pose2(0.6, 0, 0)))
-    assert made.at(0, 9.0) == 'before_odometry'
+    assert made.at(SECOND - 1, 9.0) == 'before_odometry'
+    assert made.at(0, 9.0) == 'zero_stamp'
     assert made.at(2 * SECOND, 1.9) == 'pose_gap'
     assert made.at(2 * SECOND, 2.0) == Pose2(0, 0, 0)
     assert made.at(round(3.05 * SECOND), 9.0) == 'pose_jump'
@@ -108,7 +109,10 @@ def test_few_poses_are_kept_however_old() -> None:
     assert len(made) == FEWEST + 1
     made.add(100 * (FEWEST + 20) * SECOND, Pose2(0, 0, 0))
     made.trim()
-    assert len(made) == 2
+    assert len(made) == FEWEST + 2, 'the newest stamp alone may be wrong'
+    made.add(100 * (FEWEST + 21) * SECOND, Pose2(0, 0, 0))
+    made.trim()
+    assert len(made) == 3
 
 
 def test_what_a_robot_may_do_at_most() -> None:
@@ -130,3 +134,24 @@ def test_a_wild_pose_is_undone_by_the_next_of_its_stamp() -> None:
     made = history(*((1.0 + 0.1 * k, Pose2(50.0 * (k in (1, 2)) * k, 0, 0)) for k in range(5)))
     assert made.at(round(1.3 * SECOND), 1.0) == 'pose_jump'
     assert made.at(round(1.4 * SECOND), 1.0) == Pose2(0, 0, 0)
+
+
+@pytest.mark.parametrize('again', [False, True])
+def test_the_newest_pose_can_be_forgotten(again: bool) -> None:
+    made = history((1.0, Pose2(1, 0, 0)), (1.1, Pose2(2, 0, 0)), (9.0, Pose2(3, 0, 0)))
+    if again:
+        made.add(9 * SECOND, Pose2(4, 0, 0))
+    before = made.record.snapshot()
+    made.drop_newest()
+    made.add(round(1.2 * SECOND), Pose2(5, 0, 0))
+    assert (made.before, made.newest) == (round(1.1 * SECOND), round(1.2 * SECOND))
+    assert made.record.snapshot()[1][:, 0].tolist() == [1, 2, 5]
+    assert before[0][-1] == 9 * SECOND, 'a snapshot never changes'
+
+
+def test_a_record_that_began_anew_with_the_pose_that_is_forgotten() -> None:
+    made = history((1.0, Pose2(1, 0, 0)), (9.0, Pose2(3, 0, 0)))
+    made.record.begin_anew()
+    made.drop_newest()
+    made.add(2 * SECOND, Pose2(5, 0, 0))
+    assert made.record.since_anew == 1

@@ -1,0 +1,124 @@
+"""What the node says of clocks that jump, or that are behind each other."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+pytest.importorskip('rclpy', reason='the intake takes messages of ROS')
+
+from stand_ins import Taking
+
+from forward_grid_mapper.node import clocks
+from forward_grid_mapper.node.clocks import AGAIN, LASTING
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> Any:
+    """The clock of the node, which the test moves."""
+    made = SimpleNamespace(now=1000.0)
+    monkeypatch.setattr(clocks.time, 'monotonic', lambda: made.now)
+    return made
+
+
+def taking() -> Taking:
+    robot = Taking()
+    robot.intake.begin()
+    return robot
+
+
+def test_two_sources_of_odometry_whose_clocks_differ_are_told_of_now_and_then(clock: Any) -> None:
+    robot = taking()
+    for k in range(100):
+        clock.now += 0.05
+        robot.odometry(2000.0 + 0.1 * k)
+        robot.odometry(1995.0 + 0.1 * k)
+    (fault,) = faults(robot)
+    assert 'do two nodes publish odometry, or is a clock set?' in fault
+    assert len(robot.node.warned) == 1, 'in 5 s'
+    clock.now += LASTING
+    robot.odometry(2020.0)
+    robot.odometry(2005.0)
+    assert len(robot.node.warned) == 2 and '(100 times so far)' in robot.node.warned[1]
+    clock.now += LASTING
+    assert faults(robot) == []
+
+
+def test_a_bag_that_begins_anew_is_no_fault(clock: Any) -> None:
+    robot = taking()
+    for _ in range(AGAIN + 2):
+        clock.now += 0.6 * LASTING
+        for k in range(10):
+            robot.odometry(100.0 + k)
+    assert faults(robot) == []
+    assert 'odometry of the drive, which refine_poses needs; the map is kept' in robot.node.warned[0]
+    robot.associator.clear()
+    robot.intake.forget()
+    warned = len(robot.node.warned)
+    clock.now += LASTING
+    robot.odometry(110.0)
+    assert len(robot.node.warned) == warned, 'counts that a reset sets to 0 are no jumps'
+
+
+def faults(robot: Taking) -> list[str]:
+    """What is said of stamps; the messages of this test have no numbers, so that losses are guessed."""
+    return [fault for fault in robot.intake.faults() if 'stamps' in fault]
+
+
+def drive(robot: Taking, seconds: int, late: float, *frames: str, first: int = 0) -> None:
+    """Ten readings a second, whose stamps are so late."""
+    for k in range(10 * first, 10 * (first + seconds)):
+        robot.odometry(1000.0 + 0.1 * k)
+        for frame in frames:
+            robot.range(1000.0 + 0.1 * k - late, frame)
+
+
+def test_a_sensor_whose_clock_stays_behind_is_told_of(clock: Any) -> None:
+    robot = taking()
+    drive(robot, 20, 0.0, 'sonar')
+    assert faults(robot) == []
+    drive(robot, 4, 10.0, 'left', first=20)
+    assert faults(robot) == [], 'that may be a queue'
+    drive(robot, 2, 10.0, 'left', first=24)
+    for _ in range(2):
+        (fault,) = faults(robot)
+        assert fault.startswith('the stamps of left are 10.0 s behind those of odometry')
+    assert robot.node.warned == [fault]
+    drive(robot, 6, 20.0, 'right', 'left', first=26)
+    assert 'right (and 1 sensors more) are 20.0 s behind' in faults(robot)[0]
+    # set right, or silent
+    drive(robot, 6, 0.0, 'left', first=32)
+    assert 'the stamps of right are' in faults(robot)[0]
+    drive(robot, 6, 0.0, 'left', first=38)
+    assert faults(robot) == []
+
+
+def test_a_queue_that_is_worked_off_is_not_behind(clock: Any) -> None:
+    """Odometry that is taken before the ranges that came with it."""
+    robot = taking()
+    for k in range(200):
+        robot.odometry(1000.0 + 0.1 * k)
+    for k in range(200):
+        robot.range(1000.0 + 0.1 * k)
+        robot.odometry(1020.0 + 0.05 * k)
+    drive(robot, 10, 0.0, 'sonar', first=31)
+    assert faults(robot) == []
+
+
+def test_a_stamp_that_nobody_filled_in_is_no_clock_that_is_behind(clock: Any) -> None:
+    robot = taking()
+    for k in range(100):
+        robot.odometry(1000.0 + 0.1 * k)
+        robot.range(0.0)
+    assert faults(robot) == []
+    assert robot.associator.rejected == {'zero_stamp': 100}
+
+
+def test_after_a_jump_back_a_sensor_is_looked_at_anew(clock: Any) -> None:
+    robot = taking()
+    drive(robot, 6, 10.0, 'sonar', first=100)
+    assert faults(robot)
+    drive(robot, 2, 0.0, 'sonar')
+    assert faults(robot) == []
