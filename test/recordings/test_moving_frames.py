@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from forward_grid_mapper.bags import reader
 from forward_grid_mapper.bags.reader import Bag
 from forward_grid_mapper.bags.writer import BagWriter
 from forward_grid_mapper.core.common.errors import BagError, InputError
@@ -119,3 +120,12 @@ def test_a_sensor_on_a_joint_is_told(tmp_path: Path) -> None:
     path = recorded(tmp_path / 'bag', [[('odom', 'base_link', at)], [servo]], sensor_on='servo')
     with pytest.raises(InputError, match='join sonar on servo to the robot: sensors on moving joints are not'):
         read(path)
+
+
+def test_long_recordings_are_not_read_twice_as_a_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = recorded(tmp_path / 'bag', [[MOVING], [BACK]])
+    monkeypatch.setattr(reader, 'MOST_LOOKED_AT', 20)
+    with Bag(path) as bag:
+        assert 10 <= sum(1 for _ in bag._looked_at({'/tf'})) < 40
+        assert bag.moving_frames() == {'base_footprint': 'odom', 'base_link': 'base_footprint'}
+    assert read(path).associator.map_frame == 'odom'
