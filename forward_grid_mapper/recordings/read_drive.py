@@ -103,8 +103,8 @@ class Extrinsics:
 
     def _on_joints(self, frames: Sequence[str]) -> str:
         """Say which frames hang on others that may move."""
-        tops = {frame: self._transforms.top_of(frame) for frame in frames}
-        found = [f'{frame} on {tops[frame]}' for frame in frames if tops[frame] in self.moving]
+        tops = {frame.lstrip('/'): self._transforms.top_of(frame) for frame in frames}
+        found = [f'{frame} on {top}' if frame != top else frame for frame, top in tops.items() if top in self.moving]
         if not found:
             return ''
         return (
@@ -256,7 +256,7 @@ def _nothing_associated(
     ranges, odometry = spans.ranges, spans.odometry
     lost = '; '.join(f'{count} on {topic} do not fit their type' for topic, count in undecodable.items())
     if not ranges or not odometry:
-        if ranges and lookup.moving:
+        if ranges and lookup.moving and not lookup.moving.keys() & set(BASE_FRAMES):
             moved = ', '.join(f'{child} in {parent}' for child, parent in sorted(lookup.moving.items())[:12])
             return BagError(
                 f'the transforms place neither {" nor ".join(BASE_FRAMES)}, but {moved}; give the poses of the robot '

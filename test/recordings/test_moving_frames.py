@@ -43,10 +43,12 @@ def at(i: int) -> Pose2:
     return Pose2(i / 64, -i / 32, i / 16)
 
 
-def recorded(path: Path, links: list[Any] | None, kind: str = 'mcap', sensor_on: str = 'base_link') -> Path:
+def recorded(
+    path: Path, links: list[Any] | None, kind: str = 'mcap', fixed: tuple[str, str] = ('base_link', 'sonar')
+) -> Path:
     """A bag whose poses are Odometry, or in each message of `links` transforms, made of the number of the step."""
     with TransformWriter(path, kind) as writer:
-        writer.write_static_transforms([(sensor_on, 'sonar', SENSOR)], 0)
+        writer.write_static_transforms([(*fixed, SENSOR)], 0)
         for i in range(60):
             stamp = (i + 1) * SECOND // 10
             if links is None:
@@ -110,15 +112,17 @@ def test_frames_in_doubt_are_left_to_the_parent_of_the_base(tmp_path: Path, othe
 
 
 def test_frames_with_a_prefix_are_named(tmp_path: Path) -> None:
-    path = recorded(tmp_path / 'bag', [[('r1/odom', 'r1/base_link', at)]], sensor_on='r1/base_link')
+    path = recorded(tmp_path / 'bag', [[('r1/odom', 'r1/base_link', at)]], fixed=('r1/base_link', 'sonar'))
     with pytest.raises(BagError, match=r'neither base_link nor base_footprint, but r1/base_link in r1/odom; .*--poses'):
         read(path)
 
 
-def test_a_sensor_on_a_joint_is_told(tmp_path: Path) -> None:
-    servo = ('base_link', 'servo', lambda i: Pose2(0.1, 0.0, i / 10))
-    path = recorded(tmp_path / 'bag', [[('odom', 'base_link', at)], [servo]], sensor_on='servo')
-    with pytest.raises(InputError, match='join sonar on servo to the robot: sensors on moving joints are not'):
+@pytest.mark.parametrize(('frame', 'named'), [('servo', 'sonar on servo'), ('sonar', 'sonar')])
+def test_a_sensor_on_a_joint_is_told(tmp_path: Path, frame: str, named: str) -> None:
+    servo = ('base_link', frame, lambda i: Pose2(0.1, 0.0, i / 10))
+    fixed = ('servo', 'sonar') if frame == 'servo' else ('base_link', 'laser')
+    path = recorded(tmp_path / 'bag', [[('odom', 'base_link', at)], [servo]], fixed=fixed)
+    with pytest.raises(InputError, match=f'join {named} to the robot: sensors on moving joints are not'):
         read(path)
 
 
