@@ -132,6 +132,15 @@ class Columns:
         return bad, [batch_of(good)] if good else []
 
 
+class InOrder(Columns):
+    """Decodes messages of which each says something only together with those before it."""
+
+    def decode(self, places: Places, data: Sequence[bytes]) -> tuple[list[MessageBatch], list[int]]:
+        """Return what messages say, and the places of those that do not fit their type."""
+        bad, found = self._one_by_one(zip(places.tolist(), data, strict=True))
+        return found, bad
+
+
 def _paths(message: Any) -> list[Path]:
     """Return where seconds, nanoseconds and values of a message are, as `Ranges` or `planar_pose_of` orders them."""
     if hasattr(message, 'field_of_view'):

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import random
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator, Sequence
-from itertools import islice
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from itertools import islice, repeat
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -15,16 +16,20 @@ from ..core.common.errors import BagError, InputError
 from ..core.messages.message_batch import MessageBatch, joined
 from ..core.messages.message_types import OdometryMessage, RangeMessage, range_message
 from .choice import ODOMETRY, RANGE, Topics, choose_range_topics, choose_topics
-from .columns import Columns
+from .columns import Columns, InOrder
 from .decoder import TF_MESSAGE, decoder_of
 from .namespaces import by_precedence
 from .opening import open_sources, repair_hint
 from .poses import POSES
 from .source import Channel, RawMessage, Source, one_line
 from .static_transforms import StaticTransforms
+from .transform_chain import TransformChain, chain_of
 
 _CONVERSIONS: dict[str, Callable[[Any], RangeMessage | OdometryMessage | None]] = {RANGE: range_message, **POSES}
 _PROGRESS_STEP = 1000
+MOST_LOOKED_AT = 20_000
+"""Messages in which frames are looked for: the first half of them, and others all over the bag."""
+
 BATCH = 16
 """Steps of progress after which what was read is decoded: 12 MB of Odometry."""
 
@@ -143,6 +148,7 @@ class Bag:
         BagError
             If the bag is damaged and nothing of these topics can be read.
         """
+        chain = self._chain(topics)
         wanted = self._begin(topics)
         total = sum(c.total for c in self._channels() if (c.topic, c.msgtype) in wanted)
         done = decoded = 0
@@ -153,15 +159,15 @@ class Bag:
             if progress and more and not done % _PROGRESS_STEP:
                 progress(done, max(done, total))
 
-        for channels, columns, raw in self._raw(wanted, tell):
+        for channels, columns, raw in self._raw(wanted, chain, tell):
             bad: list[tuple[int, Channel]] = []
             parts: list[MessageBatch] = []
             keys = np.fromiter((key for key, _, _ in raw), np.int64, len(raw))
-            for key, channel in channels.items():
-                places = np.flatnonzero(keys == key)
-                found, wrong = columns[key].decode(places, [raw[k][2] for k in places.tolist()])
+            for mine, decoding in columns.items():
+                places = np.flatnonzero(np.isin(keys, mine))
+                found, wrong = decoding.decode(places, [raw[k][2] for k in places.tolist()])
                 parts += found
-                bad += [(place, channel) for place in wrong]
+                bad += [(place, channels[int(keys[place])]) for place in wrong]
             for _, channel in sorted(bad, key=lambda one: one[0]):
                 self._count_undecodable(channel)
             decoded += len(raw) - len(bad)
@@ -176,14 +182,14 @@ class Bag:
             progress(done, max(done, total))
 
     def _raw(
-        self, wanted: Collection[tuple[str, str]], tell: Callable[[int], None]
-    ) -> Iterator[tuple[dict[int, Channel], dict[int, Columns], list[RawMessage]]]:
-        """Yield channels and what decodes them, by key, and some messages; `tell` hears how many have been read."""
+        self, wanted: Collection[tuple[str, str]], chain: TransformChain | None, tell: Callable[[int], None]
+    ) -> Iterator[tuple[dict[int, Channel], dict[tuple[int, ...], Columns], list[RawMessage]]]:
+        """Yield channels by key, what decodes some of them, and some messages; `tell` hears how many have been read."""
         for source in self._sources:
             channels = {c.key: c for c in source.channels if (c.topic, c.msgtype) in wanted}
             if not channels:
                 continue
-            columns = {key: Columns(decoder_of(c), _CONVERSIONS[c.msgtype]) for key, c in channels.items()}
+            columns = _decoding(channels, chain)
             held: list[RawMessage] = []
             messages = source.messages(channels.keys())
             more = True
@@ -221,6 +227,16 @@ class Bag:
             transforms.take(parts[topic])
         return transforms
 
+    def moving_frames(self, topic: str | None = None) -> dict[str, str]:
+        """Return the parent of each frame that transforms of this topic, or of `/tf`, place; they may move."""
+        names = {c.topic for c in self._channels() if c.msgtype == TF_MESSAGE}
+        topics = {name for name in names if (name.split('/')[-1] == 'tf' if topic is None else name == topic)}
+        parents: dict[str, str] = {}
+        for message in self._looked_at(topics):
+            for item in message.transforms:
+                parents[str(item.child_frame_id).lstrip('/')] = str(item.header.frame_id).lstrip('/')
+        return parents
+
     def originals(self, topics: Topics) -> Iterator[tuple[str, Any]]:
         """Yield topic and message of the chosen topics by log time, whole and as rosbags decodes them."""
         for channel, message in self._decoded(self._begin(topics)):
@@ -252,8 +268,14 @@ class Bag:
             raise ValueError('the bag is not open; use it in a with block')
         return (channel for source in self._sources for channel in source.channels)
 
-    def _decoded(self, wanted: Collection[tuple[str, str]]) -> Iterator[tuple[Channel, Any]]:
-        """Yield the messages of these (topic, type) pairs, None for one that does not fit its definition."""
+    def _decoded(
+        self, wanted: Collection[tuple[str, str]], chosen: Iterator[bool] | None = None
+    ) -> Iterator[tuple[Channel, Any]]:
+        """Yield the messages of these (topic, type) pairs, None for one that does not fit its definition.
+
+        `chosen` says of each message whether it is to be decoded; without it, all are.
+        """
+        chosen = repeat(True) if chosen is None else chosen
         for source in self._sources:
             channels = {c.key: c for c in source.channels if (c.topic, c.msgtype) in wanted}
             decoders = {key: decoder_of(channel) for key, channel in channels.items()}
@@ -261,6 +283,8 @@ class Bag:
                 continue
             try:
                 for key, _, data in source.messages(channels.keys()):
+                    if not next(chosen):
+                        continue
                     try:
                         message = decoders[key](data)
                     except Exception:  # rosbags lets many kinds through for bytes that do not fit
@@ -273,11 +297,45 @@ class Bag:
     def _count_undecodable(self, channel: Channel) -> None:
         self.undecodable[channel.topic] = self.undecodable.get(channel.topic, 0) + 1
 
+    def _chain(self, topics: Topics) -> TransformChain | None:
+        """Return what makes poses of the robot out of transforms, where it takes several of them."""
+        if topics.odom_type != TF_MESSAGE:
+            return None
+        return chain_of(self._looked_at({topics.odom_topic}))
+
+    def _looked_at(self, topics: Collection[str]) -> Iterator[Any]:
+        """Yield messages with transforms of these topics, not all of them where there are many."""
+        wanted = {(topic, TF_MESSAGE) for topic in topics}
+        total = sum(c.total for c in self._channels() if (c.topic, c.msgtype) in wanted)
+        found = self._decoded(wanted, _some(total, MOST_LOOKED_AT))
+        return (message for _, message in found if message is not None)
+
     def _frames_of(self, topic: str) -> str:
         for channel, message in self._decoded({(topic, kind) for kind in POSES}):
             if message is not None and (odometry := POSES[channel.msgtype](message)) is not None:
                 return f'{odometry.frame_id or "?"} → {odometry.child_frame_id or "?"}'
         return 'none of them readable'
+
+
+def _some(total: int, most: int) -> Iterator[bool]:
+    """Yield which of `total` things are some `most` of them: the first, and then others at random, always the same."""
+    yield from repeat(True, most // 2)
+    share = most / 2 / max(total - most // 2, 1)
+    # at random, since publishers that take turns would fall in with any step
+    draw = random.Random(0).random
+    while True:
+        yield draw() < share
+
+
+def _decoding(channels: Mapping[int, Channel], chain: TransformChain | None) -> dict[tuple[int, ...], Columns]:
+    """Return what decodes channels, by their keys; those of a chain are decoded together, in their order."""
+    moving = tuple(key for key, c in channels.items() if chain is not None and c.msgtype == TF_MESSAGE)
+    found: dict[tuple[int, ...], Columns] = {
+        (key,): Columns(decoder_of(c), _CONVERSIONS[c.msgtype]) for key, c in channels.items() if key not in moving
+    }
+    if chain is not None and moving:
+        found[moving] = InOrder(decoder_of(channels[moving[0]]), chain.pose)
+    return found
 
 
 def _add_transform(transforms: StaticTransforms, item: Any) -> None:

@@ -89,6 +89,10 @@ class StaticTransforms:
         self.rejected |= {child: why for child, why in other.rejected.items() if child not in self._parents}
         self.rejected = {child: why for child, why in self.rejected.items() if child not in self._parents}
 
+    def top_of(self, frame: str) -> str:
+        """Return the frame that a frame hangs on and that hangs on no other: itself, where it is not known."""
+        return next(reversed(self._ancestors(_plain(frame))))
+
     def doubts(self, base_frame: str, sensor_frame: str) -> list[str]:
         """Return what `contradicted` has about the frames that join a sensor to the robot."""
         to_base, to_sensor = self._ancestors(_plain(base_frame)), self._ancestors(_plain(sensor_frame))

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
+from ..bags.decoder import TF_MESSAGE
 from ..bags.poses import BASE_FRAMES
 from ..bags.reader import Bag
 from ..bags.static_transforms import StaticTransforms, SteepSensorError
@@ -30,7 +31,17 @@ MOST_OPTIONS = 24
 
 
 class Extrinsics:
-    """Where the sensors sit: given by the user, who wins, or by the bag's static transforms."""
+    """Where the sensors sit: given by the user, who wins, or by the bag's static transforms.
+
+    Attributes
+    ----------
+    steep, used, unusable : dict of str
+        By frame: why a sensor says nothing of the plane, where its pose is from, and why its transform does not do.
+    doubts : dict
+        What is to be said of poses that are in doubt, in order.
+    moving : mapping of str
+        The parents of frames that move, which `advice` tells of.
+    """
 
     def __init__(self, given: Mapping[str, Pose2], transforms: StaticTransforms) -> None:
         self._given = {frame.lstrip('/'): pose for frame, pose in given.items()}
@@ -40,6 +51,7 @@ class Extrinsics:
         self.used: dict[str, str] = {}
         self.unusable: dict[str, str] = {}
         self.doubts: dict[str, None] = {}
+        self.moving: Mapping[str, str] = {}
 
     def __call__(self, base_frame: str, frame: str, stamp: int) -> Pose2 | str | None:
         """Return the pose of a sensor, as `ExtrinsicsLookup` has it; static transforms are so at any stamp."""
@@ -81,11 +93,23 @@ class Extrinsics:
         known = self._transforms.frames
         joined = f'/tf_static joins {", ".join(known[:12])}' if known else 'the bag has no /tf_static'
         reasons = ''.join(f' {self.unusable[frame]}' for frame in frames if frame in self.unusable)
+        reasons += self._on_joints(frames)
         options = ' '.join(f'--sensor {quoted(f"{frame}=x,y,yaw")}' for frame in frames[:MOST_OPTIONS])
         more = ', and so on' if len(frames) > MOST_OPTIONS else ''
         return (
             f'no pose on the robot (frame {base_frame or "?"}) is known for {", ".join(frames)}: {joined}.{reasons} '
             f'Give {options}{more}, in metres and radians (or 90deg), or sensors.{frames[0]}.pose in --params'
+        )
+
+    def _on_joints(self, frames: Sequence[str]) -> str:
+        """Say which frames hang on others that may move."""
+        tops = {frame.lstrip('/'): self._transforms.top_of(frame) for frame in frames}
+        found = [f'{frame} on {top}' if frame != top else frame for frame, top in tops.items() if top in self.moving]
+        if not found:
+            return ''
+        return (
+            f' Only transforms that may move join {", ".join(found)} to the robot: sensors on moving joints are not '
+            f'supported with bags (the node maps them while the robot drives). If the joint stands still, a pose does.'
         )
 
 
@@ -150,6 +174,8 @@ def read_drive(
             associator.add_batch(batch_of(list(enumerate(given))))
         associator.finish()
         undecodable = dict(bag.undecodable)
+        if topics.odom_type == TF_MESSAGE and not spans.odometry:
+            lookup.moving = bag.moving_frames(topics.odom_topic)
         warnings = topics.notes() + _warnings(bag, associator, lookup)
     if not len(associator.buffer):
         if not associator.received and spans.left_out:
@@ -192,6 +218,7 @@ def _warnings(bag: Bag, associator: PoseAssociator, lookup: Extrinsics) -> list[
     for topic, count in bag.undecodable.items():
         warnings.append(f'{count} messages on {topic} do not fit their type and were skipped')
     if associator.unknown_frames:
+        lookup.moving = bag.moving_frames()
         warnings.append(lookup.advice(associator.base_frame, sorted(associator.unknown_frames)))
     warnings += [*lookup.steep.values(), *lookup.doubts]
     if unused := lookup.unused:
@@ -229,6 +256,12 @@ def _nothing_associated(
     ranges, odometry = spans.ranges, spans.odometry
     lost = '; '.join(f'{count} on {topic} do not fit their type' for topic, count in undecodable.items())
     if not ranges or not odometry:
+        if ranges and lookup.moving and not lookup.moving.keys() & set(BASE_FRAMES):
+            moved = ', '.join(f'{child} in {parent}' for child, parent in sorted(lookup.moving.items())[:12])
+            return BagError(
+                f'the transforms place neither {" nor ".join(BASE_FRAMES)}, but {moved}; give the poses of the robot '
+                f'with --poses, or record its Odometry'
+            )
         kind = 'Range' if not ranges else 'Odometry'
         return BagError(f'the chosen topics hold no readable {kind} message{f" ({lost})" if lost else ""}')
     if set(associator.rejected) == {'unknown_extrinsics'}:

@@ -14,7 +14,9 @@ from forward_grid_mapper.bags.namespaces import Parted, by_precedence, ranges_of
 from forward_grid_mapper.bags.reader import Bag
 from forward_grid_mapper.bags.writer import BagWriter
 from forward_grid_mapper.core.common.errors import BagError
+from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.messages.message_types import OdometryMessage, Pose2, RangeMessage
+from forward_grid_mapper.recordings.read_drive import read_drive
 
 MOUNTS = {'/r1': Pose2(0.1, 0.0, 0.0), '/r2': Pose2(0.3, 0.2, math.pi / 2)}
 
@@ -108,3 +110,14 @@ def test_precedence_of_fixed_transforms() -> None:
     assert by_precedence(topics, ['/r1/odom', '/r2/sonar']) == ['/tf_static', '/r2/tf_static', '/r1/tf_static']
     assert by_precedence(topics, ['/odom', '/sonar']) == ['/r2/tf_static', '/r1/tf_static', '/tf_static']
     assert by_precedence(topics, []) == by_precedence(topics, ['', '/sonar'])
+
+
+def test_the_report_of_a_drive_tells_of_it(tmp_path: Path) -> None:
+    mounts = {**MOUNTS, '': Pose2(0.0, 0.0, 0.0)}
+    for robot in ('/r1', '/r2'):
+        path = two_robots(tmp_path / robot[1:], mounts)
+        source = read_drive(path, Parameters(), {}, None, f'{robot}/odometry/filtered').source
+        assert source['range_topics'] == [f'{robot}/sonar']
+        assert source['extrinsics']['sonar'] == pytest.approx(MOUNTS[robot])
+        told = ' '.join(source['warnings'])
+        assert 'are left out' in told and f'/tf_static and {robot}/tf_static give different poses' in told

@@ -376,6 +376,16 @@ def test_files_of_one_bag_without_metadata_are_no_drives(
     assert 'ros2 bag reindex' in said
 
 
+def test_a_bag_without_metadata_in_a_folder_is_a_drive_like_others(days: Path, tmp_path: Path) -> None:
+    for name in ('day_0', 'day_1'):
+        shutil.copytree(days / name, tmp_path / 'days' / name)
+    (tmp_path / 'days' / 'day_1' / 'metadata.yaml').unlink()
+    (tmp_path / 'days' / 'day_2.bag.active').touch()
+    drives = read(tmp_path / 'days')
+    assert names(drives) == ['day_0', 'day_1']
+    assert any('left out: day_2.bag.active' in warning for warning in drives.source['warnings'])
+
+
 # ---- parts
 
 

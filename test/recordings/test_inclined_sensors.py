@@ -42,7 +42,7 @@ def read(bag: Path, monkeypatch: pytest.MonkeyPatch, **pitch: float) -> Drive:
                 *(math.sin(a) * math.cos(b), math.cos(a) * math.cos(b)),
             ),
         )
-    monkeypatch.setattr(Bag, 'static_transforms', lambda bag: transforms)
+    monkeypatch.setattr(Bag, 'static_transforms', lambda bag, topics: transforms)
     return read_drive(bag, Parameters(), {})
 
 

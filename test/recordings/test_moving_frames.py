@@ -1,0 +1,135 @@
+"""Poses of the robot and of its sensors in transforms that move."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from forward_grid_mapper.bags import reader
+from forward_grid_mapper.bags.reader import Bag
+from forward_grid_mapper.bags.writer import BagWriter
+from forward_grid_mapper.core.common.errors import BagError, InputError
+from forward_grid_mapper.core.common.parameters import Parameters
+from forward_grid_mapper.core.messages.message_types import OdometryMessage, Pose2, RangeMessage
+from forward_grid_mapper.recordings.drive import Drive
+from forward_grid_mapper.recordings.read_drive import read_drive
+
+SECOND = 1_000_000_000
+SENSOR = Pose2(0.1, 0.2, 0.5)
+Links = list[tuple[str, str, Pose2]]
+
+
+class TransformWriter(BagWriter):
+    """Writes transforms that move."""
+
+    def write_transforms(self, links: Links, stamp: int) -> None:
+        """Write (parent, child, pose of child in parent) to /tf in one message."""
+        items: list[Any] = []
+        for parent, child, pose in links:
+            posed = self._pose(pose)
+            offset = self._make('geometry_msgs/msg/Vector3', x=pose.x, y=pose.y, z=0.1)
+            transform = self._make('geometry_msgs/msg/Transform', translation=offset, rotation=posed.orientation)
+            header = self._header('/tf', stamp, parent)
+            kind = 'geometry_msgs/msg/TransformStamped'
+            items.append(self._make(kind, header=header, child_frame_id=child, transform=transform))
+        self._write('/tf', 'tf2_msgs/msg/TFMessage', self._make('tf2_msgs/msg/TFMessage', transforms=items), stamp)
+
+
+def at(i: int) -> Pose2:
+    return Pose2(i / 64, -i / 32, i / 16)
+
+
+def recorded(
+    path: Path, links: list[Any] | None, kind: str = 'mcap', fixed: tuple[str, str] = ('base_link', 'sonar')
+) -> Path:
+    """A bag whose poses are Odometry, or in each message of `links` transforms, made of the number of the step."""
+    with TransformWriter(path, kind) as writer:
+        writer.write_static_transforms([(*fixed, SENSOR)], 0)
+        for i in range(60):
+            stamp = (i + 1) * SECOND // 10
+            if links is None:
+                writer.write_odometry('/odom', OdometryMessage(stamp, 'odom', 'base_link', at(i)))
+            for message in links or ():
+                writer.write_transforms([(parent, child, pose(i)) for parent, child, pose in message], stamp)
+            writer.write_range('/sonar', RangeMessage(stamp + 1000, 'sonar', 1.0 + i / 64, 0.125, 5.0, 0.25))
+    return path
+
+
+def read(path: Path, topic: str | None = 'tf') -> Drive:
+    return read_drive(path, Parameters(), {}, None, topic)
+
+
+MOVING = ('odom', 'base_footprint', at)
+BACK = ('base_footprint', 'base_link', lambda i: Pose2(0.0, 0.0, 0.0))
+ELSEWHERE = ('map', 'odom', lambda i: Pose2(3.0, 1.0, math.pi / 2))
+
+
+@pytest.mark.parametrize('kind', ['mcap', 'ros1'])
+@pytest.mark.parametrize(
+    'messages',
+    [[[MOVING, BACK]], [[BACK, MOVING]], [[MOVING], [BACK]], [[BACK], [MOVING]], [[ELSEWHERE, MOVING], [BACK]]],
+)
+def test_links_that_stand_still_below_one_that_moves(tmp_path: Path, messages: list[Any], kind: str) -> None:
+    suffix = '.bag' if kind == 'ros1' else ''
+    expected = read(recorded(tmp_path / f'odometry{suffix}', None, kind), None).associator
+    found = read(recorded(tmp_path / f'tf{suffix}', messages, kind)).associator
+    assert (found.map_frame, found.base_frame) == ('odom', 'base_link')
+    assert len(found.readings) == 59
+    for name in ('x', 'y', 'yaw', 'z', 'stamp'):
+        np.testing.assert_allclose(getattr(found.readings, name), getattr(expected.readings, name), atol=1e-9)
+
+
+def test_the_topmost_link_that_moves_counts(tmp_path: Path) -> None:
+    drifting = ('map', 'odom', lambda i: Pose2(3.0, 1.0 + (i > 30), math.pi / 2))
+    path = recorded(tmp_path / 'bag', [[drifting], [('odom', 'base_link', at)]])
+    assert read(path).associator.map_frame == 'map'
+    with Bag(path) as bag:
+        topics = bag.choose_topics(odom_topic='/tf', any_poses=True)
+        poses = [m.pose for m in bag.messages(topics) if isinstance(m, OdometryMessage)]
+    for i, pose in enumerate(poses):
+        assert pose is not None
+        there = at(i)
+        assert pose[:2] == pytest.approx((3.0 - there.y, 1.0 + (i > 30) + there.x))
+        assert math.remainder(pose.yaw - there.yaw - math.pi / 2, math.tau) == pytest.approx(0.0, abs=1e-9)
+    assert len(poses) == 60
+
+
+def test_a_robot_that_stands_is_where_its_parent_frame_is(tmp_path: Path) -> None:
+    still = ('odom', 'base_link', lambda i: Pose2(1.0, 2.0, 0.0))
+    associator = read(recorded(tmp_path / 'bag', [[still]])).associator
+    assert (associator.map_frame, len(associator.readings)) == ('odom', 59)
+
+
+@pytest.mark.parametrize('other', [('map', 'base_link', at), ('base_link', 'odom', at)])
+def test_frames_in_doubt_are_left_to_the_parent_of_the_base(tmp_path: Path, other: Any) -> None:
+    associator = read(recorded(tmp_path / 'bag', [[('odom', 'base_link', at)], [other]])).associator
+    assert associator.map_frame == 'odom'
+    assert len(associator.readings) == 59
+
+
+def test_frames_with_a_prefix_are_named(tmp_path: Path) -> None:
+    path = recorded(tmp_path / 'bag', [[('r1/odom', 'r1/base_link', at)]], fixed=('r1/base_link', 'sonar'))
+    with pytest.raises(BagError, match=r'neither base_link nor base_footprint, but r1/base_link in r1/odom; .*--poses'):
+        read(path)
+
+
+@pytest.mark.parametrize(('frame', 'named'), [('servo', 'sonar on servo'), ('sonar', 'sonar')])
+def test_a_sensor_on_a_joint_is_told(tmp_path: Path, frame: str, named: str) -> None:
+    servo = ('base_link', frame, lambda i: Pose2(0.1, 0.0, i / 10))
+    fixed = ('servo', 'sonar') if frame == 'servo' else ('base_link', 'laser')
+    path = recorded(tmp_path / 'bag', [[('odom', 'base_link', at)], [servo]], fixed=fixed)
+    with pytest.raises(InputError, match=f'join {named} to the robot: sensors on moving joints are not'):
+        read(path)
+
+
+def test_long_recordings_are_not_read_twice_as_a_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = recorded(tmp_path / 'bag', [[MOVING], [BACK]])
+    monkeypatch.setattr(reader, 'MOST_LOOKED_AT', 20)
+    with Bag(path) as bag:
+        assert 10 <= sum(1 for _ in bag._looked_at({'/tf'})) < 40
+        assert bag.moving_frames() == {'base_footprint': 'odom', 'base_link': 'base_footprint'}
+    assert read(path).associator.map_frame == 'odom'
