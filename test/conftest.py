@@ -40,3 +40,5 @@ def pytest_configure() -> None:
     os.environ.setdefault('FASTRTPS_DEFAULT_PROFILES_FILE', str(Path(__file__).parent / 'fast_discovery.xml'))
     if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
+    if signal.getsignal(signal.SIGHUP) == signal.SIG_IGN:
+        signal.signal(signal.SIGHUP, signal.SIG_DFL)
