@@ -35,7 +35,8 @@ def domain() -> Iterator[int]:
 def pytest_configure() -> None:
     """Have participants of DDS find each other soon, and hear Ctrl-C, here and in the processes that tests start.
 
-    A shell without job control has background commands ignore Ctrl-C, which processes hand down.
+    A shell without job control has background commands ignore Ctrl-C, and `nohup` a terminal that closes; processes
+    hand that down.
     """
     os.environ.setdefault('FASTRTPS_DEFAULT_PROFILES_FILE', str(Path(__file__).parent / 'fast_discovery.xml'))
     if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
