@@ -119,22 +119,28 @@ def test_the_transform_from_map_to_odom_is_sent(
     robot.until(lambda: numbers(tf2_ros.sent[-1]) == (0.0, 0.0, 0.0))
 
 
+def mapping(inside: Callable[..., Inside], monkeypatch: pytest.MonkeyPatch) -> tuple[Inside, list[float]]:
+    """A node that maps, and the time of the machine, which goes on where it is told to."""
+    clock = [1000.0]
+    monkeypatch.setattr(pose_publishers.time, 'monotonic', lambda: clock[0])
+    robot = inside(refine_poses=True)
+    robot.node.start()
+    robot.until(lambda: robot.node.mapping)
+    return robot, clock
+
+
 def test_while_odometry_is_silent_the_transform_is_repeated(
     inside: Callable[..., Inside], tf2_ros: type[Broadcaster], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """For those who start later; of another stamp, since TF warns of the same, and of no later time."""
-    now = 1000.0
-    monkeypatch.setattr(pose_publishers.time, 'monotonic', lambda: now)
-    robot = inside(refine_poses=True)
-    robot.node.start()
-    robot.until(lambda: robot.node.mapping)
+    robot, clock = mapping(inside, monkeypatch)
     robot.odometry(100.0)
     tick, sent = robot.node.trajectory._tick, tf2_ros.sent
     for k in range(4):
         for _ in range(5):
             tick()
         assert len(sent) == 1 + k
-        now += REPEAT
+        clock[0] += REPEAT
     stamps = [transform.header.stamp.sec * 10**9 + transform.header.stamp.nanosec for transform in sent]
     assert stamps == [100_200_000_000 + k for k in range(4)]
     assert all(numbers(transform) == (0.0, 0.0, 0.0) for transform in sent)
@@ -150,11 +156,7 @@ def test_while_odometry_is_silent_the_transform_is_repeated(
 def test_one_stamp_from_the_future_does_not_go_to_tf(
     inside: Callable[..., Inside], tf2_ros: type[Broadcaster], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    now = 1000.0
-    monkeypatch.setattr(trajectory.time, 'monotonic', lambda: now)
-    robot = inside(refine_poses=True)
-    robot.node.start()
-    robot.until(lambda: robot.node.mapping)
+    robot, clock = mapping(inside, monkeypatch)
     tick, sent = robot.node.trajectory._tick, tf2_ros.sent
     path: list[Any] = []
     monkeypatch.setattr(robot.node.trajectory._out, 'publish_path', lambda frame, made, stamp: path.append(made))
@@ -170,7 +172,7 @@ def test_one_stamp_from_the_future_does_not_go_to_tf(
     robot.odometry(1000.0, 5.0)
     tick()
     assert seconds_of(sent[-1]) < 111.0
-    now += trajectory.LASTING + 0.1
+    clock[0] += trajectory.LASTING + 0.1
     tick()
     assert seconds_of(sent[-1]) == pytest.approx(1000.2)
     robot.odometry(110.0, 5.0)

@@ -28,7 +28,7 @@ LEFT = math.radians(3.0)
 
 WORTH_A_TRIAL = 1.5
 """Standard errors by which scan matching must foresee readings near by better than nodes that are known, for more to be
-tried: where corners are wrongly taken for square ones, it is 3.5 to 7; where they are square, 0.6 at the most."""
+tried. In 3 drives where corners were wrongly taken for square ones it was 3.5 to 7, in 4 others 0 to 0.6."""
 
 ROUNDS = 4
 """Times that the pose graph is made from what was found before, at the most."""
