@@ -23,7 +23,7 @@ from .opening import open_sources, repair_hint
 from .poses import POSES
 from .source import Channel, RawMessage, Source, one_line
 from .static_transforms import StaticTransforms
-from .transform_chain import TransformChain, chain_of
+from .transform_chain import TransformChain, chain_of, standing
 
 _CONVERSIONS: dict[str, Callable[[Any], RangeMessage | OdometryMessage | None]] = {RANGE: range_message, **POSES}
 _PROGRESS_STEP = 1000
@@ -229,13 +229,26 @@ class Bag:
 
     def moving_frames(self, topic: str | None = None) -> dict[str, str]:
         """Return the parent of each frame that transforms of this topic, or of `/tf`, place; they may move."""
-        names = {c.topic for c in self._channels() if c.msgtype == TF_MESSAGE}
-        topics = {name for name in names if (name.split('/')[-1] == 'tf' if topic is None else name == topic)}
+        topics = self._moving_topics() if topic is None else {topic}
         parents: dict[str, str] = {}
         for message in self._looked_at(topics):
             for item in message.transforms:
                 parents[str(item.child_frame_id).lstrip('/')] = str(item.header.frame_id).lstrip('/')
         return parents
+
+    def standing_transforms(self) -> StaticTransforms:
+        """Return the transforms on `/tf` that stay the same, besides those on `/tf_static`, which are believed more.
+
+        Simulators, and the static_transform_publisher of ROS 1's tf, repeat fixed transforms there.
+        """
+        transforms = StaticTransforms('/tf')
+        for parent, child, numbers in standing(self._looked_at(self._moving_topics())):
+            _add(transforms, parent, child, numbers[:3], numbers[3:])
+        transforms.take(self.static_transforms())
+        return transforms
+
+    def _moving_topics(self) -> set[str]:
+        return {c.topic for c in self._channels() if c.msgtype == TF_MESSAGE and c.topic.split('/')[-1] == 'tf'}
 
     def originals(self, topics: Topics) -> Iterator[tuple[str, Any]]:
         """Yield topic and message of the chosen topics by log time, whole and as rosbags decodes them."""
@@ -341,8 +354,14 @@ def _decoding(channels: Mapping[int, Channel], chain: TransformChain | None) -> 
 def _add_transform(transforms: StaticTransforms, item: Any) -> None:
     offset, turn = item.transform.translation, item.transform.rotation
     parent, child = str(item.header.frame_id), str(item.child_frame_id)
+    _add(transforms, parent, child, (offset.x, offset.y, offset.z), (turn.x, turn.y, turn.z, turn.w))
+
+
+def _add(
+    transforms: StaticTransforms, parent: str, child: str, offset: Sequence[float], quaternion: Sequence[float]
+) -> None:
     try:
-        transforms.add(parent, child, (offset.x, offset.y, offset.z), (turn.x, turn.y, turn.z, turn.w))
+        transforms.add(parent, child, offset, quaternion)
     except InputError as error:
         # One bad frame elsewhere on the robot must not stop a map that does not need it.
         transforms.rejected[child.lstrip('/')] = str(error)

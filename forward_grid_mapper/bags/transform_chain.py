@@ -69,13 +69,7 @@ def chain_of(messages: Iterable[Any]) -> TransformChain | None:
     None if a single transform of each message says it all: if the base is one frame, whose parent it moves in. None too
     if nothing moves, frames make a loop, or one has several parents, of which nobody knows the right one.
     """
-    links: dict[str, _Link] = {}
-    for message in messages:
-        for item in message.transforms:
-            parent, child, numbers = str(item.header.frame_id), str(item.child_frame_id), _numbers(item.transform)
-            link = links.setdefault(_plain(child), _Link(parent, child, numbers))
-            link.moves = link.moves or numbers != link.first
-            link.several = link.several or _plain(parent) != _plain(link.parent)
+    links = _links(messages)
     bases = [frame for frame in BASE_FRAMES if frame in links]
     up: list[_Link] = []
     frame = bases[0] if bases else ''
@@ -89,6 +83,24 @@ def chain_of(messages: Iterable[Any]) -> TransformChain | None:
     if frame in links or any(link.several for link in up[: highest + 1]):
         return None
     return TransformChain(up[: highest + 1])
+
+
+def standing(messages: Iterable[Any]) -> list[tuple[str, str, Numbers]]:
+    """Return (parent, child, transform) of the frames that all messages place alike."""
+    found = _links(messages).values()
+    return [(link.parent, link.child, link.first) for link in found if not (link.moves or link.several)]
+
+
+def _links(messages: Iterable[Any]) -> dict[str, _Link]:
+    """Return what places each frame, by its name without a leading slash."""
+    links: dict[str, _Link] = {}
+    for message in messages:
+        for item in message.transforms:
+            parent, child, numbers = str(item.header.frame_id), str(item.child_frame_id), _numbers(item.transform)
+            link = links.setdefault(_plain(child), _Link(parent, child, numbers))
+            link.moves = link.moves or numbers != link.first
+            link.several = link.several or _plain(parent) != _plain(link.parent)
+    return links
 
 
 def _numbers(transform: Any) -> Numbers:

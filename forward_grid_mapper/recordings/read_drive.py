@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import cache, partial
 from pathlib import Path
 
 from ..bags.decoder import TF_MESSAGE
@@ -43,9 +44,12 @@ class Extrinsics:
         The parents of frames that move, which `advice` tells of.
     """
 
-    def __init__(self, given: Mapping[str, Pose2], transforms: StaticTransforms) -> None:
+    def __init__(
+        self, given: Mapping[str, Pose2], transforms: StaticTransforms, more: Callable[[], StaticTransforms]
+    ) -> None:
+        """`more` finds transforms that are asked where `transforms` do not join a sensor to the robot."""
         self._given = {frame.lstrip('/'): pose for frame, pose in given.items()}
-        self._transforms = transforms
+        self._transforms, self._more = transforms, cache(more)
         self._found: dict[tuple[str, str], Pose2 | str | None] = {}
         self.steep: dict[str, str] = {}
         self.used: dict[str, str] = {}
@@ -65,8 +69,12 @@ class Extrinsics:
         if pose is not None:
             self.used[frame] = 'parameters'
             return pose
+        transforms, where = self._transforms, '/tf_static'
         try:
-            pose = self._transforms.lookup(base_frame, frame)
+            pose = transforms.lookup(base_frame, frame)
+            if pose is None and base_frame:
+                transforms, where = self._more(), 'transforms on /tf that stay the same'
+                pose = transforms.lookup(base_frame, frame)
         except SteepSensorError as error:
             self.steep[frame] = str(error)
             return STEEP
@@ -74,8 +82,8 @@ class Extrinsics:
             self.unusable[frame] = str(error)
             return None
         if pose is not None:
-            self.used[frame] = '/tf_static'
-            self.doubts.update(dict.fromkeys(self._transforms.doubts(base_frame, frame)))
+            self.used[frame] = where
+            self.doubts.update(dict.fromkeys(transforms.doubts(base_frame, frame)))
         return pose
 
     @property
@@ -109,7 +117,7 @@ class Extrinsics:
             return ''
         return (
             f' Only transforms that may move join {", ".join(found)} to the robot: sensors on moving joints are not '
-            f'supported with bags (the node maps them while the robot drives). If the joint stands still, a pose does.'
+            f'supported with bags (the node maps them while the robot drives). If the joint hardly moves, a pose does.'
         )
 
 
@@ -159,7 +167,7 @@ def read_drive(
             topics = bag.choose_topics(range_topics, odom_topic, any_poses=True)
         else:
             topics = bag.choose_range_topics(range_topics)
-        lookup = Extrinsics(extrinsics, bag.static_transforms(topics))
+        lookup = Extrinsics(extrinsics, bag.static_transforms(topics), partial(_standing, path))
         associator = BatchAssociator(lookup, parameters)
         live = LogOddsMapOfAll(associator, parameters)
         # the poses before and after a reading place it
@@ -209,6 +217,12 @@ def read_drive(
         'warnings': warnings + thinning_note(associator),
     }
     return Drive(associator, source, live)
+
+
+def _standing(path: Path | str) -> StaticTransforms:
+    """Return the transforms of a bag that stay the same; it may be open for reading elsewhere."""
+    with Bag(path) as bag:
+        return bag.standing_transforms()
 
 
 def _warnings(bag: Bag, associator: PoseAssociator, lookup: Extrinsics) -> list[str]:

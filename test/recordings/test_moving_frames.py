@@ -126,6 +126,28 @@ def test_a_sensor_on_a_joint_is_told(tmp_path: Path, frame: str, named: str) -> 
         read(path)
 
 
+@pytest.mark.parametrize('kind', ['mcap', 'ros1'])
+@pytest.mark.parametrize('slash', ['', '/'])
+def test_transforms_that_are_repeated_are_as_good_as_static_ones(tmp_path: Path, kind: str, slash: str) -> None:
+    """As by the static_transform_publisher of ROS 1's tf, and by simulators."""
+    suffix = '.bag' if kind == 'ros1' else ''
+    fixed = [(f'{slash}base_link', f'{slash}mast', lambda i: Pose2(0.3, -0.1, 0.7)), ('mast', 'sonar', lambda i: SENSOR)]
+    path = recorded(tmp_path / f'bag{suffix}', [[('odom', 'base_link', at)], fixed], kind, ('base_link', 'laser'))
+    drive = read(path)
+    expected = Pose2(0.3, -0.1, 0.7).compose(SENSOR)
+    assert drive.source['extrinsics']['sonar'] == pytest.approx(expected)
+    assert drive.source['mounts_from'] == 'transforms on /tf that stay the same'
+    assert drive.source['warnings'] == []
+
+
+def test_static_transforms_are_believed_more_than_repeated_ones(tmp_path: Path) -> None:
+    fixed = [('base_link', 'mast', lambda i: Pose2(0.3, 0.0, 0.0)), ('mast', 'sonar', lambda i: Pose2(9.0, 9.0, 0.0))]
+    path = recorded(tmp_path / 'bag', [[('odom', 'base_link', at)], fixed], fixed=('mast', 'sonar'))
+    drive = read(path)
+    assert drive.source['extrinsics']['sonar'] == pytest.approx(Pose2(0.3, 0.0, 0.0).compose(SENSOR))
+    assert ['/tf and /tf_static give different poses' in warning for warning in drive.source['warnings']] == [True]
+
+
 def test_long_recordings_are_not_read_twice_as_a_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = recorded(tmp_path / 'bag', [[MOVING], [BACK]])
     monkeypatch.setattr(reader, 'MOST_LOOKED_AT', 20)
