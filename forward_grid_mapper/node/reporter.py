@@ -8,6 +8,7 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 
 from ..core.messages.extrinsics import STEEP
+from ..core.messages.mounts import far_mounts
 from ..core.messages.pose_association import MOST_FRAMES, PoseAssociator
 from ..core.messages.rep117 import REASONS
 from . import diagnostics
@@ -50,7 +51,7 @@ class Reporter:
         self._reported: set[str] = set()
         self._lost: set[str] = set()
         self._quiet: set[str] = set()
-        self._no_map_frame = self._no_name = False
+        self._no_map_frame = self._no_name = self._far = False
         self._out = node.create_publisher(DiagnosticArray, '/diagnostics', 10)
 
     def report(self) -> None:
@@ -153,6 +154,9 @@ class Reporter:
                 'its readings are rejected'
             )
         self._lost = unknown & self._reported
+        if not self._far and (far := far_mounts(self._extrinsics.fixed)):
+            self._far = True
+            self._node.get_logger().warning(far[0])
         for frame, counts in list(self._associator.rejected_by_frame.items()):
             if STEEP in counts and frame not in self._reported and len(self._reported) < MOST_FRAMES:
                 self._reported.add(frame)

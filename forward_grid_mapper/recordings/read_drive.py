@@ -17,6 +17,7 @@ from ..core.messages.batch_association import BatchAssociator
 from ..core.messages.extrinsics import STEEP
 from ..core.messages.message_batch import batch_of
 from ..core.messages.message_types import NANOSECONDS, Pose2
+from ..core.messages.mounts import far_mounts
 from ..core.messages.pose_association import PoseAssociator
 from ..core.messages.rep117 import ODOMETRY_REASONS, REASONS, rejection_warnings
 from ..files.journal import drive_file
@@ -234,7 +235,7 @@ def _warnings(bag: Bag, associator: PoseAssociator, lookup: Extrinsics) -> list[
     if associator.unknown_frames:
         lookup.moving = bag.moving_frames()
         warnings.append(lookup.advice(associator.base_frame, sorted(associator.unknown_frames)))
-    warnings += [*lookup.steep.values(), *lookup.doubts]
+    warnings += [*lookup.steep.values(), *lookup.doubts, *far_mounts(lookup.poses)]
     if unused := lookup.unused:
         warnings.append(
             f'poses were given for {", ".join(unused)}, but no reading has such a frame; is the name right?'

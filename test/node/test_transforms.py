@@ -271,6 +271,19 @@ def test_the_log_tells_once_of_a_map_frame_without_its_transform_and_of_its_end(
     assert told.count('the transform to map_frame is there') == 1
 
 
+def test_the_log_tells_once_of_a_sensor_in_millimetres(inside: Callable[..., Inside], log: Callable[[Inside], Log]) -> None:
+    robot = begun(inside)
+    told = log(robot)
+    pose = Transform()
+    pose.translation.x, pose.rotation.w = 150.0, 1.0
+    buffer: Any = robot.node._extrinsics._transforms._buffer
+    buffer.set_transform_static(pose, '')
+    from_tower(robot, 0, 5)
+    for _ in range(3):
+        robot.status('readings')
+    assert told.count('transforms put tower up to 150 m away from the middle of the robot') == 1
+
+
 def test_the_log_tells_once_of_a_steep_sensor(inside: Callable[..., Inside], log: Callable[[Inside], Log]) -> None:
     robot = begun(inside)
     told = log(robot)

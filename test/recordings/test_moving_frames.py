@@ -140,6 +140,13 @@ def test_transforms_that_are_repeated_are_as_good_as_static_ones(tmp_path: Path,
     assert drive.source['warnings'] == []
 
 
+def test_transforms_in_millimetres_are_told(tmp_path: Path) -> None:
+    fixed = [('base_link', 'mast', lambda i: Pose2(300.0, 0.0, 0.0))]
+    path = recorded(tmp_path / 'bag', [[('odom', 'base_link', at)], fixed], fixed=('mast', 'sonar'))
+    (warning,) = read(path).source['warnings']
+    assert warning.startswith('transforms put sonar up to 300 m away') and 'in millimetres?' in warning
+
+
 def test_static_transforms_are_believed_more_than_repeated_ones(tmp_path: Path) -> None:
     fixed = [('base_link', 'mast', lambda i: Pose2(0.3, 0.0, 0.0)), ('mast', 'sonar', lambda i: Pose2(9.0, 9.0, 0.0))]
     path = recorded(tmp_path / 'bag', [[('odom', 'base_link', at)], fixed], fixed=('mast', 'sonar'))

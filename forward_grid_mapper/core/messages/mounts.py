@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from numbers import Real
 
 from ..common.errors import ParameterError
@@ -47,3 +47,19 @@ def mount_from(name: str, values: object) -> Pose2:
             f'than {FARTHEST:g} m; x and y are in metres'
         )
     return pose
+
+
+def far_mounts(poses: Mapping[str, Pose2]) -> list[str]:
+    """Return a warning of sensors that transforms put so far away as a parameter may not; `poses` are by frame.
+
+    They are mapped all the same: a crane's transforms may be right.
+    """
+    away = {frame: math.hypot(pose.x, pose.y) for frame, pose in poses.items()}
+    far = sorted(frame for frame, distance in away.items() if distance > FARTHEST)
+    if not far:
+        return []
+    return [
+        f'transforms put {", ".join(far[:8])}{" and others" if len(far) > 8 else ""} up to '
+        f'{max(away.values()):.3g} m away from the middle of the robot: are they in millimetres? Transforms are in '
+        f'metres; correct the URDF, or what publishes them, or give sensors.{far[0]}.pose'
+    ]

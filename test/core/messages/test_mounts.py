@@ -10,7 +10,7 @@ import pytest
 
 from forward_grid_mapper.core.common.errors import ParameterError
 from forward_grid_mapper.core.messages.message_types import Pose2
-from forward_grid_mapper.core.messages.mounts import FARTHEST, TURN, mount_from
+from forward_grid_mapper.core.messages.mounts import FARTHEST, TURN, far_mounts, mount_from
 
 
 @pytest.mark.parametrize('form', [list, tuple, np.array, lambda values: array.array('d', values)])
@@ -43,3 +43,12 @@ def test_the_limits_are_admitted() -> None:
 def test_what_is_refused(values: object, message: str) -> None:
     with pytest.raises(ParameterError, match=message):
         mount_from('left', values)
+
+
+def test_far_sensors_are_named_with_the_farthest() -> None:
+    near = Pose2(FARTHEST, 0.0, 0.0)
+    assert far_mounts({}) == far_mounts({'left': near}) == []
+    (warning,) = far_mounts({'left': near, 'back': Pose2(-150.0, 0.0, 0.0), 'front': Pose2(0.0, 170.0, 0.0)})
+    assert 'put back, front up to 170 m away' in warning and 'millimetres' in warning and 'left' not in warning
+    (warning,) = far_mounts({f'sonar_{k:02d}': Pose2(20.0 + k, 0.0, 0.0) for k in range(24)})
+    assert 'sonar_07 and others up to 43 m' in warning and 'sonar_08' not in warning
