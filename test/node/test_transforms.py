@@ -271,7 +271,9 @@ def test_the_log_tells_once_of_a_map_frame_without_its_transform_and_of_its_end(
     assert told.count('the transform to map_frame is there') == 1
 
 
-def test_the_log_tells_once_of_a_sensor_in_millimetres(inside: Callable[..., Inside], log: Callable[[Inside], Log]) -> None:
+def test_the_log_tells_once_of_a_sensor_in_millimetres(
+    inside: Callable[..., Inside], log: Callable[[Inside], Log]
+) -> None:
     robot = begun(inside)
     told = log(robot)
     pose = Transform()

@@ -131,7 +131,10 @@ def test_a_sensor_on_a_joint_is_told(tmp_path: Path, frame: str, named: str) -> 
 def test_transforms_that_are_repeated_are_as_good_as_static_ones(tmp_path: Path, kind: str, slash: str) -> None:
     """As by the static_transform_publisher of ROS 1's tf, and by simulators."""
     suffix = '.bag' if kind == 'ros1' else ''
-    fixed = [(f'{slash}base_link', f'{slash}mast', lambda i: Pose2(0.3, -0.1, 0.7)), ('mast', 'sonar', lambda i: SENSOR)]
+    fixed = [
+        (f'{slash}base_link', f'{slash}mast', lambda i: Pose2(0.3, -0.1, 0.7)),
+        ('mast', 'sonar', lambda i: SENSOR),
+    ]
     path = recorded(tmp_path / f'bag{suffix}', [[('odom', 'base_link', at)], fixed], kind, ('base_link', 'laser'))
     drive = read(path)
     expected = Pose2(0.3, -0.1, 0.7).compose(SENSOR)

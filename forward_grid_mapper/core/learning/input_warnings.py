@@ -79,6 +79,16 @@ SILENT = 0.05
 ECHOES = 200
 """Echoes from which on that is said."""
 
+CEILING, ABOVE = 0.05, 0.005
+"""A driver that has a range of its own for 'no echo' sends it in this part of its echoes, and hardly any is longer."""
+
+NONE = 0.01
+"""Part of the readings that are without echo then, at the most."""
+
+BELOW, DIRECTIONS = 0.05, 3
+"""Metres below that range in which there are few echoes, unlike those of a wall; and twelfths of the circle, at least,
+in which it is sent."""
+
 HANDFUL, SWEEPS = 0.02, 2
 """Part of readings, and rounds of all sensors, that may not make the map much larger; a wild pose places a round."""
 
@@ -94,7 +104,7 @@ def input_warnings(readings: Readings) -> list[str]:
     if len(readings) < ENOUGH:
         return []
     by_time = readings.select(np.argsort(readings.stamp, kind='stable'))
-    checks = (_copies, _shared_frame, _speed, _standing, _stuck, _field_of_view, _reach, _extent)
+    checks = (_copies, _shared_frame, _speed, _standing, _stuck, _ceiling, _field_of_view, _reach, _extent)
     return [text for check in checks if (text := check(by_time))]
 
 
@@ -187,10 +197,7 @@ def _standing(readings: Readings) -> str:
 
 def _still_times(mine: Readings) -> Iterable[tuple[int, int]]:
     """Yield begin and end, in nanoseconds, of the times in which a sensor did not move."""
-    moved = (np.hypot(np.diff(mine.x), np.diff(mine.y)) > STILL[0]) | (
-        np.abs(np.remainder(np.diff(mine.yaw) + math.pi, 2 * math.pi) - math.pi) > STILL[1]
-    )
-    cuts = np.flatnonzero(moved) + 1
+    cuts = np.flatnonzero(_moving(mine))
     for first, last in zip([0, *cuts.tolist()], [*cuts.tolist(), len(mine)], strict=True):
         # steps too small to be seen one by one add up
         part = slice(first, last)
@@ -234,13 +241,51 @@ def _drove(mine: Readings) -> bool:
     return path >= MOVED and float(np.ptp(np.unwrap(mine.yaw))) >= TURNED
 
 
+def _ceiling(readings: Readings) -> str:
+    """Look for a range that stands for 'no echo', below max_range: the longest one of all, ever again."""
+    echo = readings.echo
+    if np.count_nonzero(~echo) > NONE * len(readings):
+        return ''
+    # a robot that stands sees one range for long
+    parts = [mine.select(mine.echo & _moving(mine)) for _, mine in _sensors(readings)]
+    heard: Floats = np.concatenate([mine.z for mine in parts]) if parts else np.zeros(0)
+    if len(heard) < ECHOES:
+        return ''
+    longest = round(float(np.quantile(heard, 1.0 - ABOVE)), 3)
+    same = np.abs(heard - longest) < 0.0005
+    nearly = (heard > longest - BELOW) & (heard < longest) & ~same
+    if np.count_nonzero(same) < max(CEILING * len(heard), 2 * np.count_nonzero(nearly)):
+        return ''
+    # a robot that follows a wall sees it in the same directions for long
+    towards = np.remainder(np.concatenate([mine.yaw for mine in parts])[same], 2 * math.pi)
+    sectors = np.bincount((towards / (2 * math.pi) * 12).astype(np.int64))
+    if np.count_nonzero(sectors >= LEAST) < DIRECTIONS:
+        return ''
+    return (
+        f'{np.count_nonzero(same) / len(heard):.0%} of the echoes are at {longest:.3f} m, hardly any is longer, and no '
+        f'reading is without echo: is that what the driver sends where it hears nothing? Then set the parameter '
+        f'max_range to {0.98 * longest:.2g}, or a wall is mapped at that range'
+    )
+
+
+def _moving(mine: Readings) -> NDArray[np.bool_]:
+    """Return which readings of a sensor are from another place, or in another direction, than the one before."""
+    turned = np.abs(np.remainder(np.diff(mine.yaw) + math.pi, 2 * math.pi) - math.pi)
+    moved = (np.hypot(np.diff(mine.x), np.diff(mine.y)) > STILL[0]) | (turned > STILL[1])
+    return np.append(False, moved)
+
+
 def _field_of_view(readings: Readings) -> str:
     angle = 2 * readings.half_angle
     odd = (angle < NARROW) | (angle > WIDE)
     if np.count_nonzero(odd) < 0.5 * len(readings):
         return ''
     degrees = math.degrees(float(np.median(angle[odd])))
-    cause = 'is it in degrees?' if degrees > 90 else 'is it half of the angle, or a default of the driver?'
+    cause = (
+        'is it in degrees, or a default of a simulator?'
+        if degrees > 90
+        else 'is it half of the angle, or a default of the driver?'
+    )
     return (
         f'the field of view is {degrees:.3g} degrees, which no sonar has; {cause} field_of_view is the full angle of '
         f'the cone in radians, 0.26 for 15 degrees: correct the driver, or set the parameter field_of_view'
@@ -248,7 +293,10 @@ def _field_of_view(readings: Readings) -> str:
 
 
 def _reach(readings: Readings) -> str:
-    echo = readings.echo
+    # what a fixed-distance ranger says of an echo (`rep117.measure`) is half of its max_range
+    echo = readings.echo & ~(
+        np.isclose(2 * readings.z, readings.z_max) & np.isclose(12 * readings.sigma, readings.z_max)
+    )
     heard: Floats = readings.z[echo]
     if len(heard) < ECHOES or np.count_nonzero(~echo) < SILENT * len(readings):
         return ''

@@ -43,6 +43,8 @@ FEW_SHARE = 0.1
 """Nor are fewer than this part of the median of the others."""
 SILENT, DEAF = 0.95, 0.2
 """A sensor without echoes has at least the first fraction of max-range readings, and the second of missed obstacles."""
+PHANTOMS = 0.5
+"""So large a part of the few echoes it has is random."""
 SHORT = 0.5
 RANDOM = 0.5
 SAME, WINDOW = 0.8, 0.2
@@ -253,7 +255,9 @@ def _verdict(number: int, usual: float, mine: dict[str, float], others: dict[str
         # a sensor alone is judged by itself
         return not math.isfinite(others[kind]) or mine[kind] >= others[kind] + ABOVE
 
-    if mine['no_echo'] >= SILENT and mine['missed'] >= DEAF and above('no_echo'):
+    # a robot may stand for hours before what a sensor does not hear; echoes that the map explains were heard
+    phantoms = mine['random'] >= PHANTOMS * (1.0 - mine['no_echo'])
+    if mine['no_echo'] >= SILENT and mine['missed'] >= DEAF and phantoms and above('no_echo'):
         return 'never hears anything'
     if mine['short'] >= SHORT and mine['same'] >= SAME and above('short'):
         return 'always short'

@@ -115,7 +115,17 @@ def astray(seconds: float) -> Messages:
 def far_echo() -> Messages:
     """Sound ranges in a room, of a sensor that states a limit of 90 m, and one echo that comes near it."""
     one = circling().ranges[2000]
-    return circling().with_ranges(lambda m: m._replace(max_range=90.0, range=80.0 if m is one else min(m.range, 5.0)))
+    near = circling().with_ranges(lambda m: m._replace(range=min(m.range, 4.5 + m.stamp % 700_000_000 / 2e9)))
+    return near.with_ranges(
+        lambda m: m._replace(
+            max_range=90.0, range=80.0 if m.stamp == one.stamp and m.frame_id == one.frame_id else m.range
+        )
+    )
+
+
+def own_silence(value: float) -> Messages:
+    """A driver that sends a range of its own below max_range where there is no echo."""
+    return drive().with_ranges(lambda m: m._replace(range=min(m.range, value)))
 
 
 SCENARIOS: dict[str, tuple[Callable[[], Messages], str]] = {
@@ -133,7 +143,7 @@ SCENARIOS: dict[str, tuple[Callable[[], Messages], str]] = {
     ),
     'field of view of 120 degrees': (
         lambda: drive().with_ranges(lambda m: m._replace(field_of_view=math.radians(120))),
-        r'field of view is 120 degrees',
+        r'field of view is 120 degrees.*a default of a simulator\?',
     ),
     'max_range four times too large': (
         lambda: drive().with_ranges(
@@ -141,6 +151,11 @@ SCENARIOS: dict[str, tuple[Callable[[], Messages], str]] = {
         ),
         r'no echo comes from beyond.*does the sensor reach so far.*set the parameter max_range',
     ),
+    'no echo is 3 m, max_range 5 m': (
+        lambda: own_silence(3.0),
+        r'of the echoes are at 3\.000 m.*where it hears nothing.*set the parameter max_range to 2\.9,',
+    ),
+    'no echo is a float below max_range': (lambda: own_silence(4.9999995), r'of the echoes are at 5\.000 m'),
     'no limit stated': (
         lambda: drive().with_ranges(
             lambda m: m._replace(max_range=3.4e38, range=math.inf if m.range >= m.max_range else m.range)
@@ -238,3 +253,30 @@ def test_few_readings_say_nothing() -> None:
 def test_what_a_driver_sends_for_no_echo_is_no_fault() -> None:
     for value in (5.11, 6.5535, 65.535, 99.0):
         assert told(drive().with_ranges(lambda m, v=value: m._replace(range=v) if m.range >= m.max_range else m)) == []
+
+
+def test_echoes_of_fixed_distance_rangers_are_no_fault() -> None:
+    """REP 117: -inf is an echo somewhere below max_range, which is mapped as half of it."""
+
+    def fixed(m: RangeMessage) -> RangeMessage:
+        return m._replace(range=-math.inf if m.range < 1.5 else math.inf, min_range=1.5, max_range=1.5)
+
+    assert told(drive().with_ranges(fixed)) == []
+
+
+def test_a_wall_that_is_far_and_always_as_far_is_no_silence() -> None:
+    """A robot that stands for long, with ranges in centimetres; and one that drives to and fro beside a wall."""
+    rounded = circling().with_ranges(lambda m: m._replace(range=round(min(m.range, 4.5), 2), max_range=4.5))
+    last = rounded.odometry[-1]
+    poses = [last._replace(stamp=last.stamp + k * 100_000_000) for k in range(1, 3000)]
+    farthest = [m._replace(range=4.4) for m in rounded.ranges[-len(rounded.extrinsics) :]]
+    ranges = [m._replace(stamp=pose.stamp) for pose in poses for m in farthest]
+    assert not [text for text in told(Messages(rounded.extrinsics, poses, ranges)) if 'hears nothing' in text]
+
+    at_the_side = {'left': Pose2(0.0, 0.0, math.pi / 2)}
+    beside = [Pose2(min(k, 200 - k) * 0.1, 0.0, 0.0) for k in range(200)]
+    poses = [OdometryMessage(k * 500_000_000, 'odom', 'base_link', pose) for k, pose in enumerate(beside)]
+    ranges = [
+        RangeMessage(k * 250_000_000, 'left', round(1.5 + 0.01 * math.sin(k), 2), 0.1, 4.0, 0.26) for k in range(400)
+    ]
+    assert not [text for text in told(Messages(at_the_side, poses, ranges)) if 'hears nothing' in text]

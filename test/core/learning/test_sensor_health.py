@@ -17,6 +17,7 @@ from forward_grid_mapper.core.common.readings import Readings
 from forward_grid_mapper.core.learning.sensor_health import (
     commonest_range,
     first_obstacles,
+    health_of_counts,
     health_warning,
     sensor_health,
 )
@@ -88,6 +89,26 @@ def test_neither_smooth_walls_nor_a_follower_are_a_sensors_fault() -> None:
     assert health_warning(table) == ''
     # behind the robot
     assert 'something moves near it' in {table[f'sonar_{k:02d}'].verdict for k in (11, 12, 13)}
+
+
+@pytest.mark.parametrize(
+    ('silent', 'random', 'verdict'),
+    [(970, 5, 'ok'), (970, 25, 'never hears anything'), (1000, 0, 'never hears anything')],
+)
+def test_a_sensor_hears_if_the_map_explains_its_few_echoes(silent: int, random: int, verdict: str) -> None:
+    """A robot may stand for hours where one of its sensors does not hear the wall before it."""
+    ranges = np.zeros((3, 400), np.int64)
+    ranges[:, 10], ranges[:, 30] = 1, [1000 - silent, 900, 900]
+    counts = {
+        'readings': np.full(3, 1000),
+        'no_echo': np.array([silent, 100, 100]),
+        'missed': np.array([800, 0, 0]),
+        'random': np.array([random, 20, 20]),
+        'short': np.zeros(3, np.int64),
+        'ranges': ranges,
+    }
+    table = health_of_counts(('left', 'front', 'right'), counts)
+    assert [row.verdict for row in table.values()] == [verdict, 'ok', 'ok']
 
 
 def test_few_readings_are_not_judged() -> None:
