@@ -109,7 +109,10 @@ def choose_range_topics(contents: Contents, range_topics: Sequence[str] | None) 
     else:
         ranges = tuple(dict.fromkeys(_named(contents, topic, (RANGE,), '--range-topics') for topic in range_topics))
     if not ranges:
-        raise BagError(f'The bag has no sensor_msgs/Range messages to map from. {_listing(contents)}')
+        raise BagError(
+            f'The bag has no sensor_msgs/Range messages to map from; LaserScan, PointCloud and others are not read: '
+            f'publish each reading of a sonar as a Range. {_listing(contents)}'
+        )
     return ranges
 
 

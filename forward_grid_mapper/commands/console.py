@@ -25,6 +25,9 @@ COMPILES = '(compiling kernels, which takes half a minute once)'
 PATIENCE = 1.0
 """Seconds of work before progress is shown."""
 
+LONG = 10.0
+"""Seconds of work before it is said what is wrong with its input, which may not be worth to wait for."""
+
 ON_SCREEN, IN_LOG = 0.2, 1.0
 """Seconds between two looks at what is to be shown, on a terminal and elsewhere."""
 
@@ -94,6 +97,7 @@ class Ticker:
         self._text = ''
         self._compiles = False
         self._shown = ''
+        self._warnings: list[str] = []
         self._begin = time.monotonic()
         self._done = threading.Event()
         self._thread = threading.Thread(target=self._watch, daemon=True)
@@ -116,6 +120,10 @@ class Ticker:
         self._text = text
         if not self._quiet:
             self._compiles = False
+
+    def warn(self, warnings: Sequence[str]) -> None:
+        """Set what is known to be wrong with the input; it is shown if the work is long, else in the report alone."""
+        self._warnings = list(warnings)
 
     def reading(self, done: int, total: int) -> None:
         """Report messages read, for `Bag.messages`."""
@@ -143,6 +151,10 @@ class Ticker:
                 continue
             if seconds < PATIENCE or not self._text:
                 continue
+            if seconds >= LONG and self._warnings:
+                before = '\r\033[K' if on_screen else ''
+                print(*(f'{before}warning: {text}' for text in self._warnings), sep='\n', file=self._stream, flush=True)
+                self._warnings = []
             # what was compiled a moment ago is shown until the next stage, so that the line does not flicker
             self._compiles = self._compiles or compiling()
             text = f'{self._text} {COMPILES}' if self._compiles else self._text

@@ -142,6 +142,7 @@ def process(options: argparse.Namespace) -> int:
         )
         source = drives.source
         source['warnings'] += ignored
+        ticker.warn(source['warnings'])
         read = time.perf_counter() - begin
         refined = None
         if options.refine_poses or given:

@@ -101,6 +101,8 @@ class Extrinsics:
         """Say what to do about frames without a pose."""
         known = self._transforms.frames
         joined = f'/tf_static joins {", ".join(known[:12])}' if known else 'the bag has no /tf_static'
+        if not base_frame:
+            joined += '; odometry has no child_frame_id, without which transforms cannot be asked'
         reasons = ''.join(f' {self.unusable[frame]}' for frame in frames if frame in self.unusable)
         reasons += self._on_joints(frames)
         options = ' '.join(f'--sensor {quoted(f"{frame}=x,y,yaw")}' for frame in frames[:MOST_OPTIONS])
@@ -281,7 +283,7 @@ def _nothing_associated(
         return BagError(f'the chosen topics hold no readable {kind} message{f" ({lost})" if lost else ""}')
     if set(associator.rejected) == {'unknown_extrinsics'}:
         return InputError(lookup.advice(associator.base_frame, sorted(associator.unknown_frames)))
-    if ranges[1] < odometry[0] or ranges[0] > odometry[1]:
+    if set(associator.rejected) != {'zero_stamp'} and (ranges[1] < odometry[0] or ranges[0] > odometry[1]):
         a, b, c, d = (stamp / NANOSECONDS for stamp in (*ranges, *odometry))
         other = 'odometry' if poses is None else readable(poses.path)
         why = 'are the drivers set to' if poses is None else 'do the poses have'

@@ -130,7 +130,7 @@ def test_a_bag_of_which_nothing_is_left(tmp_path: Path, capsys: pytest.CaptureFi
 
 def test_no_range(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     said = refused_drive(capsys, tmp_path, tape()._replace(ranges=[]))
-    assert 'no sensor_msgs/Range' in said
+    assert 'no sensor_msgs/Range' in said and 'LaserScan, PointCloud and others are not read' in said
     assert '/odom: ' in said and '/tf_static: ' in said
 
 
@@ -206,6 +206,16 @@ def test_names_that_would_write_on_the_terminal_are_rejected_and_shown_as_text(t
 def test_frames_that_do_not_join_the_robot(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     said = refused_drive(capsys, tmp_path, tape().with_odometry(child_frame_id='base_footprint'))
     assert 'base_footprint' in said and 'base_link' in said and '--sensor' in said
+
+
+def test_odometry_that_does_not_name_the_robot(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    said = refused_drive(capsys, tmp_path, tape().with_odometry(child_frame_id=''))
+    assert 'odometry has no child_frame_id' in said and '--sensor' in said
+
+
+def test_stamps_that_nobody_filled_in(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    said = refused_drive(capsys, tmp_path, tape().with_ranges(stamp=0))
+    assert f'{COUNT} zero_stamp (header.stamp is 0: have the driver fill it in)' in said
 
 
 def test_one_frame_without_a_pose_costs_only_its_readings(tmp_path: Path) -> None:
@@ -349,9 +359,10 @@ def test_a_field_of_view_that_cannot_be(tmp_path: Path, capsys: pytest.CaptureFi
 @pytest.mark.parametrize(
     ('changes', 'reason', 'words'),
     [
-        ({'range': math.nan}, 'nan_range', 'not a number'),
+        ({'range': math.nan}, 'nan_range', 'not a number; a driver that means "no echo" should send +inf'),
         ({'range': -math.inf}, 'too_near', '-inf'),
         ({'range': 0.0}, 'below_min_range', 'below min_range'),
+        ({'range': 0.0, 'min_range': 0.0}, 'too_near', 'a driver that means "no echo" and should send +inf'),
         ({'max_range': math.inf}, 'bad_limits', 'not finite'),
         ({'max_range': 0.0}, 'bad_limits', 'max_range'),
         ({'min_range': -1.0}, 'bad_limits', 'negative'),

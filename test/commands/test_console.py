@@ -248,6 +248,35 @@ def test_shows_longer_work(monkeypatch: pytest.MonkeyPatch) -> None:
     assert '\n' not in shown['screen']
 
 
+def test_long_work_says_what_is_wrong_with_its_input(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ('PATIENCE', 'LONG', 'ON_SCREEN', 'IN_LOG'):
+        monkeypatch.setattr(console, name, 0.05)
+    log, screen, quiet = io.StringIO(), Screen(), io.StringIO()
+    with Ticker(stream=log) as one, Ticker(stream=screen) as two, Ticker(quiet=True, stream=quiet) as three:
+        for ticker in (one, two, three):
+            ticker.warn(['max_range is 400 m', 'no echo'])
+            ticker.say('index')
+        for stream in (log, screen):
+            wait_until_shown(stream, 'index')
+            begin = len(stream.getvalue())
+            one.say('search')
+            two.say('search')
+            wait_until_shown(stream, 'search', begin)
+    assert log.getvalue().startswith('warning: max_range is 400 m\nwarning: no echo\n')
+    assert screen.getvalue().startswith('\r\033[Kwarning: max_range is 400 m\n\r\033[Kwarning: no echo\n')
+    assert log.getvalue().count('warning') == screen.getvalue().count('warning') == 2
+    assert quiet.getvalue() == ''
+
+
+def test_short_work_leaves_warnings_to_the_report() -> None:
+    stream = io.StringIO()
+    with Ticker(stream=stream) as ticker:
+        ticker.warn(['max_range is 400 m'])
+        ticker.say('index')
+        wait_until_shown(stream, 'index')
+    assert 'warning' not in stream.getvalue()
+
+
 def wait_until_shown(stream: io.StringIO, text: str, begin: int = 0) -> None:
     end = time.monotonic() + 30.0
     while text not in stream.getvalue()[begin:]:

@@ -15,8 +15,9 @@ from .message_batch import REASON, Ranges
 from .message_types import RangeMessage
 
 REASONS = {
-    'nan_range': 'the range is not a number',
-    'too_near': 'the range is -inf, or less than a millimetre: something too near to measure, or a dead sensor',
+    'nan_range': 'the range is not a number; a driver that means "no echo" should send +inf (REP 117)',
+    'too_near': 'the range is -inf, or less than a millimetre: something too near to measure, a dead sensor, or a '
+    'driver that means "no echo" and should send +inf (REP 117)',
     'below_min_range': 'the range is below min_range; a driver that means "no echo" should send +inf (REP 117), not 0',
     'over_range': 'no echo, and over_range is "discard"',
     'bad_limits': 'min_range or max_range is negative or not finite, or max_range is not above min_range, or below a '
