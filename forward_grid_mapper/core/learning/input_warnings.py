@@ -23,6 +23,10 @@ ENOUGH = 30
 COPIES = 0.3
 """Part of the readings that must be copies of others; a driver may send a value twice now and then."""
 
+COARSE, CROWDED = 1_000_000, 2.0
+"""Nanoseconds after a whole second that all stamps lie within where nanosec is not filled in, or in another unit; and
+the readings of a sensor in such a second."""
+
 AT_ONCE = 0.3
 """Part of a sensor's readings that share their stamp with another one of a different range."""
 
@@ -103,6 +107,9 @@ def input_warnings(readings: Readings) -> list[str]:
     """Return what is wrong with readings that have a pose; empty if nothing seems to be."""
     if len(readings) < ENOUGH:
         return []
+    if text := _whole_seconds(readings):
+        # the other checks compare readings in their order
+        return [text]
     by_time = readings.select(np.argsort(readings.stamp, kind='stable'))
     checks = (_copies, _shared_frame, _speed, _standing, _stuck, _ceiling, _field_of_view, _reach, _extent)
     return [text for check in checks if (text := check(by_time))]
@@ -132,6 +139,20 @@ def _copies(readings: Readings) -> str:
         f'{copies} of {len(z)} readings are copies of others (same sensor, stamp and range), and count as evidence '
         f'of their own: was a topic recorded twice, or is it published by two nodes? Leave one of them out '
         f'(range_topics)'
+    )
+
+
+def _whole_seconds(readings: Readings) -> str:
+    """Look for stamps whose nanoseconds are not filled in, or in another unit, and for those that are not at all."""
+    if readings.stamp.min() < 0 or np.any(readings.stamp % 1_000_000_000 >= COARSE):
+        return ''
+    most = max((len(mine) / len(np.unique(mine.stamp // 1_000_000_000)) for _, mine in _sensors(readings)), default=0.0)
+    if most < CROWDED:
+        return ''
+    stamps = 'all stamps are one and the same' if np.ptp(readings.stamp) == 0 else 'all stamps are whole seconds'
+    return (
+        f'{stamps}, though a sensor has {most:.0f} readings at each: does the driver fill in header.stamp, with its '
+        f'nanosec in nanoseconds? Readings are placed where the robot was at their stamp'
     )
 
 

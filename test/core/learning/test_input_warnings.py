@@ -128,8 +128,25 @@ def own_silence(value: float) -> Messages:
     return drive().with_ranges(lambda m: m._replace(range=min(m.range, value)))
 
 
+def stamped(change: Callable[[int], int]) -> Messages:
+    """Stamps that a driver fills in wrongly, of ranges and odometry alike."""
+    ranges = [m._replace(stamp=change(m.stamp)) for m in circling().ranges]
+    return circling()._replace(ranges=ranges, odometry=[m._replace(stamp=change(m.stamp)) for m in circling().odometry])
+
+
+SECOND = 1_000_000_000
+
 SCENARIOS: dict[str, tuple[Callable[[], Messages], str]] = {
     'every message twice': (twice, r'copies of others.*recorded twice.*Leave one'),
+    'stamps of 0': (lambda: stamped(lambda stamp: 0), r'all stamps are one and the same.*fill in header\.stamp'),
+    'stamps without nanoseconds': (
+        lambda: stamped(lambda stamp: stamp - stamp % SECOND),
+        r'all stamps are whole seconds, though a sensor has 10 readings at each.*nanosec in nanoseconds',
+    ),
+    'milliseconds in place of nanoseconds': (
+        lambda: stamped(lambda stamp: stamp - stamp % SECOND + stamp % SECOND // 1_000_000),
+        r'all stamps are whole seconds',
+    ),
     'one frame, one stamp a sweep': (lambda: one_frame(0), r'frame sonar take turns.*one frame_id.*Give each its own'),
     'one frame, one after the other': (lambda: one_frame(8_000_000), r'frame sonar take turns.*one frame_id'),
     'odometry never moves': (lambda: standing(0.0), r'odometry stands still.*while the ranges.*encoders'),
@@ -280,3 +297,8 @@ def test_a_wall_that_is_far_and_always_as_far_is_no_silence() -> None:
         RangeMessage(k * 250_000_000, 'left', round(1.5 + 0.01 * math.sin(k), 2), 0.1, 4.0, 0.26) for k in range(400)
     ]
     assert not [text for text in told(Messages(at_the_side, poses, ranges)) if 'hears nothing' in text]
+
+
+def test_one_reading_at_each_whole_second_is_no_fault() -> None:
+    seldom = circling()._replace(ranges=[m for m in circling().ranges if m.stamp % SECOND == 0])
+    assert told(seldom) == []
