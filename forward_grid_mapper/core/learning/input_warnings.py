@@ -275,7 +275,8 @@ def _ceiling(readings: Readings) -> str:
     longest = round(float(np.quantile(heard, 1.0 - ABOVE)), 3)
     same = np.abs(heard - longest) < 0.0005
     nearly = (heard > longest - BELOW) & (heard < longest) & ~same
-    if np.count_nonzero(same) < max(CEILING * len(heard), 2 * np.count_nonzero(nearly)):
+    count, almost = int(np.count_nonzero(same)), int(np.count_nonzero(nearly))
+    if count < CEILING * len(heard) or count < 2 * almost:
         return ''
     # a robot that follows a wall sees it in the same directions for long
     towards = np.remainder(np.concatenate([mine.yaw for mine in parts])[same], 2 * math.pi)
@@ -283,7 +284,7 @@ def _ceiling(readings: Readings) -> str:
     if np.count_nonzero(sectors >= LEAST) < DIRECTIONS:
         return ''
     return (
-        f'{np.count_nonzero(same) / len(heard):.0%} of the echoes are at {longest:.3f} m, hardly any is longer, and no '
+        f'{count / len(heard):.0%} of the echoes are at {longest:.3f} m, hardly any is longer, and no '
         f'reading is without echo: is that what the driver sends where it hears nothing? Then set the parameter '
         f'max_range to {0.98 * longest:.2g}, or a wall is mapped at that range'
     )
