@@ -21,6 +21,9 @@ GRACE = 5.0
 """Seconds after a first signal in which further ones are ignored, so that nothing interrupts the clean-up: a terminal
 and `ros2 launch` send Ctrl-C more than once."""
 
+AGAIN = 0.1
+"""Seconds until a signal is sent once more whose `Cancelled` got lost."""
+
 ENDS_WITH_STDIN = 'FORWARD_GRID_MAPPER_ENDS_WITH_STDIN'
 """Environment variable: with the value 1 the process ends when its standard input does, which its parent holds open."""
 
@@ -89,32 +92,56 @@ def nobody_reads() -> bool:
 
 
 class Interruptible:
-    """Lets a signal raise `Cancelled` in a `with` block, once within `GRACE`; for the main thread, elsewhere idle."""
+    """Lets a signal raise `Cancelled` in a `with` block, once within `GRACE`; for the main thread, elsewhere idle.
+
+    Where C code calls Python, as the compiler of kernels does, an exception gets lost, or makes that code raise another
+    one. Then `Cancelled` is raised a little later, or takes the place of the other.
+    """
 
     def __init__(self) -> None:
         self._before: dict[signal.Signals, Any] = {}
         self._first = -GRACE
+        self._hook = sys.unraisablehook
+        self._lost: Cancelled | None = None
+        self._again: threading.Timer | None = None
 
     def __enter__(self) -> Interruptible:
         """Begin to take signals."""
         if threading.current_thread() is threading.main_thread():
             self._before = _install(self._raise)
+            self._hook, sys.unraisablehook = sys.unraisablehook, self._raise_later
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         """Leave signals to who had them before."""
+        if self._before:
+            sys.unraisablehook = self._hook
+        if self._again is not None:
+            self._again.cancel()
         for number, handler in self._before.items():
             # what took the signal in the block may have silenced it for good
             if signal.getsignal(number) is not signal.SIG_IGN:
                 signal.signal(number, handler)
+        if self._lost is not None and error is not None and not isinstance(error, Cancelled):
+            raise self._lost from None
 
     def _raise(self, number: int, frame: FrameType | None) -> None:
         now = time.monotonic()
         if now >= self._first + GRACE:
             self._first = now
             raise Cancelled(number)
+
+    def _raise_later(self, lost: sys.UnraisableHookArgs) -> None:
+        if not isinstance(lost.exc_value, Cancelled):
+            self._hook(lost)
+            return
+        self._lost, self._first = lost.exc_value, -GRACE
+        number = lost.exc_value.code - 128
+        self._again = threading.Timer(AGAIN, os.kill, (os.getpid(), number))
+        self._again.daemon = True
+        self._again.start()
 
 
 def end_with_parent() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
 import signal
 import subprocess
@@ -113,6 +114,26 @@ def test_a_second_signal_does_not_interrupt_the_clean_up(capsys: pytest.CaptureF
     assert cleaned == [True]
     assert capsys.readouterr().err == 'process_bag: cancelled; nothing was written\n'
     assert [signal.getsignal(number) for number in signals.SIGNALS] == before
+
+
+@pytest.mark.parametrize('fails', [False, True])
+def test_where_c_code_calls_python(capsys: pytest.CaptureFixture[str], fails: bool) -> None:
+    """As the compiler of kernels does: what is raised there is printed as ignored, and the compiler may fail of it."""
+    callback = ctypes.CFUNCTYPE(None)(lambda: signal.raise_signal(signal.SIGTERM))
+
+    def body(options: object) -> int:
+        callback()
+        if fails:
+            raise RuntimeError('missing object')
+        end = time.monotonic() + 60.0
+        while time.monotonic() < end:
+            pass
+        return 0
+
+    before = sys.unraisablehook
+    assert console.run(process_bag.parser(), body, ['bag']) == 128 + signal.SIGTERM
+    assert capsys.readouterr().err == 'process_bag: cancelled; nothing was written\n'
+    assert sys.unraisablehook is before
 
 
 def test_signals_that_are_ignored_stay_ignored(capsys: pytest.CaptureFixture[str]) -> None:
