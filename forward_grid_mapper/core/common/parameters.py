@@ -45,6 +45,12 @@ class AssociationParameters:
         'What +inf and ranges at or beyond max_range mean: no echo within max_range (informative), or nothing.',
         choices=('no_echo', 'discard'),
     )
+    invalid_range: str = param(
+        'discard',
+        'What NaN, 0 and negative ranges other than -inf mean: nothing, or no echo within max_range, as of drivers that '
+        'send them where they hear nothing. Do not take them for no echo if the driver sends them for what is too near.',
+        choices=('discard', 'no_echo'),
+    )
     field_of_view: float = param(0.0, "Full cone angle used instead of the messages'; 0 takes theirs.", 'rad', 0.0, 3.1)
     max_range: float = param(0.0, "Largest range used instead of the messages'; 0 takes theirs.", 'm', 0.0, 1000.0)
     max_jump: float = param(

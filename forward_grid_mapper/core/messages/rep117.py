@@ -14,11 +14,16 @@ from ..common.readings import Floats
 from .message_batch import REASON, Ranges
 from .message_types import RangeMessage
 
+_SILENT_DRIVER = (
+    'a driver that means "no echo" should send +inf (REP 117); where it sends NaN, 0 or a negative range, set the '
+    'parameter invalid_range to no_echo'
+)
+
 REASONS = {
-    'nan_range': 'the range is not a number; a driver that means "no echo" should send +inf (REP 117)',
-    'too_near': 'the range is -inf, or less than a millimetre: something too near to measure, a dead sensor, or a '
-    'driver that means "no echo" and should send +inf (REP 117)',
-    'below_min_range': 'the range is below min_range; a driver that means "no echo" should send +inf (REP 117), not 0',
+    'nan_range': f'the range is not a number; {_SILENT_DRIVER}',
+    'too_near': 'the range is -inf, or less than a millimetre: something too near to measure, or a dead sensor; '
+    f'{_SILENT_DRIVER}',
+    'below_min_range': f'the range is below min_range; {_SILENT_DRIVER}',
     'over_range': 'no echo, and over_range is "discard"',
     'bad_limits': 'min_range or max_range is negative or not finite, or max_range is not above min_range, or below a '
     'millimetre; the parameter max_range overrides it',
@@ -106,6 +111,8 @@ def measure(message: RangeMessage, parameters: AssociationParameters) -> Measure
     z, sigma = message.range, 0.0
     if 0.0 < message.variance < math.inf:
         sigma = math.sqrt(message.variance)
+    if parameters.invalid_range == 'no_echo' and (math.isnan(z) or -math.inf < z < NEAREST):
+        z = math.inf
     if math.isnan(z):
         return 'nan_range'
     if z == -math.inf:
@@ -172,6 +179,8 @@ def measure_all(messages: Ranges, parameters: AssociationParameters) -> Measurem
     z = messages.range
     stated = (messages.variance > 0.0) & (messages.variance < math.inf)
     sigma = np.sqrt(np.where(stated, messages.variance, 0.0))
+    if parameters.invalid_range == 'no_echo':
+        z = np.where(np.isnan(z) | ((z > -math.inf) & (z < NEAREST)), math.inf, z)
     reject('nan_range', np.isnan(z))
     near = z == -math.inf
     reject('too_near', near & ~fixed)

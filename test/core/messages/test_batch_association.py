@@ -128,9 +128,13 @@ def told(made: PoseAssociator) -> dict[str, Any]:
     bound=st.sampled_from([0, 0, 50]),
     cells=st.sampled_from([50_000_000, 20_000, 10_000]),
     over=st.sampled_from(['no_echo', 'discard']),
+    invalid=st.sampled_from(['discard', 'no_echo']),
 )
-def test_batches_give_what_single_messages_give(seed: int, trouble: float, bound: int, cells: int, over: str) -> None:
-    parameters = Parameters.from_flat({'max_readings': bound, 'max_cells': cells, 'over_range': over})
+def test_batches_give_what_single_messages_give(
+    seed: int, trouble: float, bound: int, cells: int, over: str, invalid: str
+) -> None:
+    chosen = {'max_readings': bound, 'max_cells': cells, 'over_range': over, 'invalid_range': invalid}
+    parameters = Parameters.from_flat(chosen)
     messages = drive(seed, 600, trouble)
     whole, parts = one_by_one(messages, parameters), in_batches(messages, parameters, seed)
     assert told(whole) == told(parts)

@@ -63,6 +63,21 @@ def test_a_fixed_distance_ranger() -> None:
     assert said(fixed._replace(range=math.inf)).z == 3.0
 
 
+@pytest.mark.parametrize('value', [math.nan, 0.0, -0.0, -1.0, NEAREST / 2])
+def test_invalid_ranges_may_mean_no_echo(value: float) -> None:
+    silent = PLAIN._replace(range=value)
+    refused(silent)
+    assert said(silent, invalid_range='no_echo').z == PLAIN.max_range
+    assert refused(silent, invalid_range='no_echo', over_range='discard') == 'over_range'
+
+
+def test_what_is_too_near_is_never_no_echo() -> None:
+    assert refused(PLAIN._replace(range=-math.inf), invalid_range='no_echo') == 'too_near'
+    assert refused(PLAIN._replace(range=NEAREST), invalid_range='no_echo') == 'below_min_range'
+    fixed = PLAIN._replace(min_range=3.0, max_range=3.0, range=-math.inf)
+    assert said(fixed, invalid_range='no_echo').z == 1.5
+
+
 def test_the_least_and_the_largest_range() -> None:
     assert said(PLAIN._replace(range=NEAREST, min_range=0.0)).z == NEAREST
     assert said(PLAIN._replace(range=0.1)).z == 0.1
