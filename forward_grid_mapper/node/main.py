@@ -86,10 +86,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 1
     # callbacks get their turn soon where EM is between two kernels
     sys.setswitchinterval(0.0005)
-    # numpy starts threads when it is imported, which must have the signals blocked
     from . import complaints
-    from .kernels import Kernels
-    from .mapper_node import MapperNode
 
     if wrong := complaints.of_domain(os.environ):
         print(f'mapper: error: {wrong}', file=sys.stderr)
@@ -106,6 +103,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if left:
         print(f'mapper: error: {complaints.of_arguments(left)}\n{USAGE}', file=sys.stderr)
         return 2
+    # here, as a command line that cannot be is to be told of at once, and this takes a second; numpy starts threads
+    # when it is imported, which must have the signals blocked
+    from .kernels import Kernels
+    from .mapper_node import MapperNode
+
     node = executor = None
     try:
         node = MapperNode()

@@ -1,18 +1,21 @@
 """Bags made to take time or memory without end: each is read or refused in words, within 20 s of work and 1.5 GB.
 
-Every attempt has a process of its own with a limit on its address space and its processor time, and a time-out.
+Every attempt has a process of its own with a limit on its address space and its processor time, and a time-out. It is
+a child of one that has imported what it needs, which takes longer than most attempts.
 """
 
 from __future__ import annotations
 
 import bz2
 import os
+import signal
 import socket
 import sqlite3
 import struct
 import subprocess
 import sys
-from collections.abc import Callable
+import threading
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import lz4.frame
@@ -35,41 +38,100 @@ SECONDS = 20
 
 PATIENCE = 300
 MEMORY = 3 << 29
-READ = f"""
-import resource, sys
-resource.setrlimit(resource.RLIMIT_AS, ({MEMORY}, {MEMORY}))
-resource.setrlimit(resource.RLIMIT_CPU, ({SECONDS}, {SECONDS}))
+READER = f"""
+import os, resource, sys
 from forward_grid_mapper.bags.choice import Topics
 from forward_grid_mapper.bags.reader import Bag
 from forward_grid_mapper.core.common.errors import BagError
-try:
-    with Bag(sys.argv[1]) as bag:
-        bag.topics()
-        bag.static_transforms()
-        messages = list(bag.messages(Topics(('/sonar',), '/odom')))
-        print(len(messages), bag.truncated or '', sum(bag.undecodable.values()), sep='\\n')
-except BagError as error:
-    print(-1, error, 0, sep='\\n')
+
+def read(path):
+    resource.setrlimit(resource.RLIMIT_AS, ({MEMORY}, {MEMORY}))
+    resource.setrlimit(resource.RLIMIT_CPU, ({SECONDS}, {SECONDS}))
+    try:
+        with Bag(path) as bag:
+            bag.topics()
+            bag.static_transforms()
+            messages = list(bag.messages(Topics(('/sonar',), '/odom')))
+            print(len(messages), bag.truncated or '', sum(bag.undecodable.values()), sep='\\n', flush=True)
+    except BagError as error:
+        print(-1, error, 0, sep='\\n', flush=True)
+
+for line in sys.stdin:
+    child = os.fork()
+    if not child:
+        code = 1
+        try:
+            read(line.rstrip('\\n'))
+            code = 0
+        except BaseException:
+            sys.excepthook(*sys.exc_info())
+        finally:
+            os._exit(code)
+    print('ended with', os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), flush=True)
 """
+"""Reads the bag of each line in a child with the limits, which needs not import anything."""
+
 BOMB = 1 << 30
 """Bytes that a bomb claims, or unpacks to."""
 
 
+class Reader:
+    """The process whose children read bags; it is started when it is needed, and again if one had no end."""
+
+    def __init__(self) -> None:
+        self._process: subprocess.Popen[str] | None = None
+
+    def read(self, path: Path) -> list[str]:
+        """Return the lines that a child printed; it must have ended well, and in time."""
+        if self._process is None or self._process.poll() is not None:
+            self._process = self._start()
+        assert self._process.stdin is not None and self._process.stdout is not None
+        late = threading.Timer(PATIENCE, os.killpg, (self._process.pid, signal.SIGKILL))
+        late.start()
+        try:
+            self._process.stdin.write(f'{path}\n')
+            self._process.stdin.flush()
+            lines: list[str] = []
+            while not lines or not lines[-1].startswith('ended with '):
+                line = self._process.stdout.readline()
+                assert line, f'no end within {PATIENCE} s: {path}'
+                lines.append(line.rstrip('\n'))
+        finally:
+            late.cancel()
+        assert lines.pop() == 'ended with 0', lines
+        return lines
+
+    def close(self) -> None:
+        if self._process is not None:
+            self._process.communicate(timeout=PATIENCE)
+
+    @staticmethod
+    def _start() -> subprocess.Popen[str]:
+        root = str(Path(forward_grid_mapper.__file__).parents[1])
+        search = os.pathsep.join(filter(None, (root, os.environ.get('PYTHONPATH'))))
+        return subprocess.Popen(
+            [sys.executable, '-c', READER],
+            # threads of the linear algebra, which is not used, reserve memory
+            env={**os.environ, 'PYTHONPATH': search, 'OPENBLAS_NUM_THREADS': '1'},
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            start_new_session=True,
+        )
+
+
+@pytest.fixture(scope='module', autouse=True)
+def reader() -> Iterator[None]:
+    yield
+    READ.close()
+
+
+READ = Reader()
+
+
 def attempt(path: Path) -> tuple[int, str, int]:
     """Read a bag; return the number of messages or -1, what was said, and how many messages did not fit."""
-    root = str(Path(forward_grid_mapper.__file__).parents[1])
-    search = os.pathsep.join(filter(None, (root, os.environ.get('PYTHONPATH'))))
-    done = subprocess.run(
-        [sys.executable, '-c', READ, str(path)],
-        # threads of the linear algebra, which is not used, reserve memory
-        env={**os.environ, 'PYTHONPATH': search, 'OPENBLAS_NUM_THREADS': '1'},
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=PATIENCE,
-    )
-    assert done.returncode == 0, done.stderr
-    count, said, unfit = done.stdout.rstrip('\n').split('\n')
+    count, said, unfit = READ.read(path)
     return int(count), said, int(unfit)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -23,6 +24,11 @@ def test_after_it_there_is_nothing_to_compile() -> None:
         'kernels of the EM',
         'kernels of the trajectory',
     ]
+
+
+def test_the_tests_begin_with_this_file(request: pytest.FixtureRequest) -> None:
+    """`test/conftest.py` puts it first, by its name."""
+    assert request.session.items[0].path == Path(__file__)
 
 
 SIGNATURES = """

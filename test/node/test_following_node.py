@@ -231,6 +231,8 @@ def test_a_fault_ends_it_until_the_next_run(
         node.trajectory.following, '_log', type('Log', (), {'warning': lambda self, text: warned.append(text)})()
     )
     base = node.trajectory.correction
+    # the first windows fail, and whatever comes after them has to be searched through by the run at the end
+    first = len(told.parts[1]) // 4
 
     def fails(self: Follower, *arguments: Any) -> bool:
         raise MemoryError
@@ -240,7 +242,7 @@ def test_a_fault_ends_it_until_the_next_run(
         if when == 'in a run':
             assert robot.call(node.em.run_em)[0], 'the maps are as good without'
             base = node.trajectory.correction
-        robot.hand(told.parts[1])
+        robot.hand(told.parts[1][:first])
         robot.until(lambda: node.trajectory.following.obstacle)
         robot.until(lambda: warned)
         robot.until(lambda: not node.trajectory.following.worker.waiting)
@@ -252,7 +254,7 @@ def test_a_fault_ends_it_until_the_next_run(
     # where it fails in a run, the one before may have failed during it too
     said = list(warned)
     assert len(said) == 1 or (when == 'in a run' and said == [said[0]] * 2)
-    robot.hand(told.parts[2][:100])
+    robot.hand(told.parts[1][first : first + 100])
     robot.spin(0.2)
     assert warned == said
     assert robot.call(node.em.run_em)[0]
