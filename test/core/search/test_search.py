@@ -401,6 +401,20 @@ def test_cells_driven_over_stay_free() -> None:
     assert not (after[traversed.ravel()]).any()
 
 
+def test_no_number_of_readings_occupies_what_was_traversed() -> None:
+    # a robot that stands for two days before what somebody put where it had driven
+    reading = Readings.from_columns(x=0.35, y=0.45, yaw=0.0, z=0.5, z_max=4.0, half_angle=0.03)
+    evidence = Evidence(GRID, MODEL)
+    evidence.extend(reading, np.zeros(3_000_000, np.int64))
+    traversed = np.zeros(GRID.shape, bool)
+    traversed[4] = True
+    occupied = Search(evidence, SHAPED, traversed.ravel()).run().occupied.reshape(GRID.shape)
+    assert not (occupied & traversed).any()
+    # nor what a tile holds of the map around its window
+    search = Search(evidence, SHAPED, window=(0, 4, 0, 12), hold=True)
+    assert not search.improve().occupied.any()
+
+
 def test_a_search_changes_nothing_outside_of_its_window() -> None:
     readings = random_readings(np.random.default_rng(5), AREA, 400, z_max=2.0)
     evidence = Evidence(AREA, MODEL)
