@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Callable
 from typing import NamedTuple
@@ -70,6 +71,8 @@ class OnlineWorker:
         self._publish_snapshot = publish
         self._map = OnlineMap(parameters)
         self._start: tuple[Grid, NDArray[np.int8]] | None = None
+        # held while the epoch changes, or a map of it is kept to start from
+        self._lock = threading.Lock()
         self._changed = self._publishing = False
         self._next = 0.0
         self.worker.put(prepare)
@@ -86,10 +89,11 @@ class OnlineWorker:
         """
         self._map.cancel()
         self.worker.put(self._map.dismantle)
-        self.epoch += 1
+        with self._lock:
+            self.epoch, self._start = self.epoch + 1, None
         self._parameters = parameters
         wanted = self._map = OnlineMap(parameters)
-        self._start, self.kept = None, 0
+        self.kept = 0
         self.worker.forgive()
         if readings is not None:
             self.worker.put(lambda: self._add(wanted, readings))
@@ -101,8 +105,9 @@ class OnlineWorker:
 
     def adopt(self, maps: MapSet) -> None:
         """Go on from the map that EM found."""
-        self.epoch += 1
-        wanted, self._start = self._map, (maps.grid, maps.searched)
+        with self._lock:
+            self.epoch, self._start = self.epoch + 1, (maps.grid, maps.searched)
+        wanted = self._map
         self.worker.put(lambda: self._adopt(wanted, maps))
 
     def show(self) -> None:
@@ -164,6 +169,8 @@ class OnlineWorker:
         except Cancelled:
             return
         _, searched = wanted.searched()
-        if grid.size and epoch == self.epoch:
+        with self._lock:
+            if not grid.size or epoch != self.epoch:
+                return
             self._start = grid, searched
-            self._publish_snapshot(OnlineSnapshot(epoch, grid, ml, uncertainty, searched))
+        self._publish_snapshot(OnlineSnapshot(epoch, grid, ml, uncertainty, searched))

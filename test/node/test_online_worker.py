@@ -6,6 +6,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -193,6 +194,36 @@ def test_a_new_beginning_drops_what_was_meant_for_the_map_before(node: Node, map
     node.worker.show()
     node.publish()
     assert len(node.shown) == shown + 1, "an empty map is nobody's"
+
+
+def test_no_snapshot_of_a_map_that_is_given_up_just_then_is_started_from(node: Node, maps: type[PlainMap]) -> None:
+    worker = node.worker
+
+    class Epoch(int):
+        """Lets the map be given up while the worker compares its epoch with that of a snapshot."""
+
+        def __eq__(self, other: Any) -> bool:
+            threading.Thread(target=restart).start()
+            given_up.wait(0.3)
+            return int(self) == int(other)
+
+        def __ne__(self, other: Any) -> bool:
+            return not self == other
+
+        __hash__ = int.__hash__
+
+    given_up = threading.Event()
+
+    def restart() -> None:
+        worker.restart(QUICK)
+        given_up.set()
+
+    worker.offer(readings(3))
+    worker.show()
+    worker.epoch = Epoch(0)
+    node.publish()
+    assert given_up.wait(10.0)
+    assert worker.epoch == 1 and worker.so_far() is None
 
 
 def test_it_goes_on_from_the_map_of_em(node: Node, maps: type[PlainMap]) -> None:
