@@ -21,7 +21,7 @@ from ..core.messages.rep117 import REASONS
 from ..core.trajectory.recovering import recovered
 from ..core.trajectory.windows import Odometry
 from ..files.quality_warning import quality_warning
-from .background import Inbox
+from .background import Inbox, reason
 from .deferred import Reply
 from .em import EmWorker, Outcome, Run, summary
 from .kernels import Kernels
@@ -171,8 +171,12 @@ class EmService:
         if not run.then:
             return
         first, *others = run.then
+        try:
+            self._start(first).waiting.extend(others)
+        except Exception as error:
+            _tell_all(run.then, f'EM cannot begin: {reason(error)}')
+            raise
         run.then.clear()
-        self._start(first).waiting.extend(others)
 
     def cancel(self, reply: Reply) -> None:
         """Cancel the run that goes on, forget nothing, and answer when it has ended."""

@@ -161,6 +161,25 @@ def test_a_run_by_itself_that_is_old_gives_way(held: EmRobot, why: str) -> None:
     assert held.em.explained == (7 if why == 'readings' else 5)
 
 
+def test_who_waits_for_a_run_that_cannot_begin_is_told(held: EmRobot, monkeypatch: pytest.MonkeyPatch) -> None:
+    held.em.run_by_itself()
+    held.begun()
+    held.accept(1)
+
+    def fails(*arguments: Any) -> Any:
+        raise MemoryError
+
+    with monkeypatch.context() as patched:
+        patched.setattr(held.trajectory, 'mapper', fails)
+        answer = held.run_em()
+        later = held.wait_for_maps()
+        held.until(lambda: held.em.current is None)
+    assert answer.sent == [(False, 'EM cannot begin: there is not enough memory')]
+    assert [outcome.message for outcome in later] == ['EM cannot begin: there is not enough memory']
+    held.held = False
+    assert held.run_em().sent == [] and held.em.current is not None
+
+
 def test_cancelling_is_answered_when_the_run_has_ended(held: EmRobot) -> None:
     ((success, message),) = held.cancel_em().sent
     assert (success, message) == (False, 'EM does not run: there is nothing to cancel')
