@@ -199,6 +199,8 @@ class MapperNode(ManagedNode):
             self._started = self.mapping = False
             # before what may take as long as `stopping.GRACE`
             self.journal.close()
+            # a journal that is still being read must not reach what is configured next
+            self.associator.buffer.before_thinning.clear()
             self.em.close(2.0)
             if self.online:
                 self.online.close(2.0)

@@ -21,6 +21,7 @@ pytest.importorskip('lifecycle_msgs', reason='the tests of the lifecycle need li
 import rclpy
 import yaml
 from builtin_interfaces.msg import Time
+from em_robot import some_readings
 from fault_samples import circle
 from inside import Inside
 from lifecycle_msgs.msg import State, Transition
@@ -358,6 +359,25 @@ def test_an_activation_that_fails_has_nothing_taken_twice(
         '/odom',
         '/sonar',
     ]
+
+
+def test_activations_one_after_the_other_leave_nothing(inside: Callable[..., Inside]) -> None:
+    node = inside().start().node
+    before = len(node._created)
+    for _ in range(3):
+        assert node.trigger_deactivate() == node.trigger_activate() == TransitionCallbackReturn.SUCCESS
+    assert len(node._created) == before
+    assert len([each for each in node.subscriptions if each.msg_type in (Range, Odometry)]) == 2
+
+
+def test_a_journal_that_is_still_read_does_not_reach_what_is_configured_next(inside: Callable[..., Inside]) -> None:
+    node = inside(max_readings=10).node
+    assert node.trigger_configure() == TransitionCallbackReturn.SUCCESS
+    before = node.associator
+    assert node.trigger_cleanup() == TransitionCallbackReturn.SUCCESS
+    # what is thinned is handed to the maps before
+    assert before.restore(some_readings(30)) == 0
+    assert before.buffer.held < len(before.buffer) == 30
 
 
 def test_a_topic_under_two_names_is_taken_once(inside: Callable[..., Inside]) -> None:
