@@ -227,7 +227,7 @@ class EmService:
         """Begin a run; `done` is called with how it ended, before others who come to wait for it."""
         generation, bound = self._publishers.generation, self._associator.buffer.bound
         # what comes while kernels are compiled is mapped as well
-        early = not self._kernels.has('EM')
+        early = not all(map(self._kernels.has, self._needed()))
         taken, begun = [self._take()], threading.Event()
 
         def take_now() -> Taken:
@@ -322,10 +322,13 @@ class EmService:
         reason, count = max(rejected.items(), key=lambda row: row[1])
         return f'there is nothing to map: {count} of {received} readings were rejected as {reason}: {REASONS[reason]}'
 
+    def _needed(self) -> tuple[str, ...]:
+        """Return the steps of compilation that a run waits for."""
+        return ('EM', 'trajectory') if self._parameters().node.refine_poses else ('EM',)
+
     def _wait_for_kernels(self, stop: Callable[[], bool]) -> None:
-        self._kernels.wait('EM', stop)
-        if self._parameters().node.refine_poses:
-            self._kernels.wait('trajectory', stop)
+        for step in self._needed():
+            self._kernels.wait(step, stop)
 
     def _finish(self, outcome: Outcome, count: int) -> None:
         maps = outcome.maps

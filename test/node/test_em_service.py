@@ -87,6 +87,17 @@ def test_what_comes_while_kernels_are_compiled_is_mapped_as_well(robot: EmRobot)
     assert answer.sent[0][1].startswith('8 readings') and robot.em.explained == 8
 
 
+def test_what_comes_while_those_of_the_trajectory_are_compiled_is_mapped_too(make: Callable[..., EmRobot]) -> None:
+    robot = make(refine_poses=True)
+    robot.compiled.discard('trajectory')
+    answer = robot.run_em()
+    robot.until(lambda: 'trajectory' in robot.waited)
+    robot.accept(3)
+    robot.compiled.add('trajectory')
+    robot.settle()
+    assert answer.sent[0][1].startswith('8 readings') and robot.em.explained == 8
+
+
 def test_time_in_which_kernels_are_compiled_is_told_apart(robot: EmRobot) -> None:
     robot.compiled.clear()
     answer, begin = robot.run_em(), time.monotonic()
