@@ -68,7 +68,7 @@ class OnlineWorker:
         self.worker = Worker('online map', log, lasting=True)
         self.epoch = self.kept = 0
         self._parameters = parameters
-        self._publish_snapshot = publish
+        self._publish_snapshot, self._log = publish, log
         self._map = OnlineMap(parameters)
         self._start: tuple[Grid, NDArray[np.int8]] | None = None
         # held while the epoch changes, or a map of it is kept to start from
@@ -136,13 +136,17 @@ class OnlineWorker:
     def _add(self, wanted: OnlineMap, readings: Callable[[], Readings]) -> None:
         if wanted is not self._map:
             return
-        new = readings()
+        new, taken = readings(), wanted.taken
         try:
             wanted.add(new)
         except Cancelled:
             return
         except (MapperError, MemoryError) as error:
             why = str(error) or 'there is not enough memory'
+            if wanted.taken > taken:
+                # no lasting trouble
+                self._log(f'online map: what is left of the search is done with the next readings: {why}')
+                return
             raise MapperError(f'{len(new)} readings are not in the online map: {why}') from None
         finally:
             if wanted is self._map:

@@ -32,6 +32,7 @@ class PlainMap:
 
     made: list[PlainMap]
     error: BaseException | None
+    late: BaseException | None = None
 
     def __init__(self, parameters: Parameters) -> None:
         self.parameters, self.count, self.adopted, self.cancelled = parameters, 0, 0, False
@@ -50,6 +51,12 @@ class PlainMap:
     def add(self, new: Readings) -> None:
         self._raise()
         self.count += len(new)
+        if self.late is not None:
+            raise self.late
+
+    @property
+    def taken(self) -> int:
+        return self.count
 
     def adopt(self, grid: Grid, searched: np.ndarray) -> None:
         self._raise()
@@ -274,6 +281,15 @@ def test_readings_that_do_not_fit_are_told_of_until_the_next_beginning(
     assert len(node.shown) == 1
     node.worker.restart(QUICK)
     assert node.worker.worker.trouble == ''
+
+
+def test_readings_that_were_taken_are_not_said_to_be_missing(node: Node, maps: type[PlainMap]) -> None:
+    maps.late = MemoryError()
+    node.worker.offer(readings(3))
+    node.settle()
+    said = 'online map: what is left of the search is done with the next readings: there is not enough memory'
+    assert node.logged == [said]
+    assert node.worker.worker.trouble == '' and node.worker.kept == 3
 
 
 def test_a_map_that_cannot_be_shown_is_shown_later(node: Node, maps: type[PlainMap]) -> None:
