@@ -287,6 +287,8 @@ class OnlineMap:
         if len(begun) < OF_THE_ROBOT:
             begun = of_drives([begun, readings])
             longest = longest_step(begun)
+            # from here on only their number matters, and they may be half a million
+            begun = begun.select(np.arange(min(len(begun), OF_THE_ROBOT)))
         mark_traversed(x, y, stamp, part, cells, longest)
         n = STRIDES[-1]
         return _Traversed(near, cells, (x[-n:], y[-n:], stamp[-n:]), begun, longest)

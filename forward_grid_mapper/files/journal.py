@@ -191,8 +191,7 @@ class Journal:
         self._work_in_background()
         # the file is to be there before the first reading is
         self._queue((), 0, 0)
-        with self._wake:
-            self._wake.wait_for(lambda: self._drive.made or self.trouble, PATIENCE)
+        self._wait_for(lambda: self._drive.made)
         if source is not None:
             yield from self._carry_over(source)
 
@@ -203,8 +202,7 @@ class Journal:
             for found in read(source, contents):
                 yield found
                 self.put(found, (contents.map_frame, contents.base_frame))
-                with self._wake:
-                    self._wake.wait_for(lambda: self._bytes <= MOST_PENDING // 2 or self.trouble, PATIENCE)
+                self._wait_for(lambda: self._bytes <= MOST_PENDING // 2)
         except BagError as error:
             self._notice(f'{error}; the journal goes on in {self.path.name}')
         self.put(None, (contents.map_frame, contents.base_frame), contents.path)
@@ -247,16 +245,14 @@ class Journal:
         with self._wake:
             self._closing = True
             self._wake.notify_all()
-        if self._thread is None:
-            self._writer.close()
-        else:
-            self._thread.join(seconds)
-            if self._thread.is_alive():
-                # the lock goes with the process
-                return
-        if self._syncer is not None:
-            self._syncer.close(seconds)
-        self._lock.release()
+            thread, syncer = self._thread, self._syncer
+        if thread is None or syncer is None:
+            self._let_go()
+            return
+        # it lets go of the folder, now or when the disk has done what it was asked for
+        thread.join(seconds)
+        if not thread.is_alive():
+            syncer.close(seconds)
 
     def _begin(self) -> None:
         """Begin a new drive, and its file."""
@@ -294,11 +290,24 @@ class Journal:
     # in the background
 
     def _work_in_background(self) -> None:
-        self._syncer = Syncer(self._warn)
-        self._thread = threading.Thread(target=self._work, name='journal', daemon=True)
-        self._thread.start()
+        with self._wake:
+            # what was closed while it was read must not write into a folder that another may have by now
+            if not self._closing:
+                syncer = self._syncer = Syncer(self._warn)
+                self._thread = threading.Thread(target=self._work, args=(syncer,), name='journal', daemon=True)
+                self._thread.start()
 
-    def _work(self) -> None:
+    def _wait_for(self, condition: Callable[[], bool]) -> None:
+        """Wait until the thread has come so far, unless it cannot."""
+        with self._wake:
+            self._wake.wait_for(lambda: condition() or self.trouble or self._closing, PATIENCE)
+
+    def _let_go(self) -> None:
+        """Let another journal have the folder."""
+        self._writer.close()
+        self._lock.release()
+
+    def _work(self, syncer: Syncer) -> None:
         while True:
             with self._wake:
                 self._wake.wait_for(lambda: self._closing or self._due(), LOOK)
@@ -316,7 +325,8 @@ class Journal:
                 # of whatever kind: the thread must not end silently
                 if self._failed(error):
                     break
-        self._writer.close()
+        self._let_go()
+        syncer.close(0.0)
 
     def _due(self) -> bool:
         return bool(self._pending) and not self._pending[0].drive.gone

@@ -21,7 +21,7 @@ from ..core.messages.rep117 import REASONS
 from ..core.trajectory.recovering import recovered
 from ..core.trajectory.windows import Odometry
 from ..files.quality_warning import quality_warning
-from .background import Inbox
+from .background import Inbox, reason
 from .deferred import Reply
 from .em import EmWorker, Outcome, Run, summary
 from .kernels import Kernels
@@ -171,8 +171,12 @@ class EmService:
         if not run.then:
             return
         first, *others = run.then
+        try:
+            self._start(first).waiting.extend(others)
+        except Exception as error:
+            _tell_all(run.then, f'EM cannot begin: {reason(error)}')
+            raise
         run.then.clear()
-        self._start(first).waiting.extend(others)
 
     def cancel(self, reply: Reply) -> None:
         """Cancel the run that goes on, forget nothing, and answer when it has ended."""
@@ -223,7 +227,7 @@ class EmService:
         """Begin a run; `done` is called with how it ended, before others who come to wait for it."""
         generation, bound = self._publishers.generation, self._associator.buffer.bound
         # what comes while kernels are compiled is mapped as well
-        early = not self._kernels.has('EM')
+        early = not all(map(self._kernels.has, self._needed()))
         taken, begun = [self._take()], threading.Event()
 
         def take_now() -> Taken:
@@ -318,10 +322,13 @@ class EmService:
         reason, count = max(rejected.items(), key=lambda row: row[1])
         return f'there is nothing to map: {count} of {received} readings were rejected as {reason}: {REASONS[reason]}'
 
+    def _needed(self) -> tuple[str, ...]:
+        """Return the steps of compilation that a run waits for."""
+        return ('EM', 'trajectory') if self._parameters().node.refine_poses else ('EM',)
+
     def _wait_for_kernels(self, stop: Callable[[], bool]) -> None:
-        self._kernels.wait('EM', stop)
-        if self._parameters().node.refine_poses:
-            self._kernels.wait('trajectory', stop)
+        for step in self._needed():
+            self._kernels.wait(step, stop)
 
     def _finish(self, outcome: Outcome, count: int) -> None:
         maps = outcome.maps

@@ -61,8 +61,8 @@ class Following:
         follower = self.follower
         if follower is None or self._busy or follower.obstacle or at == self._seen:
             return
-        self._busy, self._seen = True, at
         readings, odometry = drive()
+        self._busy, self._seen = True, at
 
         def work() -> None:
             try:

@@ -92,6 +92,7 @@ class JournalKeeper:
         for point in journal.contents.path:
             associator.extend_path(point)
         self._restored = self._taken = len(associator.buffer)
+        self._last_point = associator.path[-1] if associator.path else None
         logger.info(
             f'journal {journal.path}: {self._restored} readings of an earlier run are back, in frame '
             f'{associator.map_frame or "(none yet)"}'
@@ -129,6 +130,7 @@ class JournalKeeper:
     def reset(self) -> str:
         """Begin a new drive, since readings were forgotten; return where the old ones are."""
         self._restored = self._taken = 0
+        self._last_point = None
         if self._journal is None:
             return ''
         old = self._journal.path

@@ -67,8 +67,8 @@ class Kernels:
                 raise Cancelled('cancelled while kernels were compiled')
 
     def has(self, name: str) -> bool:
-        """Return whether the kernels of a step are there."""
-        return self._done[name].is_set()
+        """Return whether the kernels of a step are there, or it was left out."""
+        return name not in self._done or self._done[name].is_set()
 
     def _compile(self, name: str, ready: Callable[[], None], begin: float) -> None:
         self.stage = name

@@ -169,6 +169,11 @@ class ManagedNode(Base):
         # rclpy's own, made when use_sim_time is set: without it the clock would stand still for good
         return made if made.msg_type is Clock else self._noted(made, self.destroy_subscription)
 
+    def destroy_subscription(self, subscription: Any) -> Any:
+        """Destroy a subscription, as `Node` does, and forget it: there are others with every activation."""
+        self._created = [noted for noted in self._created if noted[1] is not subscription]
+        return super().destroy_subscription(subscription)
+
     def create_service(self, *arguments: Any, **options: Any) -> Any:
         """Create a service, as `Node` does."""
         return self._noted(super().create_service(*arguments, **options), self.destroy_service)

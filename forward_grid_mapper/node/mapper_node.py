@@ -120,11 +120,12 @@ class MapperNode(ManagedNode):
         if looked_up and not transforms.available:
             raise MapperError(f'map_frame is {node.map_frame}, but tf2_ros is not installed to look it up')
         self.associator = PoseAssociator(extrinsics, self.parameters, at_once=AT_ONCE)
-        self.journal = JournalKeeper(self, node.journal, self.associator)
         inbox = self.inbox = Inbox(self)
         kernels = self.kernels = Kernels(log.info, log.error, node.online, node.refine_poses)
         self.trajectory = trajectory = Trajectory(self, self.associator, self._steady)
         self.maps = MapPublishers(self, self.parameters.grid.resolution, lambda: trajectory.frame, self._up_to_date)
+        # after what may be refused: a journal that was not closed keeps its folder
+        self.journal = JournalKeeper(self, node.journal, self.associator)
         trajectory.publishing, trajectory.changed = self.maps.worker, self._map_anew
         trajectory.following = Following(log, inbox, trajectory.follow) if node.online else None
         trajectory.begin()
@@ -199,6 +200,8 @@ class MapperNode(ManagedNode):
             self._started = self.mapping = False
             # before what may take as long as `stopping.GRACE`
             self.journal.close()
+            # a journal that is still being read must not reach what is configured next
+            self.associator.buffer.before_thinning.clear()
             self.em.close(2.0)
             if self.online:
                 self.online.close(2.0)
@@ -212,6 +215,7 @@ class MapperNode(ManagedNode):
         for service in self._calls:
             service.end('the node is being cleaned up')
         self._calls.clear()
+        self._when_ready.clear()
 
     def _undo(self) -> None:
         super()._undo()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Callable
 from typing import NamedTuple
@@ -67,9 +68,11 @@ class OnlineWorker:
         self.worker = Worker('online map', log, lasting=True)
         self.epoch = self.kept = 0
         self._parameters = parameters
-        self._publish_snapshot = publish
+        self._publish_snapshot, self._log = publish, log
         self._map = OnlineMap(parameters)
         self._start: tuple[Grid, NDArray[np.int8]] | None = None
+        # held while the epoch changes, or a map of it is kept to start from
+        self._lock = threading.Lock()
         self._changed = self._publishing = False
         self._next = 0.0
         self.worker.put(prepare)
@@ -86,10 +89,11 @@ class OnlineWorker:
         """
         self._map.cancel()
         self.worker.put(self._map.dismantle)
-        self.epoch += 1
+        with self._lock:
+            self.epoch, self._start = self.epoch + 1, None
         self._parameters = parameters
         wanted = self._map = OnlineMap(parameters)
-        self._start, self.kept = None, 0
+        self.kept = 0
         self.worker.forgive()
         if readings is not None:
             self.worker.put(lambda: self._add(wanted, readings))
@@ -101,8 +105,9 @@ class OnlineWorker:
 
     def adopt(self, maps: MapSet) -> None:
         """Go on from the map that EM found."""
-        self.epoch += 1
-        wanted, self._start = self._map, (maps.grid, maps.searched)
+        with self._lock:
+            self.epoch, self._start = self.epoch + 1, (maps.grid, maps.searched)
+        wanted = self._map
         self.worker.put(lambda: self._adopt(wanted, maps))
 
     def show(self) -> None:
@@ -131,13 +136,17 @@ class OnlineWorker:
     def _add(self, wanted: OnlineMap, readings: Callable[[], Readings]) -> None:
         if wanted is not self._map:
             return
-        new = readings()
+        new, taken = readings(), wanted.taken
         try:
             wanted.add(new)
         except Cancelled:
             return
         except (MapperError, MemoryError) as error:
             why = str(error) or 'there is not enough memory'
+            if wanted.taken > taken:
+                # no lasting trouble
+                self._log(f'online map: what is left of the search is done with the next readings: {why}')
+                return
             raise MapperError(f'{len(new)} readings are not in the online map: {why}') from None
         finally:
             if wanted is self._map:
@@ -164,6 +173,8 @@ class OnlineWorker:
         except Cancelled:
             return
         _, searched = wanted.searched()
-        if grid.size and epoch == self.epoch:
+        with self._lock:
+            if not grid.size or epoch != self.epoch:
+                return
             self._start = grid, searched
-            self._publish_snapshot(OnlineSnapshot(epoch, grid, ml, uncertainty, searched))
+        self._publish_snapshot(OnlineSnapshot(epoch, grid, ml, uncertainty, searched))

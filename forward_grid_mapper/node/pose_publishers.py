@@ -31,6 +31,9 @@ REPEAT = 1.0
 TOLERANCE = NANOSECONDS // 5
 """Nanoseconds that a transform's stamp is later than odometry's."""
 
+LATEST = (1 << 31) * NANOSECONDS - 1
+"""The latest stamp that a message has room for."""
+
 MOST_POINTS = 2000
 """Poses of the path at the most: more would keep the executor for long when the middleware takes them."""
 
@@ -153,7 +156,7 @@ def path_message(frame: str, trajectory: Odometry | None, stamp: Any) -> Path:
 
 
 def _set_stamp(stamp: Any, nanoseconds: int) -> None:
-    stamp.sec, stamp.nanosec = divmod(nanoseconds, NANOSECONDS)
+    stamp.sec, stamp.nanosec = divmod(min(nanoseconds, LATEST), NANOSECONDS)
 
 
 def _set_yaw(rotation: Any, yaw: float) -> None:

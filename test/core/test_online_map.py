@@ -267,6 +267,13 @@ def test_a_corridor_has_room_along_it_and_within_max_cells(turned: bool) -> None
     assert bounded._evidence.grid.size <= most
 
 
+def test_many_readings_at_once_are_not_kept_a_second_time() -> None:
+    online = OnlineMap(Parameters())
+    online.add(some(count=3000))
+    assert len(online._begun) == online_map.OF_THE_ROBOT
+    assert online._begun.x.base is None
+
+
 def test_no_obstacle_stands_inside_a_large_robot() -> None:
     # two sensors 3 m apart, on either side of a car
     way = np.repeat(np.arange(0.0, 12.0, 0.1), 2)

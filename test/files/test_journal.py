@@ -28,6 +28,7 @@ from forward_grid_mapper.core.common.errors import BagError, OutputError
 from forward_grid_mapper.files import journal as journal_module
 from forward_grid_mapper.files import syncing
 from forward_grid_mapper.files.journal import Journal, drive_file, drives
+from forward_grid_mapper.files.journal_database import DriveWriter
 from forward_grid_mapper.files.journal_format import ROW, Contents
 from forward_grid_mapper.files.journal_reader import log_of, read
 
@@ -340,6 +341,47 @@ def test_a_disk_that_is_slow_to_sync_holds_up_no_writing(tmp_path: Path, monkeyp
     until(lambda: len(synced) >= 2)
     journal.close()
     assert numbers(drives(tmp_path)[1])[0] == list(range(20, 30))
+
+
+def test_a_journal_that_was_closed_too_soon_for_the_disk_lets_go_of_the_folder_later(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    others, write, go_on = {*threading.enumerate()}, DriveWriter.write, threading.Event()
+
+    def slow(*arguments: object) -> Path:
+        assert go_on.wait(20.0)
+        return write(*arguments)
+
+    journal, _ = opened(tmp_path)
+    with monkeypatch.context() as patched:
+        patched.setattr(DriveWriter, 'write', slow)
+        journal.put(made(0, 10), FRAMES)
+        journal.close(0.05)
+        with pytest.raises(OutputError, match='another node'):
+            Journal(tmp_path, print)
+        go_on.set()
+        until(lambda: {*threading.enumerate()} <= others)
+    again, chunks = opened(tmp_path)
+    assert [len(chunk) for chunk in chunks] == [10]
+    again.close()
+
+
+def test_a_journal_that_is_closed_while_it_is_read_writes_nothing_any_more(tmp_path: Path) -> None:
+    others = {*threading.enumerate()}
+    journal, _ = opened(tmp_path)
+    written(journal, made(0, 10))
+    journal.close()
+    journal = Journal(tmp_path, print)
+    found = journal.restore()
+    assert len(next(found)) == 10
+    journal.close()
+    # another node has the folder by now
+    another, _ = opened(tmp_path)
+    assert list(found) == []
+    journal.put(made(10, 10), FRAMES)
+    another.close()
+    assert {*threading.enumerate()} <= others
+    assert numbers(journal.path)[0] == list(range(10))
 
 
 def test_a_limit_on_the_size_of_files_is_a_full_disk(tmp_path: Path) -> None:

@@ -87,6 +87,17 @@ def test_what_comes_while_kernels_are_compiled_is_mapped_as_well(robot: EmRobot)
     assert answer.sent[0][1].startswith('8 readings') and robot.em.explained == 8
 
 
+def test_what_comes_while_those_of_the_trajectory_are_compiled_is_mapped_too(make: Callable[..., EmRobot]) -> None:
+    robot = make(refine_poses=True)
+    robot.compiled.discard('trajectory')
+    answer = robot.run_em()
+    robot.until(lambda: 'trajectory' in robot.waited)
+    robot.accept(3)
+    robot.compiled.add('trajectory')
+    robot.settle()
+    assert answer.sent[0][1].startswith('8 readings') and robot.em.explained == 8
+
+
 def test_time_in_which_kernels_are_compiled_is_told_apart(robot: EmRobot) -> None:
     robot.compiled.clear()
     answer, begin = robot.run_em(), time.monotonic()
@@ -159,6 +170,25 @@ def test_a_run_by_itself_that_is_old_gives_way(held: EmRobot, why: str) -> None:
     (outcome,) = waiting
     assert outcome.maps is held.em.maps is not None
     assert held.em.explained == (7 if why == 'readings' else 5)
+
+
+def test_who_waits_for_a_run_that_cannot_begin_is_told(held: EmRobot, monkeypatch: pytest.MonkeyPatch) -> None:
+    held.em.run_by_itself()
+    held.begun()
+    held.accept(1)
+
+    def fails(*arguments: Any) -> Any:
+        raise MemoryError
+
+    with monkeypatch.context() as patched:
+        patched.setattr(held.trajectory, 'mapper', fails)
+        answer = held.run_em()
+        later = held.wait_for_maps()
+        held.until(lambda: held.em.current is None)
+    assert answer.sent == [(False, 'EM cannot begin: there is not enough memory')]
+    assert [outcome.message for outcome in later] == ['EM cannot begin: there is not enough memory']
+    held.held = False
+    assert held.run_em().sent == [] and held.em.current is not None
 
 
 def test_cancelling_is_answered_when_the_run_has_ended(held: EmRobot) -> None:

@@ -126,6 +126,19 @@ def test_a_fault_ends_it_and_is_told(driving: Driving, error: BaseException, why
     assert other.windows == 1
 
 
+def test_a_drive_that_cannot_be_had_is_asked_for_again(driving: Driving) -> None:
+    follower = driving.begin(PlainFollower())
+
+    def fails() -> Any:
+        raise MemoryError
+
+    with pytest.raises(MemoryError):
+        driving.part.offer(HERE, fails)
+    driving.offer(HERE)
+    driving.settle()
+    assert follower.windows == 1
+
+
 def test_an_obstacle_that_is_there_at_the_begin_is_told_at_once(driving: Driving) -> None:
     driving.begin(PlainFollower('the clock jumped'))
     assert 'the clock jumped' in driving.node.warned[0]

@@ -118,7 +118,9 @@ def test_what_is_new_goes_to_disk_and_comes_back(tmp_path: Path) -> None:
     assert again.values()['readings restored'] == '12'
     again.drive(12, 3)
     again.keeper.close()
-    assert stored(tmp_path / 'drive_0001.journal')[0] == list(range(15)), 'none is there twice'
+    found, contents = stored(tmp_path / 'drive_0001.journal')
+    assert found == list(range(15)), 'none is there twice'
+    assert contents.path == [(0.0, 1.0), (5.0, 1.0)]
 
 
 def test_a_new_journal_names_no_frame(tmp_path: Path) -> None:
@@ -153,16 +155,19 @@ def test_a_reset_begins_a_new_file_and_says_where_the_old_one_is(tmp_path: Path)
     kept = Kept(tmp_path).start()
     assert kept.keeper.reset() == '', 'there is nothing to keep'
     kept.drive(0, 4)
+    kept.associator.extend_path((1.0, 2.0))
     kept.keeper.take()
     kept.associator.clear()
     assert kept.keeper.reset() == '; the journal keeps them in drive_0001.journal'
     kept.drive(20, 2)
+    kept.associator.extend_path((1.0, 2.0))
     kept.keeper.take()
     kept.settle()
     assert kept.values()['file'] == 'drive_0002.journal'
     kept.keeper.close()
     assert stored(tmp_path / 'drive_0001.journal')[0] == [0, 1, 2, 3]
-    assert stored(tmp_path / 'drive_0002.journal')[0] == [20, 21]
+    found, contents = stored(tmp_path / 'drive_0002.journal')
+    assert found == [20, 21] and contents.path == [(1.0, 2.0)], 'the robot has not moved'
     again = Kept(tmp_path).start()
     assert again.values()['readings restored'] == '2'
     again.associator.clear()

@@ -21,8 +21,9 @@ pytest.importorskip('lifecycle_msgs', reason='the tests of the lifecycle need li
 import rclpy
 import yaml
 from builtin_interfaces.msg import Time
+from em_robot import some_readings
 from fault_samples import circle
-from inside import Inside
+from inside import Answer, Inside
 from lifecycle_msgs.msg import State, Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 from nav_msgs.msg import Odometry
@@ -34,7 +35,9 @@ from sensor_msgs.msg import Range
 from std_srvs.srv import Trigger
 from test_mapper_node import RELIABLE
 
+from forward_grid_mapper.core.common.errors import MapperError
 from forward_grid_mapper.core.common.parameters import find
+from forward_grid_mapper.node import mapper_node
 from forward_grid_mapper.node.intake import Intake
 from forward_grid_mapper.node.kernels import Kernels
 
@@ -358,6 +361,48 @@ def test_an_activation_that_fails_has_nothing_taken_twice(
         '/odom',
         '/sonar',
     ]
+
+
+def test_activations_one_after_the_other_leave_nothing(inside: Callable[..., Inside]) -> None:
+    node = inside().start().node
+    before = len(node._created)
+    for _ in range(3):
+        assert node.trigger_deactivate() == node.trigger_activate() == TransitionCallbackReturn.SUCCESS
+    assert len(node._created) == before
+    assert len([each for each in node.subscriptions if each.msg_type in (Range, Odometry)]) == 2
+
+
+def test_a_journal_that_is_still_read_does_not_reach_what_is_configured_next(inside: Callable[..., Inside]) -> None:
+    node = inside(max_readings=10).node
+    assert node.trigger_configure() == TransitionCallbackReturn.SUCCESS
+    before = node.associator
+    assert node.trigger_cleanup() == TransitionCallbackReturn.SUCCESS
+    # what is thinned is handed to the maps before
+    assert before.restore(some_readings(30)) == 0
+    assert before.buffer.held < len(before.buffer) == 30
+
+
+def test_a_configuration_that_was_refused_does_not_keep_the_journal(
+    inside: Callable[..., Inside], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    def refused(*arguments: Any) -> Any:
+        raise MapperError('two maps on one topic')
+
+    node = inside(journal=str(tmp_path / 'journal')).node
+    with monkeypatch.context() as patched:
+        patched.setattr(mapper_node, 'MapPublishers', refused)
+        assert node.trigger_configure() == TransitionCallbackReturn.FAILURE
+    assert node.trigger_configure() == TransitionCallbackReturn.SUCCESS
+
+
+def test_a_clean_up_before_the_journal_is_read_leaves_nothing(inside: Callable[..., Inside]) -> None:
+    node = inside().node
+    assert node.trigger_configure() == TransitionCallbackReturn.SUCCESS
+    part = weakref.ref(node.em)
+    node._when(node.em.run_em, Answer())
+    assert node.trigger_cleanup() == TransitionCallbackReturn.SUCCESS
+    gc.collect()
+    assert part() is None
 
 
 def test_a_topic_under_two_names_is_taken_once(inside: Callable[..., Inside]) -> None:

@@ -6,6 +6,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -31,6 +32,7 @@ class PlainMap:
 
     made: list[PlainMap]
     error: BaseException | None
+    late: BaseException | None = None
 
     def __init__(self, parameters: Parameters) -> None:
         self.parameters, self.count, self.adopted, self.cancelled = parameters, 0, 0, False
@@ -49,6 +51,12 @@ class PlainMap:
     def add(self, new: Readings) -> None:
         self._raise()
         self.count += len(new)
+        if self.late is not None:
+            raise self.late
+
+    @property
+    def taken(self) -> int:
+        return self.count
 
     def adopt(self, grid: Grid, searched: np.ndarray) -> None:
         self._raise()
@@ -195,6 +203,36 @@ def test_a_new_beginning_drops_what_was_meant_for_the_map_before(node: Node, map
     assert len(node.shown) == shown + 1, "an empty map is nobody's"
 
 
+def test_no_snapshot_of_a_map_that_is_given_up_just_then_is_started_from(node: Node, maps: type[PlainMap]) -> None:
+    worker = node.worker
+
+    class Epoch(int):
+        """Lets the map be given up while the worker compares its epoch with that of a snapshot."""
+
+        def __eq__(self, other: Any) -> bool:
+            threading.Thread(target=restart).start()
+            given_up.wait(0.3)
+            return int(self) == int(other)
+
+        def __ne__(self, other: Any) -> bool:
+            return not self == other
+
+        __hash__ = int.__hash__
+
+    given_up = threading.Event()
+
+    def restart() -> None:
+        worker.restart(QUICK)
+        given_up.set()
+
+    worker.offer(readings(3))
+    worker.show()
+    worker.epoch = Epoch(0)
+    node.publish()
+    assert given_up.wait(10.0)
+    assert worker.epoch == 1 and worker.so_far() is None
+
+
 def test_it_goes_on_from_the_map_of_em(node: Node, maps: type[PlainMap]) -> None:
     searched = np.ones(GRID.shape, np.int8)
     node.worker.offer(readings(3))
@@ -243,6 +281,15 @@ def test_readings_that_do_not_fit_are_told_of_until_the_next_beginning(
     assert len(node.shown) == 1
     node.worker.restart(QUICK)
     assert node.worker.worker.trouble == ''
+
+
+def test_readings_that_were_taken_are_not_said_to_be_missing(node: Node, maps: type[PlainMap]) -> None:
+    maps.late = MemoryError()
+    node.worker.offer(readings(3))
+    node.settle()
+    said = 'online map: what is left of the search is done with the next readings: there is not enough memory'
+    assert node.logged == [said]
+    assert node.worker.worker.trouble == '' and node.worker.kept == 3
 
 
 def test_a_map_that_cannot_be_shown_is_shown_later(node: Node, maps: type[PlainMap]) -> None:

@@ -18,6 +18,7 @@ from inside import Inside
 from refined_robot import odometry_of
 from sensor_msgs.msg import MultiDOFJointState
 
+from forward_grid_mapper.core.messages.message_types import NANOSECONDS, Pose2
 from forward_grid_mapper.core.trajectory.poses import compose
 from forward_grid_mapper.core.trajectory.windows import Odometry
 from forward_grid_mapper.node import pose_publishers, trajectory
@@ -256,6 +257,18 @@ def test_with_tf2_msgs_alone_it_goes_there_as_a_message(monkeypatch: pytest.Monk
     send('a transform')  # type: ignore[arg-type]
     assert made == [(TFMessage, '/tf', 100)]
     assert sent[0].transforms == ['a transform']
+
+
+def test_the_latest_stamp_that_a_message_has_room_for_is_sent(
+    inside: Callable[..., Inside], tf2_ros: type[Broadcaster]
+) -> None:
+    publishers = pose_publishers.PosePublishers(inside().node)
+    latest = (2**31 - 1) * NANOSECONDS + NANOSECONDS - 1
+    for _ in range(2):
+        publishers.send(('map', 'odom', 'base_link'), np.array([0.1, 0.0, 0.0]), (latest, Pose2(1.0, 0.0, 0.0)))
+        publishers._due = 0.0
+    stamps = [transform.header.stamp for transform in tf2_ros.sent]
+    assert [(stamp.sec, stamp.nanosec) for stamp in stamps] == [divmod(latest, NANOSECONDS)] * 2
 
 
 def test_the_path_is_bounded_and_begins_and_ends_with_the_drive() -> None:

@@ -48,9 +48,10 @@ FEW_ECHOES, FEW_READINGS = 0.1, 0.2
 
 # The prior of walls
 
-FORBIDDEN = 1e6
-"""Nats that an occupied cell costs where a sensor was moved: more than all readings of any drive can say for it, and
-still a finite number, so that its product with a weight of zero is zero."""
+FORBIDDEN = 1e12
+"""Nats that an occupied cell costs where a sensor was moved: more than the evidence of a cell can hold (2⁶³ units of
+2⁻²⁴ nats), however long a robot stands before it, and still a finite number, so that its product with a weight of zero
+is zero."""
 
 # Gaps and short walls
 

@@ -26,6 +26,9 @@ from .fixed_point import RatioWorkspace, ratio_workspace_for
 WORD = 4
 """Bytes in a word of a block."""
 
+LEAST_SPREAD = 1e-100
+"""Cells between the nearest and the farthest key of a sort, below which they are left to the insertion sort."""
+
 WORDS_PER_RUN = 2
 WORDS_PER_BAND_PAIR = 3
 
@@ -161,7 +164,8 @@ def _sort(workspace: Workspace, m: int) -> None:
     low, high = math.inf, -math.inf
     for k in range(m):
         low, high = min(low, workspace.unsorted_key[k]), max(high, workspace.unsorted_key[k])
-    scale = (m - 1) / (high - low) if high > low else 0.0
+    # what is nearer than any two cells would make the scale infinite
+    scale = (m - 1) / (high - low) if high - low > LEAST_SPREAD else 0.0
     workspace.tally[: m + 1] = 0
     for k in range(m):
         bucket = int((workspace.unsorted_key[k] - low) * scale)

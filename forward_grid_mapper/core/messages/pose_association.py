@@ -198,7 +198,7 @@ class PoseAssociator:
         self._waiting.clear()
         self._held.clear()
         self._retrying, self.behind = 0, False
-        self._newest_range, self._next_try = None, 0
+        self._newest_range, self._next_try, self._next_look = None, 0, 0
         self._path.clear()
         self.received = self.odometry_received = self.time_jumps = 0
         self._extent.clear()

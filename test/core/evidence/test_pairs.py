@@ -96,10 +96,12 @@ def test_pairs_made_anew_are_those_that_are_stored() -> None:
 )
 def test_the_sort_is_stable(keys: list[float]) -> None:
     workspace = workspace_for(60)
-    m = len(keys)
+    room = np.full(len(workspace.tally) + 10, -1, np.int32)
+    workspace, m = workspace._replace(tally=room[: len(workspace.tally)]), len(keys)
     workspace.unsorted_key[:m] = keys
     workspace.unsorted[:m] = np.arange(m)
     _sort(workspace, m)
+    assert (room[m + 1 :] == -1).all()
     order = sorted(range(m), key=lambda k: keys[k])
     assert workspace.cell[:m].tolist() == order
     assert workspace.key[:m].tolist() == [keys[k] for k in order]

@@ -549,3 +549,20 @@ def test_a_reset_begins_with_the_odometry_that_comes() -> None:
     p.clear()
     p.add_range(sonar(2.3))
     assert (p.map_frame, len(p.buffer)) == ('odom', 1)
+
+
+def test_a_reset_after_another_frame_begins_with_its_clock_too() -> None:
+    clock = Clock()
+    p = associator(clock=clock)
+    p.add_odometry(odometry(1e6)._replace(frame_id='garbage'))
+    p.add_range(sonar(1e6 + 1.0))
+    p.add_odometry(odometry(1e6 + 0.5)._replace(frame_id='garbage'))
+    p.add_odometry(odometry(0.0))
+    p.clear()
+    for tenth in range(200):
+        clock.now = tenth / 10
+        p.add_odometry(odometry(tenth / 10))
+        p.add_range(sonar(tenth / 10 + 3600.0))
+    assert p.odometry_stamp == odometry(19.9).stamp
+    assert p.waiting < 60
+    assert p.rejected['from_the_future'] > 140

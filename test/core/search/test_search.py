@@ -364,7 +364,8 @@ def test_with_shapes_the_objective_of_either_stage_never_falls_and_ends_at_an_op
         assert not maps.seen[c] or told <= LEAST[0] + LEAST[1] * maps.seen[c]
         sign = -1 if maps.occupied[c] else 1
         odds = sign * naive.prior_gain(whole, maps.occupied, c, grid.shape)
-        assert neighbours[c] == pytest.approx(odds, abs=1e-9)
+        # of a traversed cell 1e12 nats, which float64 has to 1e-4
+        assert neighbours[c] == pytest.approx(odds, rel=1e-15, abs=1e-9)
     for c in rng.permutation(grid.size)[:60]:
         maps.occupied[c] ^= 1
         assert not maps.seen[c] or now(whole) <= end + 2e-4
@@ -399,6 +400,20 @@ def test_cells_driven_over_stay_free() -> None:
     after = search.run().occupied
     assert before.any()
     assert not (after[traversed.ravel()]).any()
+
+
+def test_no_number_of_readings_occupies_what_was_traversed() -> None:
+    # a robot that stands for two days before what somebody put where it had driven
+    reading = Readings.from_columns(x=0.35, y=0.45, yaw=0.0, z=0.5, z_max=4.0, half_angle=0.03)
+    evidence = Evidence(GRID, MODEL)
+    evidence.extend(reading, np.zeros(3_000_000, np.int64))
+    traversed = np.zeros(GRID.shape, bool)
+    traversed[4] = True
+    occupied = Search(evidence, SHAPED, traversed.ravel()).run().occupied.reshape(GRID.shape)
+    assert not (occupied & traversed).any()
+    # nor what a tile holds of the map around its window
+    search = Search(evidence, SHAPED, window=(0, 4, 0, 12), hold=True)
+    assert not search.improve().occupied.any()
 
 
 def test_a_search_changes_nothing_outside_of_its_window() -> None:
