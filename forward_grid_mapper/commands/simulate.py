@@ -6,7 +6,7 @@ import argparse
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
-from multiprocessing import get_context
+from multiprocessing import active_children, get_context
 from pathlib import Path
 from typing import TypeVar
 
@@ -27,6 +27,7 @@ from ..simulation.drive import BASE_FRAME, Recording, corridor_drive, door_drive
 from ..simulation.sonar import NOISE_FREE, NOISY, SonarArray, front_array, sonar_ring
 from .console import Ticker, run
 from .options import not_empty
+from .signals import without_interrupts
 
 COMMAND = 'simulate'
 REFERENCE = 'reference.tum'
@@ -216,10 +217,17 @@ def at_once(work: Callable[[int], T], numbers: Iterable[int], jobs: int) -> Iter
         return
     # a fork would copy locks that threads of this process hold
     with ProcessPoolExecutor(jobs, get_context('spawn')) as pool:
-        begun = [pool.submit(work, number) for number in numbers]
         try:
+            # a terminal sends Ctrl-C to all of its processes; ours are ended here, where it is told in one line
+            with without_interrupts():
+                begun = [pool.submit(work, number) for number in numbers]
             for future in as_completed(begun):
                 yield future.result()
+        except BaseException:
+            # nobody wants the drives that are being made
+            for process in active_children():
+                process.terminate()
+            raise
         finally:
             pool.shutdown(wait=True, cancel_futures=True)
 
