@@ -11,8 +11,7 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from types import FrameType, TracebackType
 from typing import Any, NoReturn
 
@@ -76,16 +75,6 @@ def leave_at_once(command: str) -> None:
 def leave_silently() -> None:
     """Let a signal end the process without a word: for the interpreter's own end, when all is done and reported."""
     _install(signal.SIG_DFL)
-
-
-@contextmanager
-def without_interrupts() -> Iterator[None]:
-    """Let the processes that are started in the block ignore Ctrl-C for good: a mask is inherited."""
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def nobody_reads() -> bool:

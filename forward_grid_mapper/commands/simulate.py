@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from multiprocessing import active_children, get_context
 from pathlib import Path
@@ -13,7 +14,7 @@ from typing import TypeVar
 import numpy as np
 
 from ..bags.writer import BagWriter, check_bag_path
-from ..core.common.errors import ParameterError
+from ..core.common.errors import ClusterError, ParameterError
 from ..core.common.shell import command_line
 from ..core.messages.message_types import OdometryMessage, RangeMessage
 from ..core.runtime.threads import cores
@@ -21,13 +22,13 @@ from ..core.trajectory.windows import Odometry
 from ..files.map_files import write_trinary
 from ..files.output_folder import output_errors, output_folder
 from ..files.trajectory_text import tum_text
+from ..scale.starting import signals_later
 from ..simulation.campus import campus_drive, campus_world
 from ..simulation.drift import LEVELS, with_drift
 from ..simulation.drive import BASE_FRAME, Recording, corridor_drive, door_drive
 from ..simulation.sonar import NOISE_FREE, NOISY, SonarArray, front_array, sonar_ring
 from .console import Ticker, run
 from .options import not_empty
-from .signals import without_interrupts
 
 COMMAND = 'simulate'
 REFERENCE = 'reference.tum'
@@ -219,10 +220,15 @@ def at_once(work: Callable[[int], T], numbers: Iterable[int], jobs: int) -> Iter
     with ProcessPoolExecutor(jobs, get_context('spawn')) as pool:
         try:
             # a terminal sends Ctrl-C to all of its processes; ours are ended here, where it is told in one line
-            with without_interrupts():
+            with signals_later():
                 begun = [pool.submit(work, number) for number in numbers]
             for future in as_completed(begun):
                 yield future.result()
+        except BrokenProcessPool as error:
+            raise ClusterError(
+                'a process that made drives was ended, most likely since the memory was not enough; make fewer drives '
+                'at once (--jobs), or shorter ones (--readings)'
+            ) from error
         except BaseException:
             # nobody wants the drives that are being made
             for process in active_children():

@@ -5,14 +5,13 @@ from __future__ import annotations
 import contextlib
 import logging
 import signal
-import threading
 import uuid
 from collections.abc import Callable, Iterable, Iterator
-from multiprocessing import resource_tracker
 from typing import Any
 
 from ..core.common.errors import ClusterError, MapperError, OutputError
 from .job import Job, check_versions, versions
+from .starting import signals_later
 
 PATIENCE = 10.0
 """Seconds in which a scheduler has to answer."""
@@ -37,32 +36,6 @@ Work = Callable[..., dict[str, Any]]
 def _memory_of(dask_worker: Any) -> int:
     """Return the bytes that a worker may take, 0 if it has no bound; Dask gives it the worker."""
     return int(dask_worker.memory_manager.memory_limit or 0)
-
-
-@contextlib.contextmanager
-def _signals_later() -> Iterator[None]:
-    """Keep signals until the block is done: interrupted while it starts processes, Dask leaves them to show tracebacks.
-
-    Processes that are started in the block never hear of Ctrl-C, which a terminal sends to them as well; they inherit
-    the mask.
-    """
-    # with its first process multiprocessing starts this one, and unmasks Ctrl-C
-    resource_tracker.ensure_running()
-    kept: list[int] = []
-    before: dict[signal.Signals, Any] = {}
-    if threading.current_thread() is threading.main_thread():
-        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-            if signal.getsignal(number) is not signal.SIG_IGN:
-                before[number] = signal.signal(number, lambda number, frame: kept.append(number))
-    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
-        for number, handler in before.items():
-            signal.signal(number, handler)
-    if kept:
-        signal.raise_signal(kept[0])
 
 
 def _leave_interrupts() -> None:
@@ -119,7 +92,7 @@ class Cluster:
                 logging.getLogger(name).setLevel(logging.CRITICAL)
             address: Any = self._scheduler
             if address is None:
-                with _signals_later():
+                with signals_later():
                     address = self._open.enter_context(
                         LocalCluster(
                             n_workers=self.workers,
