@@ -192,7 +192,7 @@ def _output_error(path: Path, error: OSError) -> OutputError:
         return OutputError(f'{path}: a part of this path is a file, not a folder; choose another folder')
     if error.errno in (errno.ENOTEMPTY, errno.EEXIST):
         # another run took the name while this one worked
-        return OutputError(f'{path} exists by now and is not empty; choose another folder, one for each run')
+        return OutputError(f'{path} exists by now, perhaps of another run; choose another folder')
     if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
         return OutputError(f'{path}: no permission to write there; choose another folder')
     return OutputError(f'{path} cannot be written: {error.strerror or error}')
