@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from . import arrays
-from .core.common.errors import InputError
+from .core.common.errors import InputError, OutputError
 from .core.common.parameters import TABLE, Parameters
 from .core.mapping import Mapper, Watch
 from .core.maps.map_set import MapSet
@@ -119,7 +119,11 @@ class SonarMaps:
         OutputError
             If the folder exists, or cannot be written.
         """
-        return write_results(folder, self.maps, self.source, self.path, title, judged=self.judged)
+        try:
+            return write_results(folder, self.maps, self.source, self.path, title, judged=self.judged)
+        except OutputError as error:
+            # a program has no options
+            raise OutputError(str(error).replace(' with -o', '')) from error
 
 
 def make_maps(

@@ -14,7 +14,7 @@ import pytest
 
 import forward_grid_mapper
 from forward_grid_mapper import Sonar, SonarMaps, arrays, library, make_maps, poses_from_tum
-from forward_grid_mapper.core.common.errors import InputError, ParameterError
+from forward_grid_mapper.core.common.errors import InputError, OutputError, ParameterError
 from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.mapping import Mapper
 from forward_grid_mapper.simulation.drive import door_drive
@@ -80,6 +80,16 @@ def test_results_are_saved_with_their_counts(tmp_path: Path) -> None:
     report = make_maps(**arrays).save(tmp_path / 'maps')
     assert report['counts']['rejected']['nan_range'] == 1
     assert {path.name for path in (tmp_path / 'maps').iterdir()} >= {'ml_map.pgm', 'maps.npz', 'report.txt'}
+
+
+def test_a_folder_that_is_taken_is_named_without_options_of_commands(tmp_path: Path) -> None:
+    (tmp_path / 'mine.txt').write_text('mine')
+    found = make_maps(**given())
+    for taken in (tmp_path, tmp_path / 'mine.txt'):
+        with pytest.raises(OutputError, match=r'choose another\b') as told:
+            found.save(taken)
+        assert str(told.value).startswith(str(taken)) and '-o' not in str(told.value).replace(str(taken), '')
+    assert [path.name for path in tmp_path.iterdir()] == ['mine.txt']
 
 
 def test_what_is_wrong_without_an_error_is_a_warning() -> None:

@@ -11,6 +11,7 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
+from pathlib import Path
 from types import TracebackType
 from typing import TextIO
 
@@ -57,7 +58,7 @@ def run(
         return 1
     except OSError as error:
         # of the work's files the work takes care; what remains is the output itself, or the working directory
-        problem = str(error) if _still_printing() else f'standard output: {error}'
+        problem = _what_failed(error) if _still_printing() else f'standard output: {error}'
     except Cancelled as cancelled:
         # with SIGHUP the terminal is gone
         with suppress(OSError):
@@ -79,6 +80,16 @@ def _still_printing() -> bool:
             sys.stdout.close()
         return False
     return True
+
+
+def _what_failed(error: OSError) -> str:
+    """Return an error in words; the system names no file if it is about the working directory."""
+    if error.filename is None:
+        try:
+            Path.cwd()
+        except OSError:
+            return 'the working directory does not exist any more; change to one that does'
+    return str(error)
 
 
 class Ticker:

@@ -58,6 +58,9 @@ def density_table(curve: Curve, parameters: Parameters) -> str:
         k = np.flatnonzero((z >= low) & (z < high))
         at = k[int(p[k].argmax())]
         lines.append(f'{name:28s}{z[at]:8.2f}{p[at]:14.3f}{share:9.3f}')
+    if model.p_lost:
+        # adds to the same peak as 'nothing hit'
+        lines.append(f'{"echo lost":28s}{MAX_RANGE:8.2f}{p[-1]:14.3f}{model.p_lost:9.3f}')
     lines.append(f'{"chance, everywhere":28s}{"":8s}{p.min():14.3f}{model.p_rand:9.3f}')
     lines.append('')
     lines.append(f'The obstacle beside the cone, at {BESIDE[0]:.1f} m, leaves no trace.')

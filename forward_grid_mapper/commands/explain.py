@@ -129,7 +129,8 @@ def explanation(maps: MapArchive, readings: Readings, found: CellEvidence, shown
     uncertainty, standard = _percent(maps.uncertainty[cell]), _percent(maps.live[cell])
     yield f'  obstacle: {uncertainty} (uncertainty map), {standard} (standard map)'
     count = len(found.readings)
-    yield f'  {_nats(found.data)} nats from {count} readings, {_nats(found.prior)} from the prior of walls'
+    from_readings = f'{count} reading' if count == 1 else f'{count} readings'
+    yield f'  {_nats(found.data)} nats from {from_readings}, {_nats(found.prior)} from the prior of walls'
     groups = (
         (('end here', 'ends here'), found.ends_here),
         (
@@ -215,8 +216,10 @@ def _what_decides(maps: MapArchive, found: CellEvidence, state: int) -> str:
     if typical >= LEAST_TYPICAL:
         more = math.ceil(abs(total) / typical)
         kind = f'the one that speaks most for {other}'
-        return f'to be {other} it takes {abs(total):.1f} nats more: {more} more readings like {kind}'
-    return f'to be {other} it takes {abs(total):.1f} nats; so far no reading says so to speak of'
+        readings = 'reading' if more == 1 else 'readings'
+        return f'to be {other} it takes {abs(total):.1f} nats more: {more} more {readings} like {kind}'
+    none = f'so far no single reading speaks for it with {LEAST_TYPICAL:g} nats or more'
+    return f'to be {other} it takes {abs(total):.1f} nats more; {none}'
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -16,7 +16,7 @@ from ..core.foresight import only_if_foreseen
 from ..core.joint_learning import learn_jointly
 from ..core.learning.sensor_health import health_warning, sensor_health
 from ..files.learned_text import learned_data, learned_text, parameter_file_text, write_new_file
-from ..files.output_folder import readable
+from ..files.output_folder import readable, unwritable
 from ..files.parameter_file import load_parameters
 from ..files.quality_warning import reading_warnings
 from ..files.report import json_text
@@ -84,6 +84,8 @@ def learn(options: argparse.Namespace) -> int:
             raise OutputError(f'{output} exists; choose another file with --output, or remove it first')
         if not output.parent.is_dir():
             raise OutputError(f'{output.parent} is not a folder; make it first, or choose another with --output')
+        if why := unwritable(output.parent):
+            raise OutputError(f'{output}: {why}; choose another folder with --output')
     part, poses = chosen_part(options), chosen_poses(options)
     with Ticker(options.quiet) as ticker:
         drives = read_drives(

@@ -7,6 +7,7 @@ import math
 import sys
 import time
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -214,7 +215,11 @@ def _stem(words: Sequence[str]) -> str:
 
 
 def _title(drives: Drives) -> str:
-    first = readable(Path(*Path(drives.drives[0].source['bag']).resolve().parts[-2:]))
+    path = Path(drives.drives[0].source['bag'])
+    # a text to be shown, with letters that the names of files need not have in this locale
+    with suppress(UnicodeEncodeError):
+        path = path.resolve()
+    first = readable(Path(*path.parts[-2:]))
     return first if len(drives.drives) == 1 else f'{first} and {len(drives.drives) - 1} more'
 
 

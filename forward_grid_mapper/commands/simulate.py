@@ -5,15 +5,16 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
-from multiprocessing import get_context
+from multiprocessing import active_children, get_context
 from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
 
 from ..bags.writer import BagWriter, check_bag_path
-from ..core.common.errors import ParameterError
+from ..core.common.errors import ClusterError, ParameterError
 from ..core.common.shell import command_line
 from ..core.messages.message_types import OdometryMessage, RangeMessage
 from ..core.runtime.threads import cores
@@ -21,6 +22,7 @@ from ..core.trajectory.windows import Odometry
 from ..files.map_files import write_trinary
 from ..files.output_folder import output_errors, output_folder
 from ..files.trajectory_text import tum_text
+from ..scale.starting import signals_later
 from ..simulation.campus import campus_drive, campus_world
 from ..simulation.drift import LEVELS, with_drift
 from ..simulation.drive import BASE_FRAME, Recording, corridor_drive, door_drive
@@ -216,10 +218,22 @@ def at_once(work: Callable[[int], T], numbers: Iterable[int], jobs: int) -> Iter
         return
     # a fork would copy locks that threads of this process hold
     with ProcessPoolExecutor(jobs, get_context('spawn')) as pool:
-        begun = [pool.submit(work, number) for number in numbers]
         try:
+            # a terminal sends Ctrl-C to all of its processes; ours are ended here, where it is told in one line
+            with signals_later():
+                begun = [pool.submit(work, number) for number in numbers]
             for future in as_completed(begun):
                 yield future.result()
+        except BrokenProcessPool as error:
+            raise ClusterError(
+                'a process that made drives was ended, most likely since the memory was not enough; make fewer drives '
+                'at once (--jobs), or shorter ones (--readings)'
+            ) from error
+        except BaseException:
+            # nobody wants the drives that are being made
+            for process in active_children():
+                process.terminate()
+            raise
         finally:
             pool.shutdown(wait=True, cancel_futures=True)
 

@@ -22,7 +22,11 @@ _WRITE_ONLY = _FULL | {errno.EFBIG, errno.EROFS}
 
 def readable(path: Path | str) -> str:
     """Return a path as text that can be drawn and written as UTF-8, whatever its bytes are."""
-    return os.fsencode(path).decode('utf-8', 'backslashreplace')
+    try:
+        return os.fsencode(path).decode('utf-8', 'backslashreplace')
+    except UnicodeEncodeError:
+        # it is such text already, with letters that the names of files do not have in this locale
+        return str(path).encode('utf-8', 'backslashreplace').decode('utf-8')
 
 
 def told_apart(paths: Sequence[str]) -> list[str]:
@@ -186,6 +190,9 @@ def _output_error(path: Path, error: OSError) -> OutputError:
         return OutputError(f'{path}: the disk is full; free some space, or choose another folder')
     if error.errno == errno.ENOTDIR:
         return OutputError(f'{path}: a part of this path is a file, not a folder; choose another folder')
+    if error.errno in (errno.ENOTEMPTY, errno.EEXIST):
+        # another run took the name while this one worked
+        return OutputError(f'{path} exists by now, perhaps of another run; choose another folder')
     if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
         return OutputError(f'{path}: no permission to write there; choose another folder')
     return OutputError(f'{path} cannot be written: {error.strerror or error}')

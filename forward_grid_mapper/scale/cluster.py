@@ -11,6 +11,7 @@ from typing import Any
 
 from ..core.common.errors import ClusterError, MapperError, OutputError
 from .job import Job, check_versions, versions
+from .starting import signals_later
 
 PATIENCE = 10.0
 """Seconds in which a scheduler has to answer."""
@@ -91,22 +92,23 @@ class Cluster:
                 logging.getLogger(name).setLevel(logging.CRITICAL)
             address: Any = self._scheduler
             if address is None:
-                address = self._open.enter_context(
-                    LocalCluster(
-                        n_workers=self.workers,
-                        threads_per_worker=1,
-                        processes=True,
-                        memory_limit=self.memory,
-                        dashboard_address='127.0.0.1:0',
-                        silence_logs=logging.CRITICAL,
+                with signals_later():
+                    address = self._open.enter_context(
+                        LocalCluster(
+                            n_workers=self.workers,
+                            threads_per_worker=1,
+                            processes=True,
+                            memory_limit=self.memory,
+                            dashboard_address='127.0.0.1:0',
+                            silence_logs=logging.CRITICAL,
+                        )
                     )
-                )
             try:
                 self._client = self._open.enter_context(Client(address, timeout=PATIENCE, set_as_default=False))
             except (OSError, ValueError, TimeoutError) as error:
                 raise ClusterError(
                     f'no scheduler answers at {self._scheduler}: {error or "nothing came"}. Is the address right '
-                    f'(tcp://HOST:8786), and is dask-scheduler running there?'
+                    f'(tcp://HOST:8786), and does "dask scheduler" run there?'
                 ) from error
             if self._scheduler is None:
                 # for workers that come later, too

@@ -161,7 +161,16 @@ def test_a_working_directory_that_is_gone(tmp_path: Path, bag: Path) -> None:
     environment = {**os.environ, 'PYTHONPATH': os.pathsep.join(filter(None, map(os.path.abspath, sys.path)))}
     done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False, env=environment)
     assert done.returncode == 1
-    assert 'process_bag: error: ' in done.stderr and 'Traceback' not in done.stderr
+    said = 'process_bag: error: the working directory does not exist any more; change to one that does'
+    assert done.stderr.splitlines()[-1] == said and 'Traceback' not in done.stderr
+
+
+def test_a_locale_without_the_letters_of_a_name(tmp_path: Path, bag: Path) -> None:
+    (tmp_path / 'größe').symlink_to(bag)
+    ascii_only = {'LC_ALL': 'C', 'PYTHONUTF8': '0', 'PYTHONCOERCECLOCALE': '0'}
+    done = shell('process_bag', tmp_path / 'größe', '-q', '-o', tmp_path / 'maps', **ascii_only)
+    assert (done.returncode, done.stderr) == (0, '')
+    assert 'größe' in (tmp_path / 'maps' / 'report.txt').read_text('utf-8')
 
 
 # ---- errors
@@ -196,9 +205,13 @@ def test_errors_of_ours_are_not_hidden() -> None:
         console.run(process_bag.parser(), body, ['bag'])
 
 
-def test_readable() -> None:
-    assert readable(Path('Büro 日本')) == 'Büro 日本'
+def test_readable(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert readable(Path('Büro 日本')) == readable(readable(Path('Büro 日本'))) == 'Büro 日本'
     assert readable(os.fsdecode(b'n\xfft')) == r'n\xfft'
+    # as where names of files are ASCII
+    monkeypatch.setattr(os, 'fsencode', lambda path: str(path).encode('ascii', 'surrogateescape'))
+    name = 'Büro'.encode().decode('ascii', 'surrogateescape')
+    assert readable(name) == readable(readable(name)) == 'Büro'
 
 
 # ---- progress

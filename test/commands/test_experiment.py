@@ -84,6 +84,16 @@ def test_density(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert (output / 'figure.png').read_bytes().startswith(b'\x89PNG')
 
 
+@pytest.mark.parametrize('p_lost', [0.0, 0.5])
+def test_the_weights_of_the_causes_are_all_there(p_lost: float) -> None:
+    parameters = Parameters.from_flat({'p_lost': p_lost})
+    curve, _ = experiment_density.density_of_ranges(parameters)
+    table = experiment_density.density_table(curve, parameters)
+    weights = re.findall(r' (0\.\d{3})$', table, re.MULTILINE)
+    assert sum(map(float, weights)) == pytest.approx(1.0, abs=0.003)
+    assert ('echo lost' in table) == (p_lost > 0)
+
+
 def test_the_obstacle_beside_the_cone_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     parameters = Parameters.from_flat(experiment_maps.PAPER)
     with_it, _ = experiment_density.density_of_ranges(parameters)

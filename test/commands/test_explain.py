@@ -57,7 +57,7 @@ def test_a_cell_is_explained(maps: Path, state: int, word: str, capsys: pytest.C
     assert said.splitlines()[0].endswith(f': {word}')
     readings, normals = read_readings(maps / 'readings.npz', archive)
     found = cell_evidence(readings, archive.grid, archive.ml, archive.parameters, normals, (x, y))
-    total = re.search(r'([+-][\d.]+) nats from (\d+) readings', said)
+    total = re.search(r'([+-][\d.]+) nats from (\d+) readings?,', said)
     assert total and (float(total[1]), int(total[2])) == (pytest.approx(found.data, abs=0.051), len(found.readings))
     groups = re.findall(r'^ +([+-][\d.]+)  (\d+) readings? \w+', said, re.MULTILINE)
     assert sum(int(count) for _, count in groups) == len(found.readings)
@@ -140,6 +140,8 @@ def test_folders_without_maps_or_readings_are_named(
 ) -> None:
     assert code_of(explain.main, tmp_path, 0, 0) == 1
     assert 'maps.npz does not exist' in capsys.readouterr().err
+    assert code_of(explain.main, maps / 'ml_map.yaml', 0, 0) == 1
+    assert 'give a folder that process_bag or save_maps wrote' in capsys.readouterr().err
     (tmp_path / 'maps.npz').write_bytes((maps / 'maps.npz').read_bytes())
     assert code_of(explain.main, tmp_path, 0, 0) == 1
     assert 'readings.npz does not exist' in capsys.readouterr().err

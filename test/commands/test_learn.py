@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 from pathlib import Path
 
@@ -118,6 +119,15 @@ def test_files_are_never_overwritten(tmp_path: Path, bag: Path, capsys: pytest.C
         message = said(capsys, bag, '-o', path, code=1)
         assert message.startswith('learn: error: ') and expected in message and '--output' in message
     assert everything_in(tmp_path) == before and taken.read_text() == 'mine'
+
+
+def test_a_place_without_permission_is_told_of_before_the_work(
+    tmp_path: Path, bag: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(os, 'access', lambda path, mode: mode == os.F_OK)
+    monkeypatch.setattr(learn, 'read_drives', lambda *arguments: pytest.fail('it began to work'))
+    message = said(capsys, bag, '-o', tmp_path / 'x.yaml', code=1)
+    assert message.endswith(f'{tmp_path} may not be written to; choose another folder with --output\n')
 
 
 def test_a_bad_request(bag: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

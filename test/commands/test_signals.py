@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -193,6 +194,31 @@ def test_the_demo_leaves_no_node_behind(tmp_path: Path, number: signal.Signals) 
     assert demo.returncode == 128 + number
     assert err.splitlines()[-1] == 'demo: cancelled; nothing was written'
     assert 'Traceback' not in err
+    assert everything_in(tmp_path) == []
+
+
+@pytest.mark.skipif(not Path('/proc/self/task').exists(), reason='there is no /proc')
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+def test_drives_that_are_made_at_once_end_with_the_command(tmp_path: Path, number: signal.Signals) -> None:
+    """Ctrl-C as a terminal sends it, to all of its processes; the drives would take minutes."""
+    options = ('campus', '--drives', '2', '--jobs', '2', '--readings', '1000000', '-q', '-o', str(tmp_path / 'out'))
+    command = [sys.executable, '-m', 'forward_grid_mapper', 'simulate', *options]
+    made = subprocess.Popen(
+        command, env=environment(), stderr=subprocess.PIPE, text=True, start_new_session=True, cwd=tmp_path
+    )
+
+    def children() -> list[str]:
+        return Path(f'/proc/{made.pid}/task/{made.pid}/children').read_text('ascii').split()
+
+    try:
+        # those that make drives, and the one with which multiprocessing keeps its resources
+        wait_for(lambda: len(children()) == 3)
+        os.killpg(made.pid, number) if number == signal.SIGINT else made.send_signal(number)
+        _, err = made.communicate(timeout=20)
+    finally:
+        with suppress(ProcessLookupError):
+            os.killpg(made.pid, signal.SIGKILL)
+    assert (made.returncode, err) == (128 + number, 'simulate: cancelled; nothing was written\n')
     assert everything_in(tmp_path) == []
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ from drive_samples import code_of, everything_in, in_turn, mapped, tape
 
 from forward_grid_mapper.bags.reader import Bag
 from forward_grid_mapper.commands import simulate
+from forward_grid_mapper.core.common.errors import ClusterError
 from forward_grid_mapper.core.messages.message_types import OdometryMessage
 from forward_grid_mapper.files.map_files import read_map
 from forward_grid_mapper.simulation.drive import door_drive
@@ -142,3 +144,8 @@ def test_a_campus_is_a_folder_of_drives_however_many_are_made_at_once(tmp_path: 
 def test_a_campus_without_anything_in_it(tmp_path: Path, option: tuple[str, int]) -> None:
     assert code_of(simulate.main, *CAMPUS, *option, '-o', tmp_path / 'campus') == 1
     assert not (tmp_path / 'campus').exists()
+
+
+def test_a_process_that_is_ended_from_outside_is_told_of() -> None:
+    with pytest.raises(ClusterError, match=r'fewer drives at once \(--jobs\)'):
+        list(simulate.at_once(os._exit, [1, 1], 2))

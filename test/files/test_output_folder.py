@@ -67,7 +67,7 @@ def test_refuses_a_file(tmp_path: Path) -> None:
 
 
 def test_refuses_a_folder_that_came_up_meanwhile(tmp_path: Path) -> None:
-    with pytest.raises(OutputError, match='cannot be written'), output_folder(tmp_path / 'maps') as folder:
+    with pytest.raises(OutputError, match='exists by now'), output_folder(tmp_path / 'maps') as folder:
         (folder / 'a.txt').write_text('a')
         (tmp_path / 'maps').mkdir()
         (tmp_path / 'maps' / 'mine.txt').write_text('mine')

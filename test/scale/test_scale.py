@@ -304,6 +304,24 @@ def test_ctrl_c_says_once_what_is_kept(drives: Path, tmp_path: Path) -> None:
     assert not (tmp_path / 'maps').exists() and any(work.glob('tiles/*/normals.npz'))
 
 
+@scaled
+def test_ctrl_c_while_workers_start_shows_nothing_of_theirs(drives: Path, tmp_path: Path) -> None:
+    import psutil
+
+    client = started(drives, '-o', tmp_path / 'maps', '--tiles', TILE, '--workers', 2, '-q', group=True)
+
+    def importing(process: Any) -> bool:
+        return 'spawn_main' in ' '.join(process.cmdline()) and process.cpu_times().user > 0.3
+
+    wait_for(lambda: any(map(importing, psutil.Process(client.pid).children())), client)
+    os.killpg(client.pid, signal.SIGINT)
+    output, error = client.communicate(timeout=PATIENCE)
+    lines = [line for line in error.decode().splitlines() if 'compiling' not in line]
+    assert lines == ['process_bag: cancelled; nothing was written']
+    assert client.returncode == 130 and not output
+    assert list(tmp_path.iterdir()) == []
+
+
 SIZES = {'work': '200k', 'maps': '60k'}
 
 
