@@ -361,8 +361,8 @@ def test_a_field_of_view_that_cannot_be(tmp_path: Path, capsys: pytest.CaptureFi
     [
         ({'range': math.nan}, 'nan_range', 'not a number; a driver that means "no echo" should send +inf'),
         ({'range': -math.inf}, 'too_near', '-inf'),
-        ({'range': 0.0}, 'below_min_range', 'below min_range'),
-        ({'range': 0.0, 'min_range': 0.0}, 'too_near', 'a driver that means "no echo" and should send +inf'),
+        ({'range': 0.0}, 'below_min_range', 'set the parameter invalid_range to no_echo'),
+        ({'range': 0.0, 'min_range': 0.0}, 'too_near', 'a driver that means "no echo" should send +inf'),
         ({'max_range': math.inf}, 'bad_limits', 'not finite'),
         ({'max_range': 0.0}, 'bad_limits', 'max_range'),
         ({'min_range': -1.0}, 'bad_limits', 'negative'),

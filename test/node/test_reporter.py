@@ -209,7 +209,8 @@ def test_without_a_base_frame_no_transform_is_asked_for() -> None:
         robot.intake.begin()
         robot.odometry(100.0)
         reporter = reporter_of(robot)
-        reporter._reported, reporter._lost, reporter._extrinsics = set(), set(), Extrinsics({}, Transforms())
+        reporter._reported, reporter._lost, reporter._far = set(), set(), False
+        reporter._extrinsics = Extrinsics({}, Transforms())
         robot.associator.base_frame = child
         robot.associator.unknown_frames.add('sonar')
         reporter._name_frames()
