@@ -27,7 +27,7 @@ PATIENCE = 1.0
 """Seconds of work before progress is shown."""
 
 LONG = 10.0
-"""Seconds of work before it is said what is wrong with its input, which may not be worth to wait for."""
+"""Seconds of work after which warnings of its input are shown: the result may not be worth waiting for."""
 
 ON_SCREEN, IN_LOG = 0.2, 1.0
 """Seconds between two looks at what is to be shown, on a terminal and elsewhere."""

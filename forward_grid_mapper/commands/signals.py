@@ -116,7 +116,7 @@ class Interruptible:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         """Leave signals to who had them before."""
-        if self._before:
+        if sys.unraisablehook == self._raise_later:
             sys.unraisablehook = self._hook
         if self._again is not None:
             self._again.cancel()

@@ -146,12 +146,15 @@ def test_signals_that_are_ignored_stay_ignored(capsys: pytest.CaptureFixture[str
         signal.raise_signal(signal.SIGINT)
         return 7
 
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    before = {number: signal.signal(number, signal.SIG_IGN) for number in signals.SIGNALS}
+    hook = sys.unraisablehook
     try:
         assert console.run(process_bag.parser(), body, ['bag']) == 7
     finally:
-        signal.signal(signal.SIGINT, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)
     assert capsys.readouterr().err == ''
+    assert sys.unraisablehook is hook
 
 
 # ---- children

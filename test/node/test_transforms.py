@@ -271,6 +271,15 @@ def test_the_log_tells_once_of_a_map_frame_without_its_transform_and_of_its_end(
     assert told.count('the transform to map_frame is there') == 1
 
 
+def heard_from(robot: Inside, pose: Transform) -> None:
+    """Have readings come from where TF says that the tower is, and be reported on several times."""
+    buffer: Any = robot.node._extrinsics._transforms._buffer
+    buffer.set_transform_static(pose, '')
+    from_tower(robot, 0, 5)
+    for _ in range(3):
+        robot.status('readings')
+
+
 def test_the_log_tells_once_of_a_sensor_in_millimetres(
     inside: Callable[..., Inside], log: Callable[[Inside], Log]
 ) -> None:
@@ -278,11 +287,7 @@ def test_the_log_tells_once_of_a_sensor_in_millimetres(
     told = log(robot)
     pose = Transform()
     pose.translation.x, pose.rotation.w = 150.0, 1.0
-    buffer: Any = robot.node._extrinsics._transforms._buffer
-    buffer.set_transform_static(pose, '')
-    from_tower(robot, 0, 5)
-    for _ in range(3):
-        robot.status('readings')
+    heard_from(robot, pose)
     assert told.count('transforms put tower up to 150 m away from the middle of the robot') == 1
 
 
@@ -291,9 +296,5 @@ def test_the_log_tells_once_of_a_steep_sensor(inside: Callable[..., Inside], log
     told = log(robot)
     pose = Transform()
     pose.rotation.y, pose.rotation.w = math.sin(0.75), math.cos(0.75)
-    buffer: Any = robot.node._extrinsics._transforms._buffer
-    buffer.set_transform_static(pose, '')
-    from_tower(robot, 0, 5)
-    for _ in range(3):
-        robot.status('readings')
+    heard_from(robot, pose)
     assert told.count('readings of tower are rejected: the sensor looks up or down') == 1

@@ -47,8 +47,8 @@ class AssociationParameters:
     )
     invalid_range: str = param(
         'discard',
-        'What NaN, 0 and negative ranges other than -inf mean: nothing, or no echo within max_range, where the driver '
-        'sends them if it hears nothing. If it also sends them for what is too near, keep discard.',
+        'What NaN, 0 and negative ranges other than -inf mean: nothing, or no echo within max_range. Set no_echo if '
+        'the driver sends them where it hears nothing. Keep discard if it also sends them for what is too near.',
         choices=('discard', 'no_echo'),
     )
     field_of_view: float = param(0.0, "Full cone angle used instead of the messages'; 0 takes theirs.", 'rad', 0.0, 3.1)
