@@ -16,6 +16,12 @@ things that stand about, v = (φ z)² / 3 + `THING`, and pairs count
     N' (N' − 1) · max(0, 1 − 2 mean(v) / var(t · p))          N' = N − λ − 2 √λ
 
 where λ echoes are in each bin if ranges are random: sensors do not vote for their own axes, whatever they hear.
+
+The sonars of many robots look past the walls of a corridor on both sides, as eight at equal angles do of which none looks
+straight ahead. A rough wall is heard all the same, where the edge of the cone meets it first: with s the angle from the
+edge to n, an echo then has
+
+    n · p + z cos s = d
 """
 
 from __future__ import annotations
@@ -59,6 +65,10 @@ POINT = 2.0
 THING = 0.5**2 / 12
 """Square metres: the variance of places on a thing of half a metre, which has sides but is no wall."""
 
+BESIDE, COUNTS = math.radians(30.0), 0.5
+"""Radians beside a cone up to which the normal of a wall may lie, and what such an echo counts, if no sensor looks
+straight to a side. With one that does, votes are sharper without."""
+
 USUAL = 0.05
 """Part of the usual mean of a place's votes that is added for all directions: where hardly any echoes agree, those that
 do say little."""
@@ -70,8 +80,9 @@ def count_votes(echoes: Any, counts: Any, votes: Any) -> None:
 
     Parameters
     ----------
-    echoes : float64, shape (N, 5)
-        x, y, bearing, half angle and range of each echo, metres and radians.
+    echoes : float64, shape (N, 7)
+        x, y, bearing, half angle and range of each echo, and how far the normal may lie beside the cone to the right and
+        to the left of it, metres and radians.
     counts : float64, shape (BINS, 4)
         Workspace: of each bin the echoes, Σ and Σ of squares of where they lie along the wall, Σ of v.
     votes : float64, shape (DIRECTIONS,)
@@ -82,19 +93,21 @@ def count_votes(echoes: Any, counts: Any, votes: Any) -> None:
         angle = math.radians(degree)
         c, s = math.cos(angle), math.sin(angle)
         counts[:] = 0.0
-        heard = 0
+        heard = 0.0
         for t in range(len(echoes)):
             off = (echoes[t, 2] - angle + math.pi) % (2.0 * math.pi) - math.pi
-            if abs(off) > echoes[t, 3]:
+            slant = max(abs(off) - echoes[t, 3], 0.0)
+            if slant > echoes[t, 5 if off > 0.0 else 6]:
                 continue
-            at = (echoes[t, 4] + c * echoes[t, 0] + s * echoes[t, 1]) / BIN + BINS // 2
+            at = (echoes[t, 4] * math.cos(slant) + c * echoes[t, 0] + s * echoes[t, 1]) / BIN + BINS // 2
             below = int(math.floor(at))
             if 0 <= below < BINS - 1:
-                heard += 1
+                vote = 1.0 if slant == 0.0 else COUNTS
+                heard += vote
                 part = at - below
                 along = c * echoes[t, 1] - s * echoes[t, 0]
                 thing = (echoes[t, 3] * echoes[t, 4]) ** 2 / 3.0 + THING
-                for k, weight in ((below, 1.0 - part), (below + 1, part)):
+                for k, weight in ((below, vote * (1.0 - part)), (below + 1, vote * part)):
                     counts[k, 0] += weight
                     counts[k, 1] += weight * along
                     counts[k, 2] += weight * along * along
@@ -108,6 +121,31 @@ def count_votes(echoes: Any, counts: Any, votes: Any) -> None:
                 if spread > POINT * counts[k, 3]:
                     total += (count - chance) * (count - chance - 1.0) * (1.0 - POINT * counts[k, 3] / spread)
         votes[degree % DIRECTIONS] += total
+
+
+def beside(bearing: Floats, half: Floats) -> Floats:
+    """Return how far beside each cone the normal of a wall may lie, to the right and to the left, radians, shape (N, 2).
+
+    It is as far as no cone reaches, and at most `BESIDE`; nothing if a sensor looks straight to a side of the robot.
+
+    Parameters
+    ----------
+    bearing, half : float64, shape (N,)
+        Direction of each sensor on the robot, and half angle of its cone, radians.
+    """
+    cones, which = np.unique(np.round(np.degrees(np.column_stack([bearing, half])), 1), axis=0, return_inverse=True)
+    middle, wide = cones.T
+    if (np.abs(np.abs(np.remainder(middle + 180.0, 360.0) - 180.0) - 90.0) <= wide).any():
+        return np.zeros((len(bearing), 2))
+    far = np.arange(math.degrees(BESIDE) + 1.0)
+    out = np.empty((len(cones), 2))
+    for k, side in enumerate((-1.0, 1.0)):
+        # degree by degree from the edge on
+        asked = (middle + side * wide)[:, None] + side * far[1:]
+        off = np.remainder(asked[..., None] - middle + 180.0, 360.0) - 180.0
+        free = ~(np.abs(off) <= wide).any(-1)
+        out[:, k] = np.radians(far[np.logical_and.accumulate(free, axis=1).sum(1)])
+    return out[which.ravel()]
 
 
 def wall_votes(windows: Windows, held_out: NDArray[np.bool_]) -> tuple[NDArray[np.int64], Floats]:
@@ -132,6 +170,7 @@ def wall_votes(windows: Windows, held_out: NDArray[np.bool_]) -> tuple[NDArray[n
     votes, counts = np.zeros((len(at), DIRECTIONS)), np.empty((BINS, 4))
     r = w.readings
     usable = r.echo & (r.z < FARTHEST) & ~np.repeat(held_out, np.diff(w.first))
+    past = beside(w.mount[:, 2], r.half_angle)
     for k, node in enumerate(at):
         near = np.abs(w.node_progress - w.node_progress[node]) <= SPAN / 2
         first, last = np.flatnonzero(near)[[0, -1]]
@@ -140,7 +179,7 @@ def wall_votes(windows: Windows, held_out: NDArray[np.bool_]) -> tuple[NDArray[n
         if len(which) < FEWEST:
             continue
         poses = compose(relative(w.node[node], w.robot[which]), w.mount[which])
-        count_votes(np.column_stack([poses, r.half_angle[which], r.z[which]]), counts, votes[k])
+        count_votes(np.column_stack([poses, r.half_angle[which], r.z[which], past[which]]), counts, votes[k])
     mean = votes.mean(1, keepdims=True)
     if not mean.any():
         return at, np.ones_like(votes)
