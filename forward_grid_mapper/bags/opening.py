@@ -169,12 +169,15 @@ def _open_each(files: list[Path], compression: str) -> tuple[list[Source], list[
     for file in files:
         try:
             sources.append(_open_listed(file, compression))
-        except NoSpaceError:
+        except BaseException as error:
+            # the other files of a split bag are still worth having
+            if isinstance(error, BagError) and not isinstance(error, NoSpaceError):
+                problems.append(str(error).rstrip('.'))
+                continue
+            # what was unpacked must not stay in the temporary folder
             for source in sources:
                 source.close()
             raise
-        except BagError as error:  # the other files of a split bag are still worth having
-            problems.append(str(error).rstrip('.'))
     return sources, problems
 
 
@@ -338,4 +341,4 @@ def _magic(file: Path) -> bytes:
 
 def _natural_order(file: Path) -> list[tuple[int, str]]:
     """Return a sorting key that puts bag_10 after bag_9."""
-    return [(int(part), '') if part.isdigit() else (-1, part) for part in re.split(r'(\d+)', file.name)]
+    return [(int(part), '') if part.isdecimal() else (-1, part) for part in re.split(r'(\d+)', file.name)]
