@@ -37,6 +37,10 @@ from .options import (
 
 COMMAND = 'learn'
 
+NOT_JUDGED = (
+    'no readings were held out to judge the learned values by (--keep-going): compare the maps with and without them'
+)
+
 
 def parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
@@ -63,7 +67,7 @@ def parser() -> argparse.ArgumentParser:
     made.add_argument(
         '--keep-going',
         action='store_true',
-        help='hand out values although their map has lost walls or held-out readings speak against it',
+        help='hand out the values although their map has lost walls, and without asking held-out readings',
     )
     made.add_argument('-q', '--quiet', action='store_true', help='print nothing but warnings and errors')
     add_json_option(made)
@@ -108,6 +112,7 @@ def learn(options: argparse.Namespace) -> int:
         *ignored,
         *reading_warnings(found.maps.readings, drives.source, parameters),
         *found.warnings,
+        *([NOT_JUDGED] if options.keep_going and found.accepted else []),
         *filter(None, [suspects]),
     )
     found = dataclasses.replace(found, warnings=warnings)
