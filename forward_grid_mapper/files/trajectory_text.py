@@ -20,8 +20,10 @@ def tum_text(trajectory: Odometry) -> str:
     lines = []
     for stamp, (x, y, yaw) in zip(trajectory.stamp.tolist(), trajectory.pose.tolist(), strict=True):
         # a stamp before 0 counts backwards
-        seconds, rest = divmod(abs(stamp), 10**9)
-        lines.append(f'{"-" if stamp < 0 else ""}{seconds}.{rest:09d} {x:.6f} {y:.6f} 0 0 0 {math.sin(yaw / 2):.9f} {math.cos(yaw / 2):.9f}')
+        sign, (seconds, rest) = '-' if stamp < 0 else '', divmod(abs(stamp), 10**9)
+        lines.append(
+            f'{sign}{seconds}.{rest:09d} {x:.6f} {y:.6f} 0 0 0 {math.sin(yaw / 2):.9f} {math.cos(yaw / 2):.9f}'
+        )
     return '\n'.join(lines) + '\n'
 
 

@@ -129,7 +129,7 @@ def test_a_file_without_permission_is_said(tmp_path: Path, monkeypatch: pytest.M
         raise PermissionError(13, 'Permission denied', str(path))
 
     monkeypatch.setattr(Path, 'open', refuse)
-    with pytest.raises(InputError, match='poses cannot be read: Permission denied$'):
+    with pytest.raises(InputError, match=r'poses cannot be read: Permission denied$'):
         read_given_poses(file)
 
 

@@ -64,7 +64,7 @@ def test_what_is_wrong_is_told_with_its_line(tmp_path: Path, text: str, said: st
 
 
 def test_a_file_that_cannot_be_read_is_named(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match='absent cannot be read: No such file or directory$'):
+    with pytest.raises(InputError, match=r'absent cannot be read: No such file or directory$'):
         poses_from_csv(tmp_path / 'absent')
     (tmp_path / 'poses.csv').write_bytes(b'\xff\xfe\x00')
     with pytest.raises(InputError, match='cannot be read'):
