@@ -32,7 +32,7 @@ from .options import (
     chosen_part,
     chosen_poses,
     chosen_sensors,
-    not_empty,
+    output_name,
 )
 
 COMMAND = 'learn'
@@ -55,7 +55,7 @@ def parser() -> argparse.ArgumentParser:
     made.add_argument(
         '-o',
         '--output',
-        type=not_empty,
+        type=output_name,
         metavar='FILE',
         help='new parameter YAML, for process_bag --params and for the node',
     )

@@ -22,6 +22,7 @@ from ..recordings.drive import Part
 from ..recordings.drives import without_repetition
 from ..recordings.finding import find_recordings
 from .console import Ticker
+from .options import output_name
 from .signals import Cancelled
 
 TILE = 30.0
@@ -60,6 +61,7 @@ def add_worker_options(parser: argparse.ArgumentParser) -> None:
     )
     group.add_argument(
         '--work',
+        type=output_name,
         metavar='DIR',
         help='where readings and tiles are kept until all is done, on a disk that all workers share; an interrupted '
         'job goes on from there (default: beside the results)',

@@ -44,7 +44,7 @@ from .options import (
     chosen_part,
     chosen_poses,
     chosen_sensors,
-    not_empty,
+    output_name,
 )
 
 SMALLEST_TILE = 1.0
@@ -67,7 +67,7 @@ def parser() -> argparse.ArgumentParser:
         "such as 'monday_*'"
     )
     made.add_argument(
-        '-o', '--output', type=not_empty, metavar='DIR', help='new folder for the results (default: BAG_maps)'
+        '-o', '--output', type=output_name, metavar='DIR', help='new folder for the results (default: BAG_maps)'
     )
     add_bag_options(made)
     add_part_options(made)
@@ -209,6 +209,7 @@ def tell(options: argparse.Namespace, report: Mapping[str, Any], output: Path) -
 def _stem(words: Sequence[str]) -> str:
     """Return what the results of these bags are called."""
     path = Path(words[0]).resolve()
+    path = path.parent if path.name == 'metadata.yaml' else path
     # a dot is part of a folder's name
     first = (path.name if path.is_dir() else path.stem).replace('*', '').replace('?', '') or 'bags'
     return first if len(words) == 1 else f'{first}_and_{len(words) - 1}_more'

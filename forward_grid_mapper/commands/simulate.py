@@ -30,7 +30,7 @@ from ..simulation.drift import LEVELS, with_drift
 from ..simulation.drive import BASE_FRAME, Recording, corridor_drive, door_drive
 from ..simulation.sonar import NOISE_FREE, NOISY, SonarArray, front_array, sonar_ring
 from .console import Ticker, run
-from .options import not_empty
+from .options import output_name
 
 COMMAND = 'simulate'
 REFERENCE = 'reference.tum'
@@ -66,7 +66,7 @@ def parser() -> argparse.ArgumentParser:
         'and a person walking behind the robot (Fig. 6); campus: many drives through many buildings',
     )
     made.add_argument(
-        '-o', '--output', type=not_empty, required=True, metavar='DIR', help='new folder for the recording'
+        '-o', '--output', type=output_name, required=True, metavar='DIR', help='new folder for the recording'
     )
     made.add_argument('--seen', type=int, metavar='N', help='door: sweeps taken in front of it (default 3)')
     made.add_argument('--passes', type=int, metavar='N', help='corridor: times along it (default 1)')
