@@ -19,7 +19,6 @@ from ..files.learned_text import learned_data, learned_text, parameter_file_text
 from ..files.output_folder import readable, unwritable
 from ..files.parameter_file import load_parameters
 from ..files.quality_warning import reading_warnings
-from ..files.report import json_text
 from ..recordings.drives import read_drives
 from .console import Ticker, run
 from .options import (
@@ -33,6 +32,7 @@ from .options import (
     chosen_poses,
     chosen_sensors,
     output_name,
+    print_json,
 )
 
 COMMAND = 'learn'
@@ -117,7 +117,7 @@ def learn(options: argparse.Namespace) -> int:
     )
     found = dataclasses.replace(found, warnings=warnings)
     if options.json:
-        print(json_text({'file': output and readable(output), **learned_data(found)}), end='')
+        print_json({'file': output and readable(output), **learned_data(found)})
     elif options.quiet:
         for warning in warnings:
             print(f'{COMMAND}: warning: {warning}', file=sys.stderr)

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import argparse
+import codecs
 import math
 import os
+import sys
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -16,6 +18,7 @@ from ..core.messages.message_types import Pose2
 from ..files.output_folder import expanded, readable
 from ..files.parameter_file import load_parameters, parse_sensor, parse_setting
 from ..files.parameter_text import dump_parameters
+from ..files.report import json_text
 from ..recordings.drive import Part
 from ..recordings.given_poses import GivenPoses, read_given_poses
 
@@ -38,6 +41,12 @@ def add_json_option(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--json', action='store_true', help='print the result as JSON, and nothing else on standard output'
     )
+
+
+def print_json(data: Mapping[str, Any]) -> None:
+    """Print the result as JSON, which is UTF-8; where the output has another encoding, as ASCII, which is both."""
+    encoding = getattr(sys.stdout, 'encoding', None) or 'ascii'
+    print(json_text(data, ascii=codecs.lookup(encoding).name != 'utf-8'), end='')
 
 
 def add_show_option(parser: argparse.ArgumentParser, what: str) -> None:

@@ -23,7 +23,7 @@ from ..files.map_files import occupancy_values
 from ..files.output_folder import free_name, output_folder, readable
 from ..files.picture import NOWHERE
 from ..files.quality_warning import NOT_CONVERGED
-from ..files.report import json_text, report_text
+from ..files.report import report_text
 from ..files.rerun_recording import NAME as RECORDING
 from ..files.rerun_recording import check_rerun, write_rerun
 from ..files.results import write_results
@@ -45,6 +45,7 @@ from .options import (
     chosen_poses,
     chosen_sensors,
     output_name,
+    print_json,
 )
 
 SMALLEST_TILE = 1.0
@@ -194,7 +195,7 @@ def _given(file: str | None) -> Given | None:
 def tell(options: argparse.Namespace, report: Mapping[str, Any], output: Path) -> None:
     """Print what came out, as the options want it."""
     if options.json:
-        print(json_text({'folder': readable(output), **report}), end='')
+        print_json({'folder': readable(output), **report})
         return
     if not options.quiet:
         print(report_text(dict(report)), end='')
