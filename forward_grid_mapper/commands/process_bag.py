@@ -243,7 +243,8 @@ def _write_bag(path: Path, maps: MapSet, drives: Drives) -> None:
     with BagWriter(path, 'mcap') as writer:
         for name, values in (('live_map', maps.live), ('ml_map', maps.ml), ('uncertainty_map', maps.uncertainty)):
             topic = f'/forward_grid_mapper/{name}'
-            writer.write_grid(topic, maps.grid, occupancy_values(values), frame, stamp)
+            # the log has no time before 0
+            writer.write_grid(topic, maps.grid, occupancy_values(values), frame, stamp, max(stamp, 0))
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
