@@ -50,6 +50,21 @@ def test_files_that_were_unpacked_go_with_the_bag(split: Path, temporary: Path) 
     assert not list(temporary.iterdir())
 
 
+@pytest.mark.parametrize('unpacked', [(0,), (1,), (0, 1)])
+def test_files_that_were_unpacked_by_hand_are_read(split: Path, temporary: Path, unpacked: tuple[int, ...]) -> None:
+    """As messages advise to do it, which leaves the metadata as they were."""
+    with Bag(split) as bag:
+        wanted = bag.topics()
+    for number in unpacked:
+        file = split / f'bag_{number}.mcap.zstd'
+        file.with_suffix('').write_bytes(zstd.decompress(file.read_bytes()))
+        file.unlink()
+    with Bag(split) as bag:
+        assert bag.topics() == wanted
+        assert bag.truncated is None
+    assert not list(temporary.iterdir())
+
+
 @pytest.mark.parametrize(
     ('problem', 'told'), [(KeyboardInterrupt(), KeyboardInterrupt), (PermissionError(13, 'no', 'bag_1'), BagError)]
 )
