@@ -51,8 +51,19 @@ def run(command: str, arguments: Sequence[str] | None = None) -> int:
         signals.leave_silently()
 
 
+def _open_streams() -> None:
+    """Open the standard streams that the process was started without, as by `>&-`.
+
+    Python has None for them, and the next file that is opened takes the number of such a stream.
+    """
+    for name, mode in (('stdin', 'r'), ('stdout', 'w'), ('stderr', 'w')):
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, mode, encoding='utf-8'))  # noqa: PTH123, SIM115 (for the whole process)
+
+
 def _to_a_pipe(work: Callable[[], int]) -> int:
     """Do the work of a command, whose output may go to somebody who stops reading before its end, such as `head`."""
+    _open_streams()
     try:
         try:
             return work()

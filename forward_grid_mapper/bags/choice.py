@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 from ..core.common.errors import BagError
 from ..core.common.shell import quoted
+from ..core.common.words import counted
 from .decoder import TF_MESSAGE
 from .namespaces import Parted, ranges_of
 from .poses import BASE_FRAMES, ODOMETRY, POSES
@@ -89,7 +90,8 @@ def choose_topics(
         )
     if len(found) > 1:
         lines = (
-            f'\n  {topic}: {contents[topic][1]} messages, {frames_of(topic)}: `{_choosing(topic, found, ranges)}`'
+            f'\n  {topic}: {counted(contents[topic][1], "message")}, {frames_of(topic)}: '
+            f'`{_choosing(topic, found, ranges)}`'
             for topic in found
         )
         raise BagError('The bag has several odometry topics; choose one with `--odom-topic`:' + ''.join(lines))

@@ -108,7 +108,7 @@ def _open_folder(folder: Path) -> tuple[list[Source], str | None]:
         if not inside and (deeper := sorted(path.parent.parent for path in folder.glob('*/*/metadata.yaml'))):
             hint = f' There are bags in {deeper[0]}'
         raise BagError(f'{folder} is not a bag: it has neither metadata.yaml nor a .mcap, .db3 or .bag file.{hint}')
-    listed = _without_repetition(folder / name for name in metadata.files)
+    listed = _without_repetition(_packed_or_not(folder / name) for name in metadata.files)
     there = [p for p in listed if p.exists()]
     sources, problems = _open_each(there or present, metadata.compression)
     problems += [f'{p.name} is missing' for p in listed if not p.exists()]
@@ -126,6 +126,12 @@ def is_storage_file(path: Path) -> bool:
 def plain_name(path: Path) -> str:
     """Return the name that a storage file has without compression."""
     return path.name.removesuffix('.zstd')
+
+
+def _packed_or_not(file: Path) -> Path:
+    """Return a file that the metadata list, or what it became when somebody unpacked or compressed it."""
+    others = (file.with_name(plain_name(file)), file.with_name(f'{file.name}.zstd'))
+    return file if file.exists() else next(filter(Path.exists, others), file)
 
 
 def storage_files(folder: Path) -> list[Path]:
@@ -169,12 +175,15 @@ def _open_each(files: list[Path], compression: str) -> tuple[list[Source], list[
     for file in files:
         try:
             sources.append(_open_listed(file, compression))
-        except NoSpaceError:
+        except BaseException as error:
+            # the other files of a split bag are still worth having
+            if isinstance(error, BagError) and not isinstance(error, NoSpaceError):
+                problems.append(str(error).rstrip('.'))
+                continue
+            # what was unpacked must not stay in the temporary folder
             for source in sources:
                 source.close()
             raise
-        except BagError as error:  # the other files of a split bag are still worth having
-            problems.append(str(error).rstrip('.'))
     return sources, problems
 
 
@@ -338,4 +347,4 @@ def _magic(file: Path) -> bytes:
 
 def _natural_order(file: Path) -> list[tuple[int, str]]:
     """Return a sorting key that puts bag_10 after bag_9."""
-    return [(int(part), '') if part.isdigit() else (-1, part) for part in re.split(r'(\d+)', file.name)]
+    return [(int(part), '') if part.isdecimal() else (-1, part) for part in re.split(r'(\d+)', file.name)]

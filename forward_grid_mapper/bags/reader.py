@@ -330,6 +330,13 @@ class Bag:
         return 'none of them readable'
 
 
+def skipped(count: int, topic: str) -> str:
+    """Return the warning about messages that could not be decoded."""
+    if count == 1:
+        return f'1 message on {topic} does not fit its type and was skipped'
+    return f'{count} messages on {topic} do not fit their type and were skipped'
+
+
 def _some(total: int, most: int) -> Iterator[bool]:
     """Yield which of `total` things are some `most` of them: the first, and then others at random, always the same."""
     yield from repeat(True, most // 2)

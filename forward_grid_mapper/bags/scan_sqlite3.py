@@ -6,6 +6,7 @@ many steps of SQLite's virtual machine as the size of the file justifies.
 
 from __future__ import annotations
 
+import os
 import sqlite3
 import struct
 from collections import Counter
@@ -15,6 +16,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
+from ..core.common.errors import BagError
 from .salvage import Scan
 from .source import Channel, Damage, RawMessage, full_type_name, one_line
 
@@ -44,6 +46,11 @@ def has_log(file: Path) -> bool:
     """Return whether a write-ahead log with messages lies beside the file."""
     log = file.with_name(file.name + '-wal')
     return log.is_file() and log.stat().st_size > 0
+
+
+def _may_index_log(file: Path) -> bool:
+    """Return whether SQLite finds its index of the log, or can make it: a file beside the log."""
+    return file.with_name(file.name + '-shm').exists() or os.access(file.parent, os.W_OK)
 
 
 def is_cut(file: Path) -> bool:
@@ -108,10 +115,18 @@ class Sqlite3Scan(Scan):
         ------
         Damage
             If something other than a plain table has the name of one that is read.
+        BagError
+            If messages are in a write-ahead log that cannot be read where it is.
         """
         # A recorder that was killed leaves its last messages in the write-ahead log, which 'immutable' would ignore.
         options = 'mode=ro' if has_log(self._path) else 'mode=ro&immutable=1'
-        database = sqlite3.connect(f'file:{quote(str(self._path.resolve()))}?{options}', uri=True)
+        if has_log(self._path) and not _may_index_log(self._path):
+            raise BagError(
+                f'{self._path} has messages in a log beside it, {self._path.name}-wal, which can be read only in a '
+                f'folder that can be written; copy the bag to one, with all its files.'
+            )
+        # a path of any bytes, which SQLite unquotes
+        database = sqlite3.connect(f'file:{quote(os.fsencode(self._path.resolve()))}?{options}', uri=True)
         try:
             # Without this, SQLite refuses a file that is shorter than its header says.
             database.execute('PRAGMA writable_schema=ON')

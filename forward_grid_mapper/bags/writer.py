@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import math
 import shutil
 import tempfile
@@ -90,9 +91,11 @@ class BagWriter:
                 plugin = rosbag2.StoragePlugin[self._format.upper()]
                 self._writer = rosbag2.Writer(inner, version=_METADATA_VERSION, storage_plugin=plugin)
             self._writer.open()
-        except Exception as error:  # OSError, sqlite3.Error, rosbags' own
+        except BaseException as error:  # OSError, sqlite3.Error, rosbags' own, Ctrl-C
             self._discard()
-            raise OutputError(f'{self.path} cannot be written: {one_line(error)}.') from error
+            if not isinstance(error, Exception):
+                raise
+            raise self._output_error(error) from error
         return self
 
     def __exit__(
@@ -115,7 +118,7 @@ class BagWriter:
         except OutputError:
             raise
         except Exception as problem:  # OSError, sqlite3.Error, rosbags' own
-            raise OutputError(f'{self.path} cannot be written: {one_line(problem)}.') from problem
+            raise self._output_error(problem) from problem
         finally:
             self._discard()
 
@@ -229,7 +232,15 @@ class BagWriter:
         except OutputError:
             raise
         except Exception as error:  # OSError, sqlite3.Error, a number that does not fit its field
-            raise OutputError(f'{self.path}: {topic} cannot be written: {one_line(error)}.') from error
+            raise self._output_error(error, topic) from error
+
+    def _output_error(self, error: Exception, topic: str = '') -> OutputError:
+        """Return what to say of an error while the bag, or a topic of it, was being written."""
+        number = error.errno if isinstance(error, OSError) else None
+        if number in (errno.ENOSPC, errno.EDQUOT) or 'disk is full' in str(error):
+            return OutputError(f'{self.path}: the disk is full; free some space, or choose another folder.')
+        why = (isinstance(error, OSError) and error.strerror) or one_line(error)
+        return OutputError(f'{self.path}{f": {topic}" if topic else ""} cannot be written: {why}.')
 
     def _discard(self) -> None:
         if self._writer is not None:

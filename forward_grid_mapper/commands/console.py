@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import errno
 import io
 import os
 import shutil
@@ -58,7 +59,7 @@ def run(
         return 1
     except OSError as error:
         # of the work's files the work takes care; what remains is the output itself, or the working directory
-        problem = _what_failed(error) if _still_printing() else f'standard output: {error}'
+        problem = _what_failed(error) if _still_printing() else f'standard output: {error.strerror or error}'
     except Cancelled as cancelled:
         # with SIGHUP the terminal is gone
         with suppress(OSError):
@@ -83,12 +84,15 @@ def _still_printing() -> bool:
 
 
 def _what_failed(error: OSError) -> str:
-    """Return an error in words; the system names no file if it is about the working directory."""
+    """Return an error in words; the system names no file if it is about the working directory, or what is printed."""
     if error.filename is None:
         try:
             Path.cwd()
         except OSError:
             return 'the working directory does not exist any more; change to one that does'
+        # without a buffer (PYTHONUNBUFFERED) it is lost, and the next flush finds nothing wrong
+        if error.errno == errno.ENOSPC:
+            return f'standard output: {error.strerror}'
     return str(error)
 
 

@@ -20,7 +20,7 @@ from ..simulation.score import SURFACE_DEPTH, Scores, score_map, threshold, visi
 from ..simulation.world import Door
 from .console import Ticker, run
 from .desktop import show
-from .options import add_mapping_options, add_show_option, chosen_parameters, not_empty
+from .options import add_mapping_options, add_show_option, chosen_parameters, output_name
 from .simulate import SONARS, WORLD_OPTIONS, fill_in, record, write_recording
 
 COMMAND = 'demo'
@@ -34,7 +34,7 @@ def parser() -> argparse.ArgumentParser:
         'replays the bag to it over DDS, runs EM, saves the maps, and scores them against the truth.',
         epilog='example: demo --world corridor -o seen',
     )
-    made.add_argument('-o', '--output', type=not_empty, metavar='DIR', help='new folder (default: demo_output)')
+    made.add_argument('-o', '--output', type=output_name, metavar='DIR', help='new folder (default: demo_output)')
     made.add_argument('--world', choices=('door', 'corridor'), default='door', help='default: door')
     made.add_argument('--seen', type=int, metavar='N', help='door: sweeps in front of it (default 3)')
     made.add_argument('--rate', type=float, default=10.0, metavar='R', help='speed of the replay (default 10)')

@@ -16,7 +16,7 @@ from .desktop import show
 from .experiment_density import density_of_ranges, density_table
 from .experiment_drift import drift
 from .experiment_maps import corridor, door, passer_by
-from .options import add_mapping_options, add_show_option, chosen_parameters, not_empty
+from .options import add_mapping_options, add_show_option, chosen_parameters, output_name
 
 COMMAND = 'experiment'
 
@@ -42,7 +42,7 @@ def parser() -> argparse.ArgumentParser:
         "person who walks by; Fig. 6: a long corridor; drift: wheel odometry that drifts, with the paper's corridor "
         'and a building of ours',
     )
-    made.add_argument('-o', '--output', type=not_empty, metavar='DIR', help='new folder (default: experiment_WHICH)')
+    made.add_argument('-o', '--output', type=output_name, metavar='DIR', help='new folder (default: experiment_WHICH)')
     made.add_argument(
         '--seeds', type=int, default=5, metavar='N', help='seeds of the noise to average over (default 5)'
     )

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from ..core.common.grid import Grid
 from ..core.common.parameters import Parameters
 from ..core.common.readings import Readings
+from ..core.common.words import counted
 from ..core.mapping import Mapper
 from ..core.trajectory.local_map import at_poses
 from ..core.trajectory.poses import Floats, compose, rms_after_alignment
@@ -91,9 +92,9 @@ def aligned(poses: Floats, true: Floats) -> Floats:
 def drift(options: argparse.Namespace, parameters: Parameters, ticker: Ticker) -> tuple[str, dict[str, Figure]]:
     """Return the table, and for each world the maps of its first drive with the box that they show."""
     lines = [
-        f'Wheel odometry that drifts (simulate --drift {LEVEL}), {options.seeds} drives of each world: absolute',
-        'trajectory error after rigid alignment, F1 with one cell of tolerance, and of the floor that a robot of',
-        f'{RADIUS:g} m radius may use the part that map and truth share (IoU); means, and the largest error.',
+        f'Wheel odometry that drifts (simulate --drift {LEVEL}), {counted(options.seeds, "drive")} of each world:',
+        'absolute trajectory error after rigid alignment, F1 with one cell of tolerance, and of the floor that a robot',
+        f'of {RADIUS:g} m radius may use the part that map and truth share (IoU); means, and the largest error.',
         '',
         f'{"":12s}{"poses":12s}{"ATE, m":>8s}{"largest":>9s}{"F1":>7s}{"IoU":>7s}{"refined":>9s}',
     ]

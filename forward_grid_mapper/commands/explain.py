@@ -20,9 +20,8 @@ from ..core.maps.cell_evidence import CellEvidence, cell_evidence
 from ..core.messages.message_types import NANOSECONDS
 from ..files.map_archive import MapArchive, read_npz
 from ..files.reading_archive import read_readings
-from ..files.report import json_text
 from .console import run
-from .options import add_json_option
+from .options import add_json_option, print_json
 
 COMMAND = 'explain'
 ARCHIVE = 'maps.npz'
@@ -69,7 +68,7 @@ def explain(options: argparse.Namespace) -> int:
         )
     found = cell_evidence(readings, maps.grid, maps.ml, maps.parameters, normals, (options.x, options.y))
     if options.json:
-        print(json_text(explanation_data(maps, readings, found, options.readings)), end='')
+        print_json(explanation_data(maps, readings, found, options.readings))
     else:
         shown = SHOWN if options.readings is None else max(options.readings, 0)
         print('\n'.join(explanation(maps, readings, found, shown)))

@@ -19,7 +19,6 @@ from ..files.learned_text import learned_data, learned_text, parameter_file_text
 from ..files.output_folder import readable, unwritable
 from ..files.parameter_file import load_parameters
 from ..files.quality_warning import reading_warnings
-from ..files.report import json_text
 from ..recordings.drives import read_drives
 from .console import Ticker, run
 from .options import (
@@ -32,10 +31,15 @@ from .options import (
     chosen_part,
     chosen_poses,
     chosen_sensors,
-    not_empty,
+    output_name,
+    print_json,
 )
 
 COMMAND = 'learn'
+
+NOT_JUDGED = (
+    'no readings were held out to judge the learned values by (--keep-going): compare the maps with and without them'
+)
 
 
 def parser() -> argparse.ArgumentParser:
@@ -51,7 +55,7 @@ def parser() -> argparse.ArgumentParser:
     made.add_argument(
         '-o',
         '--output',
-        type=not_empty,
+        type=output_name,
         metavar='FILE',
         help='new parameter YAML, for process_bag --params and for the node',
     )
@@ -63,7 +67,7 @@ def parser() -> argparse.ArgumentParser:
     made.add_argument(
         '--keep-going',
         action='store_true',
-        help='hand out values although their map has lost walls or held-out readings speak against it',
+        help='hand out the values although their map has lost walls, and without asking held-out readings',
     )
     made.add_argument('-q', '--quiet', action='store_true', help='print nothing but warnings and errors')
     add_json_option(made)
@@ -108,11 +112,12 @@ def learn(options: argparse.Namespace) -> int:
         *ignored,
         *reading_warnings(found.maps.readings, drives.source, parameters),
         *found.warnings,
+        *([NOT_JUDGED] if options.keep_going and found.accepted else []),
         *filter(None, [suspects]),
     )
     found = dataclasses.replace(found, warnings=warnings)
     if options.json:
-        print(json_text({'file': output and readable(output), **learned_data(found)}), end='')
+        print_json({'file': output and readable(output), **learned_data(found)})
     elif options.quiet:
         for warning in warnings:
             print(f'{COMMAND}: warning: {warning}', file=sys.stderr)

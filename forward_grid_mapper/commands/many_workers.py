@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import math
+import os
 import re
 import shutil
 import sys
@@ -22,6 +23,7 @@ from ..recordings.drive import Part
 from ..recordings.drives import without_repetition
 from ..recordings.finding import find_recordings
 from .console import Ticker
+from .options import output_name
 from .signals import Cancelled
 
 TILE = 30.0
@@ -60,6 +62,7 @@ def add_worker_options(parser: argparse.ArgumentParser) -> None:
     )
     group.add_argument(
         '--work',
+        type=output_name,
         metavar='DIR',
         help='where readings and tiles are kept until all is done, on a disk that all workers share; an interrupted '
         'job goes on from there (default: beside the results)',
@@ -88,7 +91,7 @@ def with_workers(
     from ..scale.work_folder import WorkFolder
 
     output = Path(options.output) if options.output else free_name(Path.cwd(), default)
-    work = WorkFolder(str(Path(options.work or f'{output}.work').resolve()))
+    work = WorkFolder(str(Path(options.work or beside(output)).resolve()))
     memory = int((options.memory_per_worker or MEMORY) * 1e9)
     size = TILE if options.tiles is None else options.tiles
     meant = find_recordings(options.bags)
@@ -132,6 +135,11 @@ def with_workers(
         seconds = time.perf_counter() - begun
         print(f'{seconds:.0f} s; the largest worker took {found.peak / 1e9:.2f} GB')
     return 0
+
+
+def beside(output: Path) -> Path:
+    """Return the folder in which a job works that writes to `output`: not in it, also where that is `.`."""
+    return Path(f'{os.path.abspath(output)}.work')  # noqa: PTH100 (as `output_folder` has it)
 
 
 def _check(options: argparse.Namespace) -> None:

@@ -3,28 +3,37 @@
 from __future__ import annotations
 
 import argparse
+import codecs
 import math
 import os
+import sys
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
-from ..core.common.errors import ParameterError
+from ..core.common.errors import OutputError, ParameterError
 from ..core.common.former_parameters import DEPRECATED
 from ..core.common.parameters import Parameters, find
 from ..core.common.shell import quoted
 from ..core.messages.message_types import Pose2
-from ..files.output_folder import readable
+from ..files.output_folder import expanded, readable
 from ..files.parameter_file import load_parameters, parse_sensor, parse_setting
 from ..files.parameter_text import dump_parameters
+from ..files.report import json_text
 from ..recordings.drive import Part
 from ..recordings.given_poses import GivenPoses, read_given_poses
 
 
-def not_empty(text: str) -> str:
-    """Return what an option is given, for argparse; a shell's variable may have been empty."""
+def output_name(text: str) -> str:
+    """Return the name of what is to be written, for argparse.
+
+    A shell's variable may have been empty, and bash leaves the `~` of `--output=~/maps` as it is.
+    """
     if not text.strip():
         raise argparse.ArgumentTypeError('the name is empty')
-    return text
+    try:
+        return str(expanded(text)) if text.startswith('~') else text
+    except OutputError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
 
 
 def add_json_option(parser: argparse.ArgumentParser) -> None:
@@ -32,6 +41,12 @@ def add_json_option(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--json', action='store_true', help='print the result as JSON, and nothing else on standard output'
     )
+
+
+def print_json(data: Mapping[str, Any]) -> None:
+    """Print the result as JSON, which is UTF-8; where the output has another encoding, as ASCII, which is both."""
+    encoding = getattr(sys.stdout, 'encoding', None) or 'ascii'
+    print(json_text(data, ascii=codecs.lookup(encoding).name != 'utf-8'), end='')
 
 
 def add_show_option(parser: argparse.ArgumentParser, what: str) -> None:

@@ -23,7 +23,7 @@ from ..files.map_files import occupancy_values
 from ..files.output_folder import free_name, output_folder, readable
 from ..files.picture import NOWHERE
 from ..files.quality_warning import NOT_CONVERGED
-from ..files.report import json_text, report_text
+from ..files.report import report_text
 from ..files.rerun_recording import NAME as RECORDING
 from ..files.rerun_recording import check_rerun, write_rerun
 from ..files.results import write_results
@@ -44,7 +44,8 @@ from .options import (
     chosen_part,
     chosen_poses,
     chosen_sensors,
-    not_empty,
+    output_name,
+    print_json,
 )
 
 SMALLEST_TILE = 1.0
@@ -67,7 +68,7 @@ def parser() -> argparse.ArgumentParser:
         "such as 'monday_*'"
     )
     made.add_argument(
-        '-o', '--output', type=not_empty, metavar='DIR', help='new folder for the results (default: BAG_maps)'
+        '-o', '--output', type=output_name, metavar='DIR', help='new folder for the results (default: BAG_maps)'
     )
     add_bag_options(made)
     add_part_options(made)
@@ -194,7 +195,7 @@ def _given(file: str | None) -> Given | None:
 def tell(options: argparse.Namespace, report: Mapping[str, Any], output: Path) -> None:
     """Print what came out, as the options want it."""
     if options.json:
-        print(json_text({'folder': readable(output), **report}), end='')
+        print_json({'folder': readable(output), **report})
         return
     if not options.quiet:
         print(report_text(dict(report)), end='')
@@ -209,6 +210,7 @@ def tell(options: argparse.Namespace, report: Mapping[str, Any], output: Path) -
 def _stem(words: Sequence[str]) -> str:
     """Return what the results of these bags are called."""
     path = Path(words[0]).resolve()
+    path = path.parent if path.name == 'metadata.yaml' else path
     # a dot is part of a folder's name
     first = (path.name if path.is_dir() else path.stem).replace('*', '').replace('?', '') or 'bags'
     return first if len(words) == 1 else f'{first}_and_{len(words) - 1}_more'
@@ -241,7 +243,8 @@ def _write_bag(path: Path, maps: MapSet, drives: Drives) -> None:
     with BagWriter(path, 'mcap') as writer:
         for name, values in (('live_map', maps.live), ('ml_map', maps.ml), ('uncertainty_map', maps.uncertainty)):
             topic = f'/forward_grid_mapper/{name}'
-            writer.write_grid(topic, maps.grid, occupancy_values(values), frame, stamp)
+            # the log has no time before 0
+            writer.write_grid(topic, maps.grid, occupancy_values(values), frame, stamp, max(stamp, 0))
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

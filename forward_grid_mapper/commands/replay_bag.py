@@ -12,8 +12,9 @@ from typing import Any
 
 from ..bags.choice import ODOMETRY, RANGE
 from ..bags.decoder import TF_MESSAGE
-from ..bags.reader import Bag
+from ..bags.reader import Bag, skipped
 from ..core.common.errors import MapperError
+from ..core.common.words import counted
 from ..replay.player import CLOCK, Player
 from ..replay.publishers import Publishers, renamed
 from ..replay.ros_messages import MISFITS, message_class, static_transforms
@@ -121,9 +122,9 @@ def _warn(bag: Bag, player: Player) -> None:
     if bag.truncated:
         _print_warning(bag.truncated)
     for topic, count in (player.unusable + Counter(bag.undecodable)).items():
-        _print_warning(f'{count} messages on {topic} do not fit their type and were skipped')
+        _print_warning(skipped(count, topic))
     if player.jumps:
-        _print_warning(f'the stamps went back or left a gap {player.jumps} times, which was not waited for')
+        _print_warning(f'the stamps went back or left a gap {counted(player.jumps, "time")}, which was not waited for')
 
 
 def _print_warning(text: str) -> None:

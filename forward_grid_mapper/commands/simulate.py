@@ -6,6 +6,7 @@ import argparse
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
 from dataclasses import dataclass
 from multiprocessing import active_children, get_context
 from pathlib import Path
@@ -14,8 +15,9 @@ from typing import TypeVar
 import numpy as np
 
 from ..bags.writer import BagWriter, check_bag_path
-from ..core.common.errors import ClusterError, ParameterError
+from ..core.common.errors import ClusterError, MapperError, ParameterError
 from ..core.common.shell import command_line
+from ..core.common.words import counted
 from ..core.messages.message_types import OdometryMessage, RangeMessage
 from ..core.runtime.threads import cores
 from ..core.trajectory.windows import Odometry
@@ -28,7 +30,7 @@ from ..simulation.drift import LEVELS, with_drift
 from ..simulation.drive import BASE_FRAME, Recording, corridor_drive, door_drive
 from ..simulation.sonar import NOISE_FREE, NOISY, SonarArray, front_array, sonar_ring
 from .console import Ticker, run
-from .options import not_empty
+from .options import output_name
 
 COMMAND = 'simulate'
 REFERENCE = 'reference.tum'
@@ -41,6 +43,9 @@ WORLD_OPTIONS = {
     'campus': {'drives': 4, 'buildings': 4, 'readings': 40_000, 'jobs': cores()},
 }
 """Options that one world alone has, and their defaults."""
+
+MOST = 10_000_000
+"""The largest number that these options take; beyond, no machine has the memory or the time."""
 
 FORMATS = {'mcap': 'bag', 'sqlite3': 'bag', 'ros1': 'drive.bag'}
 SONARS: dict[str, Callable[[], SonarArray]] = {'ring': sonar_ring, 'front': front_array}
@@ -61,7 +66,7 @@ def parser() -> argparse.ArgumentParser:
         'and a person walking behind the robot (Fig. 6); campus: many drives through many buildings',
     )
     made.add_argument(
-        '-o', '--output', type=not_empty, required=True, metavar='DIR', help='new folder for the recording'
+        '-o', '--output', type=output_name, required=True, metavar='DIR', help='new folder for the recording'
     )
     made.add_argument('--seen', type=int, metavar='N', help='door: sweeps taken in front of it (default 3)')
     made.add_argument('--passes', type=int, metavar='N', help='corridor: times along it (default 1)')
@@ -91,7 +96,7 @@ def fill_in(options: argparse.Namespace, known: Mapping[str, Mapping[str, int]])
     Raises
     ------
     ParameterError
-        If an option of another world is given, or a number is not positive.
+        If an option of another world is given, or a number is not positive or too large.
     """
     for world, defaults in known.items():
         for name, default in defaults.items():
@@ -100,17 +105,29 @@ def fill_in(options: argparse.Namespace, known: Mapping[str, Mapping[str, int]])
                 raise ParameterError(f'--{name} is an option of the world {world}, and the world is {options.world}')
             if given is not None and given < 1:
                 raise ParameterError(f'--{name} must be a positive number')
+            if given is not None and given > MOST:
+                raise ParameterError(f'--{name} must be at most {MOST}')
             setattr(options, name, default if given is None else given)
     if options.seed < 0:
         raise ParameterError('--seed must be a positive number or 0')
 
 
 def record(world: str, seen: int, passes: int, noise_free: bool, seed: int, sonars: SonarArray) -> Recording:
-    """Simulate the drive that the options ask for."""
+    """Simulate the drive that the options ask for.
+
+    Raises
+    ------
+    MapperError
+        If the memory is not enough; names the option to lower.
+    """
     noise = NOISE_FREE if noise_free else NOISY
-    if world == 'door':
-        return door_drive(seen, noise, seed, sonars)
-    return corridor_drive(seed, passes, noise, not noise_free, sonars)
+    try:
+        if world == 'door':
+            return door_drive(seen, noise, seed, sonars)
+        return corridor_drive(seed, passes, noise, not noise_free, sonars)
+    except MemoryError as error:
+        option = '--seen' if world == 'door' else '--passes'
+        raise MapperError(f'the memory is not enough for so long a drive; lower {option}') from error
 
 
 def write_bag(path: Path, recording: Recording, format: str, each: bool) -> None:
@@ -183,7 +200,7 @@ def simulate_campus(options: argparse.Namespace, ticker: Ticker) -> None:
     """Make many drives, several at once, and the true map that they share."""
     if options.drift:
         raise ParameterError('campus: drives that drift are not in one map frame; leave out --drift')
-    with output_folder(options.output) as folder:
+    with _enough_memory(), output_folder(options.output) as folder:
         for name in ('drives', 'trajectories'):
             with output_errors(folder):
                 (folder / name).mkdir()
@@ -206,9 +223,21 @@ def simulate_campus(options: argparse.Namespace, ticker: Ticker) -> None:
             ticker.say(f'simulating: {len(done)} of {options.drives} drives')
     if not options.quiet:
         readings, odometry = (sum(column) for column in zip(*done, strict=True))
-        print(f'{options.drives} drives: {readings:,} readings and {odometry:,} odometry messages')
+        print(f'{counted(options.drives, "drive")}: {readings:,} readings and {odometry:,} odometry messages')
         print(f'drives, trajectories and reference.yaml are in {options.output}; map them with')
         print(f'  {command_line("process_bag", Path(options.output) / "drives", "--tiles", "30")}')
+
+
+@contextmanager
+def _enough_memory() -> Iterator[None]:
+    """Say what to do where the memory is not enough for a campus or its drives."""
+    try:
+        yield
+    except MemoryError as error:
+        raise MapperError(
+            'the memory is not enough for so large a campus, or for so long drives through it; lower --buildings or '
+            '--readings, or make fewer drives at once (--jobs)'
+        ) from error
 
 
 def at_once(work: Callable[[int], T], numbers: Iterable[int], jobs: int) -> Iterator[T]:

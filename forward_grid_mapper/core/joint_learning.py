@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from .common.grid import part_of
 from .common.parameters import ModelParameters, Parameters
 from .common.readings import Readings
+from .common.words import counted
 from .learning.lost_walls import Stretch, lost_walls
 from .learning.model_update import learn
 from .learning.standard_errors import LEARNED, Estimate, estimates
@@ -298,7 +299,7 @@ def _quality_warnings(rounds: list[Round], accepted: int, converged: bool) -> li
                 f'at the same values; it ended in another local maximum'
             )
     if accepted and not converged and accepted == len(rounds) - 1:
-        warnings.append(f'the values had not come to rest after {accepted} rounds; try more with --rounds')
+        warnings.append(f'the values had not come to rest after {counted(accepted, "round")}; try more with --rounds')
     return warnings
 
 

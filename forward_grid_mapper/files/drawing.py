@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -75,7 +76,10 @@ def draw(path: Path, picture: Picture) -> None:
         _frame(axes, panel.title, picture.view, (column == 0, row == rows - 1))
     _head(figure, picture)
     _foot(figure, picture)
-    figure.savefig(path)
+    with warnings.catch_warnings():
+        # of the names of bags; a box stands for a letter that the font lacks
+        warnings.filterwarnings('ignore', 'Glyph')
+        figure.savefig(path)
 
 
 def draw_map(axes: Axes, values: NDArray[Any], extent: Box, pixel: float) -> None:

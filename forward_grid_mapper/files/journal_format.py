@@ -134,7 +134,12 @@ class Contents:
     @property
     def harm(self) -> str:
         """What is wrong with the file, in words; empty if nothing is."""
-        counts = [f'{count} readings are left out, since {reason}' for reason, count in self.left_out.items()]
+        counts = [
+            f'{count} readings are left out, since {reason}'
+            if count > 1
+            else f'1 reading is left out, since {reason.replace("their", "its", 1)}'
+            for reason, count in self.left_out.items()
+        ]
         return '; '.join(self.faults + counts)
 
     def fault(self, text: str) -> None:

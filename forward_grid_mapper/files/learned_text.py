@@ -138,7 +138,9 @@ def parameter_file_text(
     for key, value in extra.items():
         # a list on one line, as the rest of the file has it
         flow = None if isinstance(value, list) else False
-        text += '    ' + yaml.safe_dump({key: value}, default_flow_style=flow, width=1000).strip() + '\n'
+        # yaml puts what follows a long name on a line of its own
+        made = yaml.safe_dump({key: value}, default_flow_style=flow, width=1000).strip().splitlines()
+        text += ''.join(f'    {line}\n' for line in made)
     return text
 
 
@@ -158,6 +160,7 @@ def write_new_file(path: Path, text: str) -> None:
         try:
             with file:
                 file.write(text)
-        except OSError:
+        except BaseException:
+            # Ctrl-C as well as a full disk
             path.unlink(missing_ok=True)
             raise

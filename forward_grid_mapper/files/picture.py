@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from ..core.common.errors import OutputError
 from ..core.common.grid import UNKNOWN, Grid
+from ..core.common.words import counted
 from ..core.maps.map_set import MapSet
 from .output_folder import output_errors
 from .panels import Box, Panel, Picture, coarse
@@ -145,7 +146,7 @@ def figures_of(maps: MapSet) -> str:
 
 def figures_text(readings: int, resolution: float, log_likelihood: float) -> str:
     """Return the line of figures below the title."""
-    parts = [f'{readings:,} readings', f'{100 * resolution:g} cm cells']
+    parts = [counted(readings, 'reading', ','), f'{100 * resolution:g} cm cells']
     if np.isfinite(log_likelihood):
         total, mean = (f'{v:,.2f}'.replace('-', '−') for v in (log_likelihood, log_likelihood / max(1, readings)))
         parts.append(f'log-likelihood {total} nats ({mean} a reading)')

@@ -81,14 +81,18 @@ def poses_from_csv(path: Path | str) -> Poses:
     Raises
     ------
     InputError
-        If a column is missing, or a line has something else than finite numbers in the columns that are wanted.
+        If it is no CSV, a column is missing, or a line has something else than finite numbers in the columns that are
+        wanted.
     """
     lines = _lines(path)
     start = next((k for k, line in enumerate(lines) if line.strip()), None)
     if start is None:
         raise InputError(f'{path} is empty')
     comma = ';' if lines[start].count(';') > lines[start].count(',') else ','
-    rows = list(csv.reader(lines[start:], delimiter=comma))
+    try:
+        rows = list(csv.reader(lines[start:], delimiter=comma))
+    except csv.Error as error:
+        raise InputError(f'{path} is not CSV: {error}') from None
     header = [name.strip().lstrip('#').strip().lower() for name in rows[0]]
     columns = _columns(path, header)
     stamps, poses = [], []
@@ -133,7 +137,9 @@ def _columns(path: Path | str, header: Sequence[str]) -> dict[str, int]:
 def _lines(path: Path | str) -> list[str]:
     try:
         return Path(path).read_text(encoding='utf-8-sig').splitlines()
-    except (OSError, UnicodeDecodeError) as error:
+    except OSError as error:
+        raise InputError(f'{path} cannot be read: {error.strerror or error}') from None
+    except UnicodeDecodeError as error:
         raise InputError(f'{path} cannot be read: {error}') from None
 
 

@@ -73,7 +73,9 @@ def read_readings(path: Path | str, maps: MapArchive) -> ReadingArchive:
             same = float(data['log_likelihood']) == maps.log_likelihood
             sound = all(np.isfinite(column).all() for column in columns.values())
     except FileNotFoundError as error:
-        raise InputError(f'{path} does not exist; make the maps anew') from error
+        raise InputError(
+            f'{path} does not exist; make the maps anew, and without --workers or --scheduler, which write no readings'
+        ) from error
     except Exception as error:  # zipfile, zlib and numpy have many kinds for damaged bytes
         raise InputError(f'{path} is not an archive of readings, or is damaged: {error}') from error
     if not sound:

@@ -127,9 +127,12 @@ def _map(maps: MapSet) -> dict[str, Any]:
     }
 
 
-def json_text(data: Mapping[str, Any]) -> str:
-    """Return data as lines of JSON, whatever numpy types are in it; a number that is not finite is null."""
-    return json.dumps(plain(data), indent=2, ensure_ascii=False, allow_nan=False) + '\n'
+def json_text(data: Mapping[str, Any], ascii: bool = False) -> str:
+    """Return data as lines of JSON, whatever numpy types are in it; a number that is not finite is null.
+
+    With `ascii` all other characters are escaped.
+    """
+    return json.dumps(plain(data), indent=2, ensure_ascii=ascii, allow_nan=False) + '\n'
 
 
 def plain(value: Any) -> Any:

@@ -7,6 +7,8 @@ from collections.abc import Iterator
 from datetime import datetime, timezone
 from typing import Any
 
+from ..core.common.words import counted
+
 _LABEL = 14
 _WIDTH = 100
 _SHOWN = 6
@@ -195,7 +197,8 @@ def _result(data: dict[str, Any]) -> Iterator[str]:
         yield from _line('Objective', f'{objective:,.1f} nats{before}')
     if (unexplained := result.get('unexplained')) is not None:
         share = _share(unexplained, readings)
-        yield from _line('Random', f'{unexplained:,} readings ({share}) are most likely random measurements')
+        are = 'is most likely a random measurement' if unexplained == 1 else 'are most likely random measurements'
+        yield from _line('Random', f'{counted(unexplained, "reading", ",")} ({share}) {are}')
     work = [f'{statistics[key]:,} {key}' for key in ('pairs', 'iterations', 'flips', 'shifts') if statistics.get(key)]
     if (converged := statistics.get('converged')) is not None:
         work.append('converged' if converged else 'NOT converged: max_iterations was reached')
@@ -204,7 +207,7 @@ def _result(data: dict[str, Any]) -> Iterator[str]:
     if tiles := statistics.get('tiles'):
         yield from _line(
             'Tiles',
-            f'{tiles:,}, searched {statistics["searches_of_tiles"]:,} times; a reading belongs to '
+            f'{tiles:,}, searched {counted(statistics["searches_of_tiles"], "time", ",")}; a reading belongs to '
             f'{statistics["evaluations_of_a_reading"]:.2f} of them',
         )
 

@@ -19,8 +19,11 @@ def tum_text(trajectory: Odometry) -> str:
     """Return a line for each pose, `stamp x y z qx qy qz qw` in seconds and metres, as evo reads them."""
     lines = []
     for stamp, (x, y, yaw) in zip(trajectory.stamp.tolist(), trajectory.pose.tolist(), strict=True):
-        seconds = f'{stamp // 10**9}.{stamp % 10**9:09d}'
-        lines.append(f'{seconds} {x:.6f} {y:.6f} 0 0 0 {math.sin(yaw / 2):.9f} {math.cos(yaw / 2):.9f}')
+        # a stamp before 0 counts backwards
+        sign, (seconds, rest) = '-' if stamp < 0 else '', divmod(abs(stamp), 10**9)
+        lines.append(
+            f'{sign}{seconds}.{rest:09d} {x:.6f} {y:.6f} 0 0 0 {math.sin(yaw / 2):.9f} {math.cos(yaw / 2):.9f}'
+        )
     return '\n'.join(lines) + '\n'
 
 

@@ -61,7 +61,7 @@ class Spans:
     Parameters
     ----------
     part : Part
-        The drive begins with the first message.
+        The drive begins with the first message that has a stamp.
     margin : float
         Nanoseconds before and after the part whose odometry is taken as well.
 
@@ -85,19 +85,28 @@ class Spans:
             _widen(self.ranges, ranges)
             _widen(self.odometry, odometry)
             return batch
-        if self._bounds is None:
-            both = [kind for kind in batch if len(kind.stamp)]
-            first = min(both, key=lambda kind: int(kind.place[0]))
-            self._bounds = self._part.bounds(int(first.stamp[0]))
-        begin, end = self._bounds
+        if self._bounds is None and (first := _first_stamp(batch)) is not None:
+            self._bounds = self._part.bounds(first)
+        begin, end = self._bounds or self._part.bounds(0)
         # as whole numbers, which floats of this size are not all
         now = np.array([begin <= stamp < end for stamp in ranges.tolist()], np.bool_)
         near = [begin - self._margin <= stamp < end + self._margin for stamp in odometry.tolist()]
         moved = np.array(near, np.bool_)
         _widen(self.ranges, ranges[now])
         _widen(self.odometry, odometry[moved])
-        _widen(self.left_out, np.concatenate([ranges[~now], odometry[~moved]]))
+        left_out = np.concatenate([ranges[~now], odometry[~moved]])
+        _widen(self.left_out, left_out[left_out != 0] if left_out.any() else left_out)
         return batch.select(now, moved)
+
+
+def _first_stamp(batch: MessageBatch) -> int | None:
+    """Return the stamp of the first message that has one; a driver may not have filled in that of the very first."""
+    found = []
+    for kind in batch:
+        stamped = np.flatnonzero(kind.stamp)
+        if len(stamped):
+            found.append((int(kind.place[stamped[0]]), int(kind.stamp[stamped[0]])))
+    return min(found)[1] if found else None
 
 
 def _widen(span: list[int], stamps: NDArray[np.int64]) -> None:

@@ -151,18 +151,24 @@ def unreadable(errors: Sequence[tuple[Path, MapperError]], count: int) -> Mapper
 
 
 def without_repetition(paths: Sequence[Path]) -> tuple[list[Path], list[str]]:
-    """Return the recordings, each once, and a warning for those that are given more often, by whatever name."""
+    """Return the recordings, each once, and a warning for those that are given more often, by whatever name.
+
+    Of a bag and one of its files the bag is taken, in whatever order they are given.
+    """
     found: dict[object, Path] = {}
     told = []
-    for path in paths:
-        keys = _files(path)
+    files = {path: _files(path) for path in paths}
+    # one whose files are a part of another one's comes after it
+    for path in sorted(paths, key=lambda path: -len(files[path])):
+        keys = files[path]
         earlier = next((found[key] for key in keys if key in found), None)
         if earlier is not None:
             again = '' if earlier == path else f' again as {readable(path)}'
             told.append(f'{readable(earlier)} is given{again or " more than once"}; it is read once')
             continue
         found.update(dict.fromkeys(keys, path))
-    return list(dict.fromkeys(found.values())), list(dict.fromkeys(told))
+    kept = set(found.values())
+    return [path for path in dict.fromkeys(paths) if path in kept], list(dict.fromkeys(told))
 
 
 def _files(path: Path) -> list[object]:

@@ -109,4 +109,4 @@ def _left_out(path: Path, skipped: Sequence[Path]) -> str:
 
 def _natural(name: str) -> list[tuple[int, str]]:
     """Return a sorting key that puts day_10 after day_9."""
-    return [(int(part), '') if part.isdigit() else (-1, part) for part in re.split(r'(\d+)', name)]
+    return [(int(part), '') if part.isdecimal() else (-1, part) for part in re.split(r'(\d+)', name)]

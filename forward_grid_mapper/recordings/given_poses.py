@@ -73,6 +73,9 @@ def _is_csv(path: Path) -> bool:
         raise InputError(
             f'{readable(path)} is not a file with poses' if path.exists() else f'{readable(path)} does not exist'
         )
-    with path.open(encoding='utf-8', errors='replace') as lines:
-        first = next((line for line in lines if line.strip()), '')
+    try:
+        with path.open(encoding='utf-8', errors='replace') as lines:
+            first = next((line for line in lines if line.strip()), '')
+    except OSError as error:
+        raise InputError(f'{readable(path)} cannot be read: {error.strerror or error}') from None
     return ',' in first or ';' in first

@@ -9,6 +9,7 @@ from pathlib import Path
 from ..core.common.errors import InputError, ParameterError
 from ..core.common.parameters import TABLE, Parameters
 from ..core.common.readings import Readings
+from ..core.common.words import counted
 from ..core.messages.message_types import NANOSECONDS, Pose2
 from ..core.messages.pose_association import PoseAssociator
 from ..core.messages.rep117 import REASONS
@@ -54,7 +55,10 @@ def read_journal(
         first, last = min(first, int(readings.stamp.min())), max(last, int(readings.stamp.max()))
         names |= set(readings.sensor_names)
     if not len(associator.buffer):
-        reasons = [f'{count} are refused: {REASONS[reason]}' for reason, count in associator.rejected.items()]
+        reasons = [
+            f'{count} {"is" if count == 1 else "are"} refused: {REASONS[reason]}'
+            for reason, count in associator.rejected.items()
+        ]
         why = '; '.join(filter(None, [contents.harm, *reasons]))
         raise InputError(f'the journal {path} holds no reading{f" to map: {why}" if why else ""}')
     associator.map_frame, associator.base_frame = contents.map_frame, contents.base_frame
@@ -104,7 +108,8 @@ def _warnings(path: Path, contents: Contents, associator: PoseAssociator, parame
     if contents.note:
         warnings.append(f'{path.name}: {contents.note}; a node that starts with this journal goes on in a new file')
     for reason, count in associator.rejected.items():
-        warnings.append(f'{count} of {associator.received} readings are refused: {REASONS[reason]}')
+        of_all = counted(associator.received, 'reading')
+        warnings.append(f'{count} of {of_all} {"is" if count == 1 else "are"} refused: {REASONS[reason]}')
     ours = parameters.flat()
     other = {
         row.name: contents.parameters.get(row.name, row.default)

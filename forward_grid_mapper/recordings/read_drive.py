@@ -8,11 +8,12 @@ from pathlib import Path
 
 from ..bags.decoder import TF_MESSAGE
 from ..bags.poses import BASE_FRAMES
-from ..bags.reader import Bag
+from ..bags.reader import Bag, skipped
 from ..bags.static_transforms import StaticTransforms, SteepSensorError
 from ..core.common.errors import BagError, InputError, ParameterError
 from ..core.common.parameters import Parameters
 from ..core.common.shell import quoted
+from ..core.common.words import counted
 from ..core.messages.batch_association import BatchAssociator
 from ..core.messages.extrinsics import STEEP
 from ..core.messages.message_batch import batch_of
@@ -233,7 +234,7 @@ def _warnings(bag: Bag, associator: PoseAssociator, lookup: Extrinsics) -> list[
     if bag.truncated:
         warnings.append(bag.truncated)
     for topic, count in bag.undecodable.items():
-        warnings.append(f'{count} messages on {topic} do not fit their type and were skipped')
+        warnings.append(skipped(count, topic))
     if associator.unknown_frames:
         lookup.moving = bag.moving_frames()
         warnings.append(lookup.advice(associator.base_frame, sorted(associator.unknown_frames)))
@@ -244,7 +245,7 @@ def _warnings(bag: Bag, associator: PoseAssociator, lookup: Extrinsics) -> list[
         )
     if associator.time_jumps:
         warnings.append(
-            f"odometry's clock jumped back {associator.time_jumps} times; what waited for a pose was dropped"
+            f"odometry's clock jumped back {counted(associator.time_jumps, 'time')}; what waited for a pose was dropped"
         )
     warnings += to_and_fro_note(associator)
     warnings += associator.limits.warnings()

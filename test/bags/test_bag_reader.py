@@ -223,6 +223,25 @@ def test_messages_still_in_the_write_ahead_log(tmp_path: Path) -> None:
         assert opened.topics()['/late'][1] == COUNT
 
 
+def test_a_log_that_cannot_be_read_where_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """SQLite wants to make a file beside it, which a disk that is mounted for reading alone does not let it."""
+    bag = write_sample(tmp_path, 'sqlite3')
+    file = storage_file(bag)
+    file.with_name(f'{file.name}-wal').write_bytes(b'7' * 100)
+    monkeypatch.setattr(os, 'access', lambda path, mode: mode != os.W_OK)
+    with pytest.raises(BagError, match=r'messages in a log beside it, .*-wal, .* copy the bag to one, with all its'):
+        read_all(bag)
+
+
+@pytest.mark.parametrize('kind', KINDS)
+def test_any_bytes_in_the_path(tmp_path: Path, kind: str) -> None:
+    folder = tmp_path / os.fsdecode(b'n\xff?# %')
+    folder.mkdir()
+    path = write_sample(tmp_path, kind)
+    messages, _ = read_all(path.rename(folder / path.name))
+    assert messages == sample_messages()
+
+
 def test_transforms_of_namespaces_and_bad_ones(tmp_path: Path) -> None:
     store = get_typestore(Stores.ROS2_JAZZY)
     types = store.types

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import sqlite3
 from pathlib import Path
 
 import numpy as np
 import pytest
 from bag_samples import EXTRINSICS, START, SUFFIXES, write_sample
+from rosbags import rosbag1, rosbag2
 from rosbags.highlevel import AnyReader
 from rosbags.interfaces import QosDurability, QosReliability
 
@@ -70,6 +72,37 @@ def test_nothing_is_left_after_an_exception(tmp_path: Path, kind: str) -> None:
         writer.write_range('/sonar', RANGE)
         assert not path.exists()
         raise KeyboardInterrupt
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize('kind', KINDS)
+def test_nothing_is_left_where_it_is_interrupted_as_it_begins(
+    tmp_path: Path, kind: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(*unused: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(rosbag1.Writer, 'open', interrupted)
+    monkeypatch.setattr(rosbag2.Writer, 'open', interrupted)
+    with pytest.raises(KeyboardInterrupt), BagWriter(final_path(tmp_path, kind), kind):
+        pass
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize('kind', KINDS)
+@pytest.mark.parametrize('when', ['open', 'write', 'close'])
+def test_a_full_disk_is_told_in_words(tmp_path: Path, kind: str, when: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    problem = sqlite3.OperationalError('database or disk is full') if kind == 'sqlite3' else OSError(28, 'No space')
+
+    def full(*unused: object) -> None:
+        raise problem
+
+    for writer in (rosbag1.Writer, rosbag2.Writer):
+        monkeypatch.setattr(writer, when, full)
+    path = final_path(tmp_path, kind)
+    with pytest.raises(OutputError) as caught, BagWriter(path, kind) as writer:
+        writer.write_range('/sonar', RANGE)
+    assert str(caught.value) == f'{path}: the disk is full; free some space, or choose another folder.'
     assert list(tmp_path.iterdir()) == []
 
 

@@ -41,7 +41,7 @@ def test_several_odometry_topics_must_be_chosen_from(tmp_path: Path) -> None:
     text = str(caught.value)
     assert '--odom-topic' in text
     assert '/odom: 2 messages, odom → base_link' in text
-    assert '/corrected: 1 messages, map → base_link' in text
+    assert '/corrected: 1 message, map → base_link' in text
 
 
 def test_bags_that_lack_something(tmp_path: Path) -> None:

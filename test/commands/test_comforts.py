@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import io
 import json
 import os
 import re
@@ -19,6 +20,7 @@ from drive_samples import code_of, report_in, tape, write_tape
 
 from forward_grid_mapper.__main__ import COMMANDS
 from forward_grid_mapper.commands import completion, demo, desktop, experiment, process_bag
+from forward_grid_mapper.commands.options import print_json
 from forward_grid_mapper.files import drawing
 from forward_grid_mapper.node.main import USAGE
 
@@ -40,6 +42,16 @@ def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def parser_of(command: str) -> argparse.ArgumentParser:
     made: argparse.ArgumentParser = importlib.import_module(f'forward_grid_mapper.{COMMANDS[command][0]}').parser()
     return made
+
+
+@pytest.mark.parametrize('encoding', ['utf-8', 'ascii', 'latin-1'])
+def test_json_is_utf_8_in_every_locale(encoding: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    data = {'bag': 'Büro – 中文 𝄞'}
+    written = io.BytesIO()
+    monkeypatch.setattr(sys, 'stdout', io.TextIOWrapper(written, encoding, errors='backslashreplace'))
+    print_json(data)
+    sys.stdout.flush()
+    assert json.loads(written.getvalue().decode('utf-8')) == data
 
 
 @pytest.mark.parametrize('command', PARSED)

@@ -10,6 +10,7 @@ import pytest
 from drive_samples import Tape, code_of, refusal, report_in, tape, write_tape
 
 from forward_grid_mapper.commands import learn, process_bag
+from forward_grid_mapper.core.common.errors import InputError
 from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.common.readings import Readings
 from forward_grid_mapper.core.messages.message_types import NANOSECONDS
@@ -119,6 +120,17 @@ def test_what_is_wrong_with_a_file_is_said(
     bag = write_tape(tmp_path / 'bag', tape())
     answer = refusal(capsys, tmp_path, bag, '--poses', file, '-o', tmp_path / 'maps')
     assert said in answer and 'poses.txt' in answer
+
+
+def test_a_file_without_permission_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    file = written(tmp_path / 'poses', 'csv')
+
+    def refuse(path: Path, *unused: object, **options: object) -> None:
+        raise PermissionError(13, 'Permission denied', str(path))
+
+    monkeypatch.setattr(Path, 'open', refuse)
+    with pytest.raises(InputError, match=r'poses cannot be read: Permission denied$'):
+        read_given_poses(file)
 
 
 def test_what_is_no_file_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

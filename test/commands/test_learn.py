@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import io
 import json
+import math
 import os
 import re
 from pathlib import Path
@@ -14,6 +16,7 @@ from drive_samples import backwards, code_of, everything_in, mapped, tape, write
 from forward_grid_mapper.commands import learn
 from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.files import drawing
+from forward_grid_mapper.files.learned_text import write_new_file
 from forward_grid_mapper.files.parameter_file import load_parameters
 
 LEARNED = ('p_hit', 'p_rand', 'p_lost', 'sigma')
@@ -109,6 +112,36 @@ def test_values_that_held_out_readings_speak_against_are_not_handed_out(
         assert found['parameters'][name] == start[name] == written[name]
     assert any('the map of the learned values does not predict' in text for text in found['warnings'])
     assert 'Nothing was learned from' in file.read_text().splitlines()[0]
+
+
+def test_what_was_not_judged_is_told(bag: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    told = 'no readings were held out to judge the learned values by'
+    assert told in ' '.join(said(capsys, bag, '--rounds', 1, '--keep-going').split())
+    assert told not in ' '.join(said(capsys, bag, '--rounds', 1).split())
+
+
+def test_sensors_with_long_names_are_read_back(tmp_path: Path, bag: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    frame, file = 'f' * 200, tmp_path / 'learned.yaml'
+    said(capsys, bag, '--rounds', 1, '--sensor', f'{frame}=1,2,90deg', '-o', file)
+    assert load_parameters(file).extrinsics[frame] == pytest.approx((1.0, 2.0, math.pi / 2))
+    assert list(yaml.safe_load(file.read_text())) == ['/**']
+
+
+def test_nothing_is_left_of_a_file_whose_writing_is_interrupted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Interrupted(io.StringIO):
+        def write(self, text: str) -> int:
+            raise KeyboardInterrupt
+
+    def opened(path: Path, *unused: object, **options: object) -> io.StringIO:
+        path.touch()
+        return Interrupted()
+
+    monkeypatch.setattr(Path, 'open', opened)
+    with pytest.raises(KeyboardInterrupt):
+        write_new_file(tmp_path / 'learned.yaml', 'p_hit: 0.5')
+    assert not list(tmp_path.iterdir())
 
 
 def test_files_are_never_overwritten(tmp_path: Path, bag: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -15,7 +15,7 @@ from drive_samples import code_of, mapped, tape, write_tape
 from forward_grid_mapper import __version__
 from forward_grid_mapper.__main__ import COMMANDS
 from forward_grid_mapper.commands import demo, experiment, learn, process_bag, replay_bag, simulate
-from forward_grid_mapper.commands.options import chosen_parameters, chosen_part, chosen_sensors
+from forward_grid_mapper.commands.options import chosen_parameters, chosen_part, chosen_sensors, output_name
 from forward_grid_mapper.core.common.errors import ParameterError
 from forward_grid_mapper.core.common.parameters import TABLE
 from forward_grid_mapper.files import drawing
@@ -50,6 +50,7 @@ def test_the_results_of_a_folder_with_a_dot_have_its_whole_name(tmp_path: Path) 
     (tmp_path / 'one.mcap').touch()
     named = {name: process_bag._stem([str(tmp_path / name)]) for name in ('bag_1.5', 'one.mcap', 'day_*')}
     assert named == {'bag_1.5': 'bag_1.5', 'one.mcap': 'one', 'day_*': 'day_'}
+    assert process_bag._stem([str(tmp_path / 'bag_1.5' / 'metadata.yaml')]) == 'bag_1.5'
 
 
 @pytest.mark.parametrize('parser', PARSERS)
@@ -243,3 +244,16 @@ def test_an_output_without_a_name_is_refused(command: ModuleType, capsys: pytest
     with pytest.raises(SystemExit):
         command.parser().parse_args([*words, '-o', ''])
     assert '-o/--output: the name is empty' in capsys.readouterr().err
+
+
+def test_the_home_of_an_output_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As bash leaves it in `--output=~/maps`: a folder whose name is ~ would be made, which nobody dares to remove."""
+    monkeypatch.setenv('HOME', str(tmp_path))
+    assert output_name('~/maps') == str(tmp_path / 'maps')
+    for name in ('maps', './~/maps', 'maps~', 'maps/'):
+        assert output_name(name) == name
+    with pytest.raises(argparse.ArgumentTypeError, match='no user nobody_at_all'):
+        output_name('~nobody_at_all/maps')
+    for command in (process_bag, learn):
+        options = command.parser().parse_args([str(tmp_path), '--output=~/maps'])
+        assert options.output == str(tmp_path / 'maps')

@@ -12,11 +12,13 @@ import pytest
 import yaml
 from drive_samples import (
     FILES,
+    SECOND,
     Tape,
     arrays_in,
     assert_same_maps,
     backwards,
     code_of,
+    in_turn,
     mapped,
     report_in,
     tape,
@@ -147,6 +149,23 @@ def test_report(plain: Path, capsys: pytest.CaptureFixture[str]) -> None:
     text = (plain / 'maps' / 'report.txt').read_text('utf-8')
     assert str(plain / 'bag') in text and '/odom' in text
     assert text.count('sonar_') == len(FRAMES)
+
+
+def test_a_drive_before_time_zero(tmp_path: Path, plain: Path) -> None:
+    """Stamps are signed, the times of a log are not."""
+    shift = -tape().odometry[0].stamp - 100 * SECOND
+    early = tape()._replace(
+        odometry=[m._replace(stamp=m.stamp + shift) for m in tape().odometry],
+        ranges=[m._replace(stamp=m.stamp + shift) for m in tape().ranges],
+    )
+    logged = [(time + 200 * SECOND, message) for time, message in in_turn(early)]
+    bag = write_tape(tmp_path / 'bag', early, logged=logged)
+    mapped(bag, tmp_path / 'maps', '--bag')
+    assert_same_maps(tmp_path / 'maps', plain / 'maps')
+    with AnyReader([tmp_path / 'maps' / 'maps.mcap_bag']) as reader:
+        for connection, time, raw in reader.messages():
+            header = reader.deserialize(raw, connection.msgtype).header
+            assert (time, header.stamp.sec) == (0, max(m.stamp for m in early.ranges) // SECOND)
 
 
 def test_bag_of_the_maps(tmp_path: Path, plain: Path) -> None:

@@ -100,6 +100,37 @@ def test_wrong_options(
     assert everything_in(tmp_path) == []
 
 
+@pytest.mark.parametrize(
+    ('world', 'option', 'work', 'advice'),
+    [
+        ('door', '--seen', 'door_drive', 'so long a drive; lower --seen'),
+        ('corridor', '--passes', 'corridor_drive', 'so long a drive; lower --passes'),
+        ('campus', '--buildings', 'campus_world', 'lower --buildings or --readings, or make fewer drives at once'),
+    ],
+)
+def test_what_the_memory_does_not_hold(
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    world: str,
+    option: str,
+    work: str,
+    advice: str,
+) -> None:
+    """What is said of maps (a coarser resolution) would be of no use here."""
+
+    def too_large(*unused: object, **options: object) -> None:
+        raise MemoryError
+
+    monkeypatch.setattr(simulate, work, too_large)
+    for number, expected in ((1_000_000, advice), (10**30, f'{option} must be at most')):
+        assert code_of(simulate.main, world, option, number, '-o', tmp_path / 'drive') == 1
+        err = capsys.readouterr().err
+        assert err.startswith('simulate: error: ') and err.count('\n') == 1
+        assert expected in err and 'resolution' not in err
+    assert everything_in(tmp_path) == []
+
+
 def test_an_output_folder_must_be_given(capsys: pytest.CaptureFixture[str]) -> None:
     assert code_of(simulate.main, 'door') == 2
     assert '--output' in capsys.readouterr().err

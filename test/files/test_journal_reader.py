@@ -97,7 +97,7 @@ def test_readings_that_cannot_be_are_left_out_and_named(
     found, contents = numbers(path)
     assert len(found) == 9
     assert set(found) <= set(range(1, 11))
-    assert contents.harm.startswith('1 readings are left out, since their ')
+    assert contents.harm.startswith('1 reading is left out, since its ')
     assert said in contents.harm
 
 

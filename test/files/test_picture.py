@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import sys
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -27,6 +28,15 @@ def test_shapes_of_maps(tmp_path: Path, width: int, height: int, with_reference:
     maps = made_maps(width, height)
     reference = (Grid(0.05, -5, -5, 30, 20), np.ones((20, 30), np.int8)) if with_reference else None
     write_picture(tmp_path / 'maps.png', maps, PATH, 'costs $5 or $6_a^b ' * 20, reference)
+    assert (tmp_path / 'maps.png').read_bytes().startswith(PNG)
+
+
+def test_letters_that_the_font_lacks_are_no_matter(tmp_path: Path) -> None:
+    pytest.importorskip('matplotlib')
+    paths = np.array([[-1.0, 0.0], [1.0, 0.0], [np.nan, np.nan], [-1.0, 1.0], [1.0, 1.0]])
+    with warnings.catch_warnings():
+        warnings.simplefilter('error')
+        write_picture(tmp_path / 'maps.png', made_maps(), paths, '走廊', drives=('星期一', '星期二'))
     assert (tmp_path / 'maps.png').read_bytes().startswith(PNG)
 
 

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from forward_grid_mapper.core.trajectory.windows import Odometry
+from forward_grid_mapper.files.pose_files import poses_from_tum
 from forward_grid_mapper.files.report_text import report_text
 from forward_grid_mapper.files.trajectory_text import calibration_words, tum_text
 
@@ -19,6 +21,13 @@ def test_tum_lines_hold_stamp_position_and_quaternion() -> None:
     assert first.split()[0] == '1700000000.000000005'
     values = [float(word) for word in second.split()]
     assert values == pytest.approx([1700000001.5, 1.5, 0.25, 0, 0, 0, math.sqrt(0.5), math.sqrt(0.5)])
+
+
+@pytest.mark.parametrize('stamp', [-500_000_000, -1_500_000_000, -1, 0, 1, 2_500_000_000])
+def test_stamps_before_zero_are_read_back(tmp_path: Path, stamp: int) -> None:
+    (tmp_path / 'a.tum').write_text(tum_text(Odometry(np.array([stamp]), np.zeros((1, 3)))))
+    stamps, _ = poses_from_tum(tmp_path / 'a.tum')
+    assert stamps.tolist() == [stamp / 1e9]
 
 
 def test_the_calibration_is_told_in_words() -> None:

@@ -290,6 +290,20 @@ def test_a_page_with_few_readings_opens(tmp_path: Path, readings: int) -> None:
     ]
 
 
+@pytest.mark.parametrize(('count', 'said'), [(1, '1 reading ends here'), (2, '2 readings end here')])
+def test_readings_are_counted_in_words(tmp_path: Path, count: int, said: str) -> None:
+    script = """
+        const found = report.evidence.cell(0, 0, true);
+        const one = {t: 0, nats: 1, distance: 1, range: 1, silent: false, kind: 'end here'};
+        report.found = {...found, readings: Array(COUNT).fill(one)};
+        report.listReadings(12);
+        return $('cell').innerText;
+    """
+    text = found_in(written(tmp_path, made_maps(readings=10)), tmp_path, script.replace('COUNT', str(count)))
+    assert f'nats: {said}' in text
+    assert f'nats from {count} {"reading" if count == 1 else "readings"}, ' in text
+
+
 def test_several_drives_stay_apart(tmp_path: Path) -> None:
     xy = np.full((30_001, 2), 0.5)
     xy[10_001] = np.nan

@@ -50,3 +50,8 @@ def test_one_bag_is_no_folder_of_bags(tmp_path: Path) -> None:
     # files of a split bag are not several drives, whatever lies beside them
     folder = made(tmp_path / 'split', 'a_0.mcap', 'a_1.mcap', 'b/metadata.yaml')
     assert names_of(folder) == ['.']
+
+
+def test_digits_that_are_no_numbers(tmp_path: Path) -> None:
+    folder = made(tmp_path, '1²2/metadata.yaml', '10/metadata.yaml', '9/metadata.yaml', 'a1²2.mcap', 'b.mcap')
+    assert names_of(folder) == ['1²2', '9', '10', 'a1²2.mcap', 'b.mcap']

@@ -22,6 +22,8 @@ const signed = (nats, digits = 1) => {
   const text = nats.toFixed(digits), nothing = Number(text) === 0;
   return (nothing || nats > 0 ? '+' : '−') + text.replace('-', '');
 };
+const ONE = {'end here': 'ends here', 'reach farther': 'reaches farther', 'end before it': 'ends before it'};
+const counted = count => `${count} reading${count === 1 ? '' : 's'}`;
 const share = value => value === UNKNOWN ? 'unknown' : `${(value / 100).toFixed(0)} %`;
 
 /** Return the numbers of the page, unpacked. */
@@ -115,7 +117,7 @@ class Page {
 
   summary(found) {
     const {uncertainty_map: uncertainty, live_map: live} = this.page.arrays, [x, y] = this.place(found);
-    const says = this.evidence.count ? `${signed(found.data)} nats from ${found.readings.length} readings, ` : '';
+    const says = this.evidence.count ? `${signed(found.data)} nats from ${counted(found.readings.length)}, ` : '';
     return {
       title: `x = ${x.toFixed(2)} m, y = ${y.toFixed(2)} m (row ${found.row}, column ${found.column}): ${found.state}`,
       odds: `obstacle: ${share(uncertainty[found.cell])} (uncertainty map), ${share(live[found.cell])} (standard map)`,
@@ -156,7 +158,8 @@ class Page {
     const groups = make('ul', {className: 'groups'});
     for (const kind of ['end here', 'reach farther', 'heard no echo', 'end before it']) {
       const mine = readings.filter(r => r.kind === kind), nats = mine.reduce((sum, r) => sum + r.nats, 0);
-      if (mine.length) groups.append(make('li', {textContent: `${signed(nats)} nats: ${mine.length} readings ${kind}`}));
+      const verb = mine.length === 1 ? ONE[kind] || kind : kind;
+      if (mine.length) groups.append(make('li', {textContent: `${signed(nats)} nats: ${counted(mine.length)} ${verb}`}));
     }
     if (found.state === 'occupied' && this.evidence.count) {
       groups.append(make('li', {

@@ -1,0 +1,61 @@
+"""Commands that are started without standard streams, as some daemons start them."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from drive_samples import tape, write_tape
+
+PLACES = """
+import os, sys
+from forward_grid_mapper import __main__
+__main__._open_streams()
+print(*(os.readlink(f'/proc/self/fd/{number}') for number in (0, 1, 2)), file=open(sys.argv[1], 'w'))
+"""
+
+
+def started(closed: str, *words: object) -> subprocess.CompletedProcess[str]:
+    """Run Python by a shell that closes some streams."""
+    command = ' '.join(['exec "$@"', closed])
+    return subprocess.run(
+        ['/bin/sh', '-c', command, 'sh', sys.executable, *map(str, words)],
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+
+
+@pytest.mark.parametrize('closed', ['>&-', '2>&-', '<&- >&- 2>&-'])
+def test_a_command_does_its_work(tmp_path: Path, closed: str) -> None:
+    folder = tmp_path / 'drive'
+    done = started(closed, '-m', 'forward_grid_mapper', 'simulate', 'door', '--seen', 1, '-o', folder)
+    assert (done.returncode, done.stderr) == (0, '')
+    assert (folder / 'bag' / 'metadata.yaml').is_file()
+    assert ('readings' in done.stdout) == ('>&-' not in closed.split())
+
+
+def test_an_error_has_its_exit_code(tmp_path: Path) -> None:
+    done = started('>&-', '-m', 'forward_grid_mapper', 'process_bag', tmp_path / 'absent', '-o', tmp_path / 'maps')
+    assert done.returncode == 1
+    assert done.stderr.startswith('process_bag: error: ') and done.stderr.count('\n') == 1
+    for word in ('--help', '--version', '--list-parameters'):
+        done = started('>&-', '-m', 'forward_grid_mapper', 'process_bag', word)
+        assert (done.returncode, done.stderr) == (0, '')
+
+
+def test_no_file_of_ours_takes_the_place_of_a_stream(tmp_path: Path) -> None:
+    """What a library writes to standard output would be written into it."""
+    report = tmp_path / 'report'
+    started('<&- >&- 2>&-', '-c', PLACES, report)
+    assert report.read_text().split() == ['/dev/null'] * 3
+
+
+def test_json_of_nobody(tmp_path: Path) -> None:
+    bag = write_tape(tmp_path / 'bag', tape())
+    done = started('>&-', '-m', 'forward_grid_mapper', 'process_bag', bag, '-o', tmp_path / 'maps', '--json', '-q')
+    assert done.returncode == 0 and 'Traceback' not in done.stderr
+    assert (tmp_path / 'maps' / 'report.json').is_file()

@@ -1,0 +1,47 @@
+"""One of a thing is told in the singular."""
+
+from __future__ import annotations
+
+import argparse
+
+import pytest
+
+from forward_grid_mapper.bags.reader import skipped
+from forward_grid_mapper.commands import experiment_maps
+from forward_grid_mapper.commands.console import Ticker
+from forward_grid_mapper.core.common.parameters import Parameters
+from forward_grid_mapper.core.common.words import counted
+from forward_grid_mapper.files.picture import figures_text
+from forward_grid_mapper.files.report_text import report_text
+
+
+def test_counts() -> None:
+    assert counted(1, 'reading') == '1 reading'
+    assert counted(0, 'reading') == '0 readings'
+    assert counted(1234, 'reading', ',') == '1,234 readings'
+
+
+def test_messages_that_were_skipped() -> None:
+    assert skipped(1, '/a') == '1 message on /a does not fit its type and was skipped'
+    assert skipped(2, '/a') == '2 messages on /a do not fit their type and were skipped'
+
+
+def test_the_report_and_the_picture() -> None:
+    one = report_text({'result': {'readings': 4, 'unexplained': 1}})
+    assert '1 reading (25.0 %) is most likely a random measurement\n' in one
+    several = report_text({'result': {'readings': 4, 'unexplained': 2}})
+    assert '2 readings (50.0 %) are most likely random measurements\n' in several
+    assert figures_text(1, 0.1, -2.0).startswith('1 reading   ·')
+
+
+@pytest.mark.parametrize('seeds', [1, 2])
+def test_seeds_of_an_experiment(monkeypatch: pytest.MonkeyPatch, seeds: int) -> None:
+    """Settings of the standard map are tried with as many drives as there are, two at the most."""
+    monkeypatch.setattr(experiment_maps, 'GAINS', experiment_maps.GAINS[:1])
+    # a short one will do
+    monkeypatch.setattr(experiment_maps, 'corridor_drive', experiment_maps.passing_drive)
+    for made in (experiment_maps.passer_by, experiment_maps.corridor):
+        options = argparse.Namespace(seeds=seeds)
+        table, _ = made(options, Parameters(), Ticker(True))
+        assert counted(seeds, 'seed') in ' '.join(table.split())
+    assert f'(standard map: {seeds})' in table

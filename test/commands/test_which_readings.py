@@ -1,0 +1,54 @@
+"""Which readings of the drives on a command line are mapped: each once, and those of the part that was asked for."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+from drive_samples import in_turn, tape, write_tape
+
+from forward_grid_mapper.core.common.errors import InputError
+from forward_grid_mapper.core.common.parameters import Parameters
+from forward_grid_mapper.core.common.readings import in_canonical_order
+from forward_grid_mapper.core.messages.message_types import NANOSECONDS
+from forward_grid_mapper.recordings.drive import Part
+from forward_grid_mapper.recordings.drives import Drives, read_drives
+
+
+def read(*paths: Path, **options: Any) -> Drives:
+    return read_drives(paths, Parameters(), {}, **options)
+
+
+def test_of_a_bag_and_one_of_its_files_the_bag_is_read(tmp_path: Path) -> None:
+    """The file may hold a half of the drive."""
+    whole = tape()
+    halves = in_turn(whole)[::2], in_turn(whole)[1::2]
+    bag = write_tape(tmp_path / 'bag', whole, logged=halves[0])
+    other = write_tape(tmp_path / 'other', whole._replace(extrinsics=()), logged=halves[1])
+    next(other.glob('*.mcap')).rename(bag / 'bag_1.mcap')
+    (bag / 'metadata.yaml').write_text('relative_file_paths:\n  - bag.mcap\n  - bag_1.mcap\n')
+    for words in ((bag, bag / 'bag.mcap'), (bag / 'bag.mcap', bag), (bag / 'bag_1.mcap', bag, bag / 'bag.mcap')):
+        drives = read(*words)
+        assert [drive.source['bag'] for drive in drives.drives] == [str(bag)]
+        assert len(drives.drives[0].associator.buffer) == len(whole.ranges)
+        assert sum('it is read once' in warning for warning in drives.source['warnings']) == len(words) - 1
+
+
+def test_a_part_where_the_first_message_has_no_stamp(tmp_path: Path) -> None:
+    drive = tape()
+    unstamped = drive._replace(odometry=[drive.odometry[0]._replace(stamp=0), *drive.odometry[1:]])
+    logged = [(drive.odometry[0].stamp, unstamped.odometry[0]), *in_turn(unstamped)[1:]]
+    path = write_tape(tmp_path / 'bag', unstamped, logged=logged)
+    begin = drive.odometry[1].stamp + 2 * NANOSECONDS
+    found = in_canonical_order(read(path, part=Part(2.0, 3.0)).readings)
+    assert len(found) and begin <= found.stamp[0] and found.stamp[-1] < begin + 3 * NANOSECONDS
+    with pytest.raises(InputError, match=r'its messages span \d\d\.\d s'):
+        read(path, part=Part(900.0))
+
+
+def test_a_part_of_a_drive_without_stamps(tmp_path: Path) -> None:
+    drive = tape().with_ranges(stamp=0).with_odometry(stamp=0)
+    path = write_tape(tmp_path / 'bag', drive, logged=[(k + 1, m) for k, (_, m) in enumerate(in_turn(drive))])
+    with pytest.raises(InputError, match='no reading in the part'):
+        read(path, part=Part(2.0))
