@@ -69,6 +69,9 @@ BESIDE, COUNTS = math.radians(30.0), 0.5
 """Radians beside a cone up to which the normal of a wall may lie, and what such an echo counts, if no sensor looks
 straight to a side. With one that does, votes are sharper without."""
 
+WELL_INSIDE = 3.0
+"""Degrees from the edge of its cone at least at which a sensor holds what lies straight to a side: yaws waver."""
+
 USUAL = 0.05
 """Part of the usual mean of a place's votes that is added for all directions: where hardly any echoes agree, those that
 do say little."""
@@ -135,7 +138,7 @@ def beside(bearing: Floats, half: Floats) -> Floats:
     """
     cones, which = np.unique(np.round(np.degrees(np.column_stack([bearing, half])), 1), axis=0, return_inverse=True)
     middle, wide = cones.T
-    if (np.abs(np.abs(np.remainder(middle + 180.0, 360.0) - 180.0) - 90.0) <= wide).any():
+    if (np.abs(np.abs(np.remainder(middle + 180.0, 360.0) - 180.0) - 90.0) <= wide - WELL_INSIDE).any():
         return np.zeros((len(bearing), 2))
     far = np.arange(math.degrees(BESIDE) + 1.0)
     out = np.empty((len(cones), 2))

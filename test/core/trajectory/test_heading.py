@@ -12,13 +12,16 @@ from forward_grid_mapper.core.trajectory.heading import LEAST_GAIN, NOISES, head
 from forward_grid_mapper.core.trajectory.odometry_model import calibrated, motions, sensitivity, with_yaw
 from forward_grid_mapper.core.trajectory.poses import wrapped
 from forward_grid_mapper.core.trajectory.walls import (
+    BESIDE,
     BIN,
     BINS,
     CHANCE,
+    COUNTS,
     DIRECTIONS,
     FARTHEST,
     POINT,
     THING,
+    beside,
     count_votes,
     wall_votes,
 )
@@ -51,17 +54,22 @@ def test_votes_are_those_of_plain_python() -> None:
     echoes = np.column_stack(
         [rng.normal(0, 1, (60, 2)), rng.uniform(-4, 4, 60), rng.choice([0.13, 0.3], 60), rng.uniform(0.3, 3, 60)]
     )
+    echoes = np.column_stack([echoes, rng.choice([0.0, 0.2, BESIDE], (60, 2))])
     wanted = np.zeros(DIRECTIONS)
     for degree in range(360):
         angle, bins = math.radians(degree), {}
-        for x, y, bearing, half, z in echoes:
-            if abs(wrapped(bearing - angle)) <= half:
-                at = (z + math.cos(angle) * x + math.sin(angle) * y) / BIN + BINS // 2
-                below = math.floor(at)
+        even = 0.0
+        for x, y, bearing, half, z, right, left in echoes:
+            # to the left of the cone it is positive
+            off = wrapped(angle - bearing)
+            edge = min(max(off, -half), half)
+            if -half - right <= off <= half + left:
+                at = (z * math.cos(off - edge) + math.cos(angle) * x + math.sin(angle) * y) / BIN + BINS // 2
+                below, vote = math.floor(at), 1.0 if off == edge else COUNTS
                 row = (math.cos(angle) * y - math.sin(angle) * x, (half * z) ** 2 / 3 + THING)
-                bins.setdefault(below, []).append((1 - (at - below), *row))
-                bins.setdefault(below + 1, []).append((at - below, *row))
-        even = sum(len(rows) for rows in bins.values()) / 2 * BIN / FARTHEST
+                bins.setdefault(below, []).append((vote * (1 - (at - below)), *row))
+                bins.setdefault(below + 1, []).append((vote * (at - below), *row))
+                even += vote * BIN / FARTHEST
         for rows in bins.values():
             weight, along, point = np.array(rows).T
             n = weight.sum()
@@ -82,7 +90,7 @@ def echoes_along_a_way(touched) -> np.ndarray:
     for x in np.arange(-1.5, 1.5, 0.1):
         bearing, z = touched(x)
         sensor = round(bearing / (math.pi / 8)) * math.pi / 8
-        rows.append((x, 0.0, sensor, math.pi / 16, z))
+        rows.append((x, 0.0, sensor, math.pi / 16, z, 0.0, 0.0))
     return np.array(rows)
 
 
@@ -102,13 +110,49 @@ def test_random_ranges_vote_for_nothing_much() -> None:
     rng = np.random.default_rng(0)
     sensors = np.radians([-90, -50, -30, -10, 10, 30, 50, 90])
     x, bearing = (grid.ravel() for grid in np.meshgrid(np.arange(-1.5, 1.5, 0.1), sensors))
-    echoes = np.column_stack([x, 0 * x, bearing, 0 * x + 0.26, rng.uniform(0.3, 3.5, len(x))])
+    echoes = np.column_stack([x, 0 * x, bearing, 0 * x + 0.26, rng.uniform(0.3, 3.5, len(x)), 0 * x, 0 * x])
     wall, votes = np.empty(DIRECTIONS), np.empty(DIRECTIONS)
     count_votes(echoes, np.empty((BINS, 4)), votes)
     echoes[np.abs(bearing) > 1.5, 4] = 1.2
     count_votes(echoes, np.empty((BINS, 4)), wall)
     assert wall.argmax() == 0
     assert votes.max() < 0.1 * wall.max()
+
+
+def in_degrees(bearings, half: float) -> list[list[float]]:
+    return np.degrees(beside(np.radians(bearings), np.full(len(bearings), math.radians(half)))).tolist()
+
+
+def test_cones_reach_as_far_as_no_other_does_if_none_looks_to_a_side() -> None:
+    # of eight at equal angles, none straight ahead, each has a gap of 30 degrees on either side
+    eighths = np.arange(-157.5, 180.0, 45.0)
+    assert in_degrees(eighths, 7.4) == pytest.approx(np.full((8, 2), 30.0))
+    assert in_degrees(eighths, 17.4) == pytest.approx(np.full((8, 2), 10.0))
+    # right of one that looks 20 degrees to the right there is nothing, between the two there are 10 degrees
+    assert (
+        in_degrees([-20.0, 0.0, 0.0], 4.9)
+        == [[pytest.approx(30.0), pytest.approx(10.0)]] + [[pytest.approx(10.0), pytest.approx(30.0)]] * 2
+    )
+
+
+@pytest.mark.parametrize(('bearing', 'to_a_side'), [(97.0, False), (95.0, True), (-95.0, True), (265.0, True)])
+def test_a_cone_that_holds_what_is_straight_to_a_side_is_enough(bearing: float, to_a_side: bool) -> None:
+    assert (in_degrees([bearing, 0.0], 9.0) == [[0.0, 0.0]] * 2) == to_a_side
+
+
+@pytest.mark.parametrize('side', [1.0, -1.0])
+def test_a_wall_beside_which_all_cones_look_is_voted_for(side: float) -> None:
+    # 1.2 m away, and first met by the edge of the cone that looks 67.5 degrees to its side
+    bearings, half = np.radians(np.arange(-157.5, 180.0, 45.0)), math.radians(7.5)
+    slant = math.radians(15.0)
+    x = np.arange(-1.5, 1.5, 0.1)
+    echoes = np.column_stack([x, 0 * x, 0 * x + side * np.radians(67.5), 0 * x + half, 0 * x + 1.2 / math.cos(slant)])
+    past = beside(bearings, np.full(8, half))[[np.abs(bearings - side * np.radians(67.5)).argmin()] * len(x)]
+    votes = np.empty((2, DIRECTIONS))
+    count_votes(np.column_stack([echoes, past]), np.empty((BINS, 4)), votes[0])
+    count_votes(np.column_stack([echoes, 0 * past]), np.empty((BINS, 4)), votes[1])
+    assert votes[0].argmax() == 0
+    assert votes[0, 0] > 3 * votes[1].max()
 
 
 def test_windows_hold_every_reading_once(bent) -> None:
