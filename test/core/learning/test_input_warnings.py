@@ -185,6 +185,10 @@ SCENARIOS: dict[str, tuple[Callable[[], Messages], str]] = {
     ),
     'one echo far away': (far_echo, r'1 of 4808 readings make the map .* range of 80.0 m.*set the parameter max_range'),
     'ranges in centimetres': (lambda: scaled(100, 1), r'are the ranges in centimetres and the limits in metres'),
+    'ranges in centimetres, of near walls': (
+        lambda: scaled(52, 1),
+        r'times as large, and so count as no echo: are the ranges in centimetres',
+    ),
     'ranges in millimetres': (lambda: scaled(1000, 1), r'are the ranges in millimetres and the limits in metres'),
     'ranges in feet': (lambda: scaled(3.281, 1), r'are the ranges in feet and the limits in metres'),
     'ranges in inches': (lambda: scaled(39.37, 1), r'are the ranges in inches and the limits in metres'),
