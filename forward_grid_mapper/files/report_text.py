@@ -10,6 +10,8 @@ from typing import Any
 _LABEL = 14
 _WIDTH = 100
 _SHOWN = 6
+# the part of random readings beyond what recordings with good poses have
+_MANY = 0.2
 
 
 def report_text(data: dict[str, Any]) -> str:
@@ -195,7 +197,10 @@ def _result(data: dict[str, Any]) -> Iterator[str]:
         yield from _line('Objective', f'{objective:,.1f} nats{before}')
     if (unexplained := result.get('unexplained')) is not None:
         share = _share(unexplained, readings)
-        yield from _line('Random', f'{unexplained:,} readings ({share}) are most likely random measurements')
+        sought = any(source.get('trajectory') for source in (data.get('input') or {}, *(data.get('drives') or [])))
+        many = bool(readings) and unexplained > _MANY * readings and not sought
+        hint = ': many, as where odometry drifts (refine_poses)' if many else ''
+        yield from _line('Random', f'{unexplained:,} readings ({share}) are most likely random measurements{hint}')
     work = [f'{statistics[key]:,} {key}' for key in ('pairs', 'iterations', 'flips', 'shifts') if statistics.get(key)]
     if (converged := statistics.get('converged')) is not None:
         work.append('converged' if converged else 'NOT converged: max_iterations was reached')

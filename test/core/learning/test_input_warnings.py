@@ -241,6 +241,19 @@ def test_no_alarm_on_the_recordings(shared: Path, name: str, odometry: str) -> N
     assert input_warnings(found.associator.readings) == []
 
 
+def test_the_reach_of_a_sensor_is_not_judged_from_one_place() -> None:
+    """Six of eight sensors see walls at 1 m, two look along a corridor."""
+    rng = np.random.default_rng(0)
+    frames, pose = list(drive().extrinsics), drive().odometry[0].pose
+    odometry = [OdometryMessage(k * 100_000_000, 'odom', 'base_link', pose) for k in range(301)]
+    ranges = [
+        RangeMessage(k * 100_000_000, frame, math.inf if n < 2 else 1.0 + rng.normal(0, 0.02), 0.1, 5.0, 0.26)
+        for k in range(300)
+        for n, frame in enumerate(frames)
+    ]
+    assert told(Messages(drive().extrinsics, odometry, ranges)) == []
+
+
 def test_a_robot_that_stands_while_people_walk_is_no_fault() -> None:
     """Two of eight sensors see somebody come near; the others see the same as before."""
     rng = np.random.default_rng(0)
