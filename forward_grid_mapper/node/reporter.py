@@ -143,6 +143,9 @@ class Reporter:
         # a reset forgets which are unknown, too
         for frame in sorted((self._lost - unknown).intersection(self._associator.buffer.counts())):
             self._node.get_logger().info(f'sensor {frame} has a pose on the robot now')
+        unheard = self._extrinsics.known.keys() - self._associator.buffer.counts().keys()
+        # said once, however many frames are new
+        named = f'; poses are given for {diagnostics.listed(unheard)}: is one of them meant?' if unheard else ''
         for frame in sorted(unknown - self._reported)[: diagnostics.SHOWN]:
             if len(self._reported) >= MOST_FRAMES:
                 break
@@ -160,8 +163,9 @@ class Reporter:
             )
             self._node.get_logger().warning(
                 f'no pose on the robot for sensor {frame}: set sensors.{frame}.pose: [x, y, yaw], or {way}; {why}; '
-                'its readings are rejected'
+                f'its readings are rejected{named}'
             )
+            named = ''
         self._lost = unknown & self._reported
         if not self._far and (far := far_mounts(self._extrinsics.fixed)):
             self._far = True

@@ -12,6 +12,7 @@ pytest.importorskip('rclpy', reason='the tests of the node need rclpy')
 from stand_ins import Taking
 
 from forward_grid_mapper.core.common.grid import Grid
+from forward_grid_mapper.core.messages.message_types import Pose2
 from forward_grid_mapper.node import diagnostics
 from forward_grid_mapper.node.diagnostics import Health
 from forward_grid_mapper.node.frames import Extrinsics, Transforms
@@ -252,3 +253,19 @@ def test_without_a_base_frame_no_transform_is_asked_for() -> None:
         reporter._name_frames()
         (text,) = robot.node.warned
         assert 'set sensors.sonar.pose: [x, y, yaw], or ' in text and advice in text
+        assert text.endswith('its readings are rejected')
+
+
+def test_poses_of_frames_that_nobody_sends_are_named_beside_one_without_a_pose() -> None:
+    robot = Taking()
+    robot.intake.begin()
+    drive(robot, 0, 3, 0)
+    reporter = reporter_of(robot)
+    reporter._reported, reporter._lost, reporter._far = set(), set(), False
+    poses = {name: Pose2(0.1, 0.0, 0.0) for name in ('sonar', 'us_left', 'us_right')}
+    reporter._extrinsics = Extrinsics(poses, Transforms())
+    robot.associator.unknown_frames.update(('left', 'right'))
+    reporter._name_frames()
+    text, other = robot.node.warned
+    assert other.endswith('its readings are rejected')
+    assert text.endswith('; poses are given for us_left, us_right: is one of them meant?')
