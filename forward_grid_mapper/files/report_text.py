@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import textwrap
 from collections.abc import Iterator
 from datetime import datetime, timezone
@@ -198,7 +199,7 @@ def _result(data: dict[str, Any]) -> Iterator[str]:
     if (unexplained := result.get('unexplained')) is not None:
         share = _share(unexplained, readings)
         sought = any(source.get('trajectory') for source in (data.get('input') or {}, *(data.get('drives') or [])))
-        many = bool(readings) and unexplained > _MANY * readings and not sought
+        many = unexplained > _MANY * (readings or math.inf) and not sought
         hint = ': many, as where odometry drifts (refine_poses)' if many else ''
         yield from _line('Random', f'{unexplained:,} readings ({share}) are most likely random measurements{hint}')
     work = [f'{statistics[key]:,} {key}' for key in ('pairs', 'iterations', 'flips', 'shifts') if statistics.get(key)]

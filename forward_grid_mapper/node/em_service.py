@@ -17,7 +17,6 @@ from ..core.maps.map_set import MapSet
 from ..core.messages.message_types import Pose2
 from ..core.messages.pose_association import PoseAssociator
 from ..core.messages.reading_buffer import bounded
-from ..core.messages.rep117 import ODOMETRY_REASONS, REASONS
 from ..core.trajectory.recovering import recovered
 from ..core.trajectory.windows import Odometry
 from ..files.quality_warning import quality_warning
@@ -26,6 +25,7 @@ from .deferred import Reply
 from .em import EmWorker, Outcome, Run, summary
 from .kernels import Kernels
 from .map_publishers import MapPublishers
+from .nothing_to_map import nothing_to_map
 from .online import OnlineWorker
 from .refining import Drive, Found, RefiningMapper
 from .sensor_status import SensorWatch
@@ -267,7 +267,7 @@ class EmService:
             elif outcome.maps is None and run.asked:
                 outcome.message = 'EM was cancelled by cancel_em'
             elif outcome.maps is None and not len(taken[0][1]):
-                outcome.message = self._nothing()
+                outcome.message = nothing_to_map(self._associator, self.range_topics, self.odom_topic)
             elif outcome.maps is None and run.then:
                 outcome.message = 'the run that was begun after some way gave way to run_em'
             self._finish(outcome, taken[0][0])
@@ -314,30 +314,6 @@ class EmService:
         if generation == self._publishers.generation:
             self._trajectory.adopt(mapper.found if isinstance(mapper, RefiningMapper) else None, count)
             self._show(maps, generation)
-
-    def _nothing(self) -> str:
-        """Return why there is no reading to map."""
-        received, rejected = self._associator.received, self._associator.rejected
-        if not received:
-            topics = ', '.join(self.range_topics)
-            return f'there is nothing to map: no Range message has come on {topics} since the start or reset'
-        if not rejected:
-            return f'there is nothing to map: {received} readings have come, and wait for their poses'
-        reason, count = max(rejected.items(), key=lambda row: row[1])
-        why = self._no_odometry() if reason == 'no_odometry' else ''
-        return 'there is nothing to map: ' + (
-            why or f'{count} of {received} readings were rejected as {reason}: {REASONS[reason]}'
-        )
-
-    def _no_odometry(self) -> str:
-        """Return why there is no pose at all; empty if some odometry was taken."""
-        came, rejected = self._associator.odometry_received, self._associator.odometry_rejected
-        if not came:
-            return f'no Odometry message has come on {self.odom_topic} since the start or reset'
-        if came > sum(rejected.values()):
-            return ''
-        reason = max(rejected, key=lambda key: rejected[key])
-        return f'all {came} odometry messages were rejected as {reason}: {ODOMETRY_REASONS[reason]}'
 
     def _needed(self) -> tuple[str, ...]:
         """Return the steps of compilation that a run waits for."""
