@@ -57,12 +57,12 @@ def reading_warnings(readings: Readings, source: Mapping[str, Any], parameters: 
 
 
 def _of_one(readings: Readings, extrinsics: Mapping[str, Pose2], parameters: Parameters) -> Iterator[str]:
-    yield from _deaf(readings)
+    yield from deaf(readings)
     yield from input_warnings(readings)
     yield from consistency_warnings(readings, extrinsics, parameters)
 
 
-def _deaf(readings: Readings) -> Iterator[str]:
+def deaf(readings: Readings) -> Iterator[str]:
     """Yield a warning where no sensor hears anything; where only one does not, its health tells."""
     if len(readings) >= ENOUGH and not readings.echo.any():
         yield (

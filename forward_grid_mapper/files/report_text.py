@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import textwrap
 from collections.abc import Iterator
 from datetime import datetime, timezone
@@ -12,6 +13,8 @@ from ..core.common.words import counted
 _LABEL = 14
 _WIDTH = 100
 _SHOWN = 6
+# the part of random readings beyond what recordings with good poses have
+_MANY = 0.2
 
 
 def report_text(data: dict[str, Any]) -> str:
@@ -198,7 +201,10 @@ def _result(data: dict[str, Any]) -> Iterator[str]:
     if (unexplained := result.get('unexplained')) is not None:
         share = _share(unexplained, readings)
         are = 'is most likely a random measurement' if unexplained == 1 else 'are most likely random measurements'
-        yield from _line('Random', f'{counted(unexplained, "reading", ",")} ({share}) {are}')
+        sought = any(source.get('trajectory') for source in (data.get('input') or {}, *(data.get('drives') or [])))
+        many = unexplained > _MANY * (readings or math.inf) and not sought
+        hint = ': many, as where odometry drifts (refine_poses)' if many else ''
+        yield from _line('Random', f'{counted(unexplained, "reading", ",")} ({share}) {are}{hint}')
     work = [f'{statistics[key]:,} {key}' for key in ('pairs', 'iterations', 'flips', 'shifts') if statistics.get(key)]
     if (converged := statistics.get('converged')) is not None:
         work.append('converged' if converged else 'NOT converged: max_iterations was reached')

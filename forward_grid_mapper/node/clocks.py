@@ -1,4 +1,4 @@
-"""What stamps say of clocks: odometry's that jump, and those of sensors that are behind odometry's."""
+"""What stamps say of clocks: odometry's that jump, and those of sensors that are apart from odometry's."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ AGAIN = 3
 """Jumps within `LASTING` from which on they are a fault, and not a bag that begins anew."""
 
 WINDOW = 5 * NANOSECONDS
-"""Nanoseconds of odometry's stamps for which a sensor is behind before it is told of."""
+"""Nanoseconds of odometry's stamps for which a sensor is behind or ahead before it is told of."""
 
 FEWEST = 5
 """Readings that this takes at least."""
 
-BEHIND = NANOSECONDS
-"""Nanoseconds by which even the least late of them is behind."""
+APART = NANOSECONDS
+"""Nanoseconds by which even the least late of them is behind, or the latest ahead."""
 
 
 class OdometryClock:
@@ -75,17 +75,21 @@ class OdometryClock:
 
 @dataclass(slots=True)
 class _Window:
-    """The readings of a sensor since odometry's stamp `begin`, and the least lag of those before; nanoseconds."""
+    """The readings of a sensor since odometry's stamp `begin`, and by how much those before were all behind.
+
+    Nanoseconds; a negative lag is of a sensor that is ahead.
+    """
 
     begin: int
     last: int
     least: int
+    most: int
     count: int = 1
     lag: int = 0
 
 
 class SensorClocks:
-    """Finds sensors whose stamps stay behind odometry's; a queue that is worked off is not behind for so long."""
+    """Finds sensors whose stamps stay apart from odometry's; a queue that is worked off is not behind for so long."""
 
     def __init__(self, warn: Callable[[str], object]) -> None:
         self._warn = warn
@@ -105,26 +109,30 @@ class SensorClocks:
         if window is None or odometry < window.begin:
             proper = 0 < len(frame) <= LONGEST_NAME and frame.isprintable()
             if window is not None or (len(self._windows) < MOST_FRAMES and proper):
-                self._windows[frame] = _Window(odometry, odometry, lag)
+                self._windows[frame] = _Window(odometry, odometry, lag, lag)
             return
-        window.last, window.least, window.count = odometry, min(lag, window.least), window.count + 1
+        window.last, window.count = odometry, window.count + 1
+        window.least, window.most = min(lag, window.least), max(lag, window.most)
         if odometry - window.begin >= WINDOW and window.count >= FEWEST:
-            self._windows[frame] = _Window(odometry, odometry, lag, lag=window.least)
+            # the lag that all of them have at least
+            common = max(window.least, 0) + min(window.most, 0)
+            self._windows[frame] = _Window(odometry, odometry, lag, lag, lag=common)
 
     def faults(self, odometry: int | None) -> list[str]:
         """Return what to warn of, in words; the log is told once of each sensor."""
         found = {
             frame: window.lag
             for frame, window in self._windows.items()
-            if window.lag > BEHIND and odometry is not None and odometry - window.last < 2 * WINDOW
+            if abs(window.lag) > APART and odometry is not None and odometry - window.last < 2 * WINDOW
         }
         if not found:
             return []
-        most = max(found, key=lambda frame: found[frame])
+        most = max(found, key=lambda frame: abs(found[frame]))
+        side = 'behind' if found[most] > 0 else 'ahead of'
         others = f' (and {len(found) - 1} sensors more)' if len(found) > 1 else ''
         text = (
-            f'the stamps of {most}{others} are {found[most] / NANOSECONDS:.1f} s behind those of odometry: where a '
-            'clock is wrong, its readings are placed wrongly; synchronise the clocks (NTP, PTP)'
+            f'the stamps of {most}{others} are {abs(found[most]) / NANOSECONDS:.1f} s {side} those of odometry: where '
+            'a clock is wrong, its readings are placed wrongly; synchronise the clocks (NTP, PTP)'
         )
         if found.keys() - self._told:
             self._told |= found.keys()

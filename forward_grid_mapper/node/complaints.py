@@ -5,8 +5,11 @@ from __future__ import annotations
 import difflib
 import re
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 
+from ..core.common.errors import MapperError
 from ..core.common.parameters import TABLE
+from ..files.parameter_file import load_parameters
 
 OPTIONS = ('--ros-args', '--help')
 ROS_OPTIONS = (
@@ -18,6 +21,7 @@ TOPICS = ('sonar', 'odom')
 HIGHEST_DOMAIN = 232
 """DDS has ports for no more."""
 
+_LIST = re.compile(r':=\s*\[.*\.')
 _SOURCE = re.compile(r', at /\S+:\d+')
 _INIT = re.compile(r'^failed to initialize rcl: ')
 _RULE = re.compile(r"Couldn't parse remap rule: '(?:-r|--remap) (?P<rule>.*?)'\.")
@@ -65,6 +69,19 @@ def of_domain(environment: Mapping[str, str]) -> str:
     return f'ROS_DOMAIN_ID is {text}, not a whole number from 0 to {HIGHEST_DOMAIN}'
 
 
+def _of_file(path: str, why: str) -> str:
+    """Return what is wrong with a parameter file: in our words where our own reader refuses it as well."""
+    if Path(path).is_file():
+        try:
+            load_parameters(path)
+        except MapperError as error:
+            return f'--params-file {error}'
+    remedy = '; write each number of a list with a point' if 'same type' in why else ''
+    if 'before ros__parameters' in why:
+        remedy = '; parameters of a node stand below /**: and ros__parameters:, as in config/mapper.yaml'
+    return f'--params-file {path}: {why}{remedy}'
+
+
 def of_ros(error: BaseException) -> str:
     """Return what rclpy says of a failure, without the lines of its sources, and with a remedy where there is one."""
     lines = _SOURCE.sub('', str(error)).splitlines()
@@ -76,9 +93,12 @@ def of_ros(error: BaseException) -> str:
             'digit'
         )
     if found := _PARAMETER.search(text):
-        return f'-p {found["rule"]} is not a valid parameter: it takes -p NAME:=VALUE, such as -p resolution:=0.05'
+        rule = f'-p {found["rule"]} is not a valid parameter'
+        if _LIST.search(found['rule']):
+            return f'{rule}: write each number of a list with a point; ROS refuses lists of both kinds'
+        return f'{rule}: it takes -p NAME:=VALUE, such as -p resolution:=0.05'
     if found := _FILE.search(text):
-        return f'--params-file {found["file"]}: {found["why"]}'
+        return _of_file(found['file'], found['why'])
     if 'PARAMETER_NOT_SET' in text:
         return 'a parameter has no value, or an empty list (range_topics:=[]): leave it out, or give it one'
     return text or repr(error)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import Counter, deque
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
@@ -33,6 +33,9 @@ NEARLY = 0.9
 SHOWN = 20
 """Names of frames that a message lists."""
 
+NO_POSE = 'no pose on the robot for '
+"""How a verdict begins that names frames without a pose."""
+
 
 class Health:
     """Watches what arrives and turns it into diagnostics."""
@@ -58,9 +61,14 @@ class Health:
         grid: Grid,
         extra: dict[str, Any],
         map_frame: str = '',
+        absent: Callable[[str], str] = lambda kind: '',
     ) -> list[DiagnosticStatus]:
-        """Return the statuses of input and of EM; `map_frame` says what is wrong with its transform."""
-        level, message = self._judge(associator, intake, map_frame)
+        """Return the statuses of input and of EM.
+
+        `map_frame` says what is wrong with its transform, and `absent` why no message of a kind comes, 'Range' or
+        'Odometry'.
+        """
+        level, message = self._judge(associator, intake, map_frame, absent)
         bound = associator.parameters.max_readings
         held = min(associator.buffer.held, bound or associator.buffer.held)
         values = {
@@ -87,7 +95,9 @@ class Health:
             status(f'{name}: EM', DiagnosticStatus.OK, em['state'], name, em),
         ]
 
-    def _judge(self, associator: PoseAssociator, intake: Intake, map_frame: str) -> tuple[bytes, str]:
+    def _judge(
+        self, associator: PoseAssociator, intake: Intake, map_frame: str, absent: Callable[[str], str]
+    ) -> tuple[bytes, str]:
         received = intake.received
         # looked at each time: a reset begins to count anew
         new, by_reason, time_span = self._recent.look(received, associator.rejected)
@@ -109,17 +119,22 @@ class Health:
             return DiagnosticStatus.WARN, f'odometry is rejected as {reason}: {ODOMETRY_REASONS[reason]}'
         if map_frame:
             return DiagnosticStatus.WARN, map_frame
+        missing = []
         if silent_odometry > SILENCE:
-            return DiagnosticStatus.WARN, f'no odometry for {silent_odometry:.0f} s{_and_no_pose(associator)}'
-        if stuck > SILENCE and (intake.waiting or new_rejected):
+            missing.append(f'no odometry for {silent_odometry:.0f} s{absent("Odometry")}')
+        elif stuck > SILENCE and new:
             return DiagnosticStatus.WARN, (
-                f'odometry comes, but its stamp has been {stamp / NANOSECONDS:.3f} s for {stuck:.0f} s, so that no '
-                'reading gets a pose; have its driver fill in header.stamp'
+                f'odometry comes, but its stamp has been {stamp / NANOSECONDS:.3f} s for {stuck:.0f} s, so that '
+                'readings get no pose, or all the same; have its driver fill in header.stamp'
             )
         if silent_ranges > max(SILENCE, intake.heard.patience):
-            return DiagnosticStatus.WARN, f'no Range for {silent_ranges:.0f} s{_and_no_pose(associator)}'
-        if associator.unknown_frames and nowhere < RECENT:
-            return DiagnosticStatus.WARN, f'no pose on the robot for {listed(associator.unknown_frames)}'
+            missing.append(f'no Range for {silent_ranges:.0f} s{absent("Range")}')
+        without_pose = f'{NO_POSE}{listed(associator.unknown_frames)}' if associator.unknown_frames else ''
+        if missing:
+            # stays wrong when messages end
+            return DiagnosticStatus.WARN, '; '.join([*missing, *filter(None, [without_pose])])
+        if without_pose and nowhere < RECENT:
+            return DiagnosticStatus.WARN, without_pose
         if new and new_rejected > 0.2 * new:
             # some of them may have waited since before
             new = max(new, new_rejected)
@@ -131,8 +146,9 @@ class Health:
             return DiagnosticStatus.WARN, (
                 f'no reading has been accepted so far: {wrong.total()} were rejected{_main_reason(wrong)}'
             )
-        if received and not len(associator.buffer):
-            return DiagnosticStatus.OK, 'no reading has been accepted so far: they wait for their poses'
+        if not len(associator.buffer):
+            what = 'they wait for their poses' if received else 'none has come'
+            return DiagnosticStatus.OK, f'no reading has been accepted so far: {what}'
         bound = associator.parameters.max_readings
         if bound and NEARLY * bound < len(associator.buffer) <= bound:
             return DiagnosticStatus.WARN, (
@@ -188,11 +204,6 @@ def _main_reason(counts: Counter[str]) -> str:
     """Say what most readings were rejected for."""
     reason = max(counts, key=lambda key: counts[key], default='')
     return f', most of them as {reason}: {REASONS[reason]}' if reason else ''
-
-
-def _and_no_pose(associator: PoseAssociator) -> str:
-    """Say which sensors have no pose, which stays wrong when messages end."""
-    return f'; no pose on the robot for {listed(associator.unknown_frames)}' if associator.unknown_frames else ''
 
 
 def listed(frames: Collection[str]) -> str:

@@ -22,7 +22,7 @@ from ..core.maps.map_set import MapSet
 from ..core.runtime.memory import shortage
 from ..core.runtime.threads import cores
 from ..core.search.search import Progress
-from ..files.quality_warning import quality_warning
+from ..files.quality_warning import deaf, quality_warning
 from .background import Worker, reason
 from .refining import RefiningMapper
 
@@ -151,7 +151,7 @@ class EmWorker:
         """Add what the maps say of sensors and readings; the maps are good without it."""
         try:
             outcome.health = sensor_health(maps)
-            outcome.warnings = input_warnings(maps.readings)
+            outcome.warnings = [*deaf(maps.readings), *input_warnings(maps.readings)]
         except Exception as error:
             outcome.warnings = [f'sensors could not be judged: {error!r}']
 
@@ -199,9 +199,9 @@ def summary(maps: MapSet, seconds: float) -> str:
     """Return a run's result in one line."""
     s = maps.statistics
     return (
-        f'{len(maps.readings)} readings, {s["iterations"]} iterations, log-likelihood {maps.log_likelihood:.1f}, '
-        f'objective {maps.objective:.1f}, {s["flips"]} flips, {s["shifts"]} shifts, {s["occupied"]} occupied cells, '
-        f'{seconds:.2f} seconds'
-        + ('' if s['converged'] else ', NOT converged: raise max_iterations')
-        + (f'; BUT {warning}' if (warning := quality_warning(maps)) else '')
+        f'{len(maps.readings)} readings, {s["occupied"]} occupied cells, {seconds:.2f} seconds '
+        f'({s["iterations"]} iterations, {s["flips"]} flips, {s["shifts"]} shifts, '
+        f'log-likelihood {maps.log_likelihood:.1f}, objective {maps.objective:.1f})'
+        + ('' if s['converged'] else '; NOT converged: raise max_iterations')
+        + (f'; WARNING: {warning}' if (warning := quality_warning(maps)) else '')
     )

@@ -17,7 +17,6 @@ from ..core.maps.map_set import MapSet
 from ..core.messages.message_types import Pose2
 from ..core.messages.pose_association import PoseAssociator
 from ..core.messages.reading_buffer import bounded
-from ..core.messages.rep117 import REASONS
 from ..core.trajectory.recovering import recovered
 from ..core.trajectory.windows import Odometry
 from ..files.quality_warning import quality_warning
@@ -26,6 +25,7 @@ from .deferred import Reply
 from .em import EmWorker, Outcome, Run, summary
 from .kernels import Kernels
 from .map_publishers import MapPublishers
+from .nothing_to_map import nothing_to_map
 from .online import OnlineWorker
 from .refining import Drive, Found, RefiningMapper
 from .sensor_status import SensorWatch
@@ -83,7 +83,7 @@ class EmService:
     online : OnlineWorker or None
         Gives the map to start from, and takes what was found.
     range_topics : sequence of str
-        Full names, for what is said where nothing has come.
+        Full names, for what is said where nothing has come, as `odom_topic`.
     extrinsics : callable
         Returns the poses of the sensors that are fixed to the robot, by frame.
     mounts : callable
@@ -108,6 +108,7 @@ class EmService:
         self.sensors = SensorWatch()
         self.online: OnlineWorker | None = None
         self.range_topics: Sequence[str] = ()
+        self.odom_topic = ''
         self.extrinsics: Callable[[], Mapping[str, Pose2]] = dict
         self.mounts: Callable[[], Mapping[str, Pose2]] = dict
         self._parameters, self._associator, self._publishers = parameters, associator, publishers
@@ -134,8 +135,11 @@ class EmService:
                 waited = min(outcome.waited, spent)
                 compiled = f'after {waited:.0f} s in which kernels were compiled, as at the first start'
                 said = [summary(outcome.maps, spent - waited), compiled if waited >= LONG_WAIT else '']
-                reply.send(True, '; '.join(filter(None, [*said, outcome.trajectory])))
+                warned = [f'WARNING: {warning}' for warning in outcome.warnings]
+                reply.send(True, '; '.join(filter(None, [*said, outcome.trajectory, *warned])))
 
+        if not all(map(self._kernels.has, self._needed())):
+            self._logger.info('run_em waits for kernels that are being compiled, as at the first start')
         run = self.current
         if run is None:
             self._start(done)
@@ -263,7 +267,7 @@ class EmService:
             elif outcome.maps is None and run.asked:
                 outcome.message = 'EM was cancelled by cancel_em'
             elif outcome.maps is None and not len(taken[0][1]):
-                outcome.message = self._nothing()
+                outcome.message = nothing_to_map(self._associator, self.range_topics, self.odom_topic)
             elif outcome.maps is None and run.then:
                 outcome.message = 'the run that was begun after some way gave way to run_em'
             self._finish(outcome, taken[0][0])
@@ -311,17 +315,6 @@ class EmService:
             self._trajectory.adopt(mapper.found if isinstance(mapper, RefiningMapper) else None, count)
             self._show(maps, generation)
 
-    def _nothing(self) -> str:
-        """Return why there is no reading to map."""
-        received, rejected = self._associator.received, self._associator.rejected
-        if not received:
-            topics = ', '.join(self.range_topics)
-            return f'there is nothing to map: no Range message has come on {topics} since the start or reset'
-        if not rejected:
-            return f'there is nothing to map: {received} readings have come, and wait for their poses'
-        reason, count = max(rejected.items(), key=lambda row: row[1])
-        return f'there is nothing to map: {count} of {received} readings were rejected as {reason}: {REASONS[reason]}'
-
     def _needed(self) -> tuple[str, ...]:
         """Return the steps of compilation that a run waits for."""
         return ('EM', 'trajectory') if self._parameters().node.refine_poses else ('EM',)
@@ -334,7 +327,7 @@ class EmService:
         maps = outcome.maps
         if maps is None:
             self.last_run = outcome.message
-            self._logger.warning(f'EM: {outcome.message}')
+            self._logger.warning(outcome.message if outcome.message.startswith('EM ') else f'EM: {outcome.message}')
             if self.online:
                 # what it showed while EM ran was not published
                 self.online.show()

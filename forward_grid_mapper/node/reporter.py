@@ -21,6 +21,7 @@ from .kernels import Kernels
 from .live import LiveMap
 from .surroundings import Surroundings
 from .trajectory import Trajectory
+from .verdict_log import VerdictLog
 
 
 class Reporter:
@@ -48,6 +49,7 @@ class Reporter:
         self._surroundings = Surroundings(
             node, intake.subscriptions, transforms.topics, lambda: bool(associator.unknown_frames)
         )
+        self._verdicts = VerdictLog(node.get_logger())
         self._reported: set[str] = set()
         self._lost: set[str] = set()
         self._quiet: set[str] = set()
@@ -58,6 +60,7 @@ class Reporter:
         """Publish the diagnostics of now."""
         self._name_frames()
         name = self._node.get_fully_qualified_name().lstrip('/')
+        topics = {'Range': self._em.range_topics, 'Odometry': [self._em.odom_topic]}
         extra: dict[str, Any] = {'map frame': self._trajectory.frame}
         if self._map_frame.dropped:
             extra['odometry without a transform to map_frame'] = self._map_frame.dropped
@@ -69,10 +72,16 @@ class Reporter:
             self._em.last_run,
             self._live.grid,
             extra,
-            self._map_frame_fault(),
+            no_map_frame := self._map_frame_fault(),
+            lambda kind: self._surroundings.absent(kind, topics[kind]),
         )
         faults = [*self._intake.faults(), *self._surroundings.faults(), *self._nameless()]
-        diagnostics.add_faults(statuses[0], [*faults, *self._associator.limits.warnings(), *self._em.wrong_input])
+        limits = self._associator.limits.warnings()
+        # what is wrong with frames is told of where each is found out
+        silent = statuses[0].message == no_map_frame or statuses[0].message.startswith(diagnostics.NO_POSE)
+        bad = statuses[0].level != DiagnosticStatus.OK
+        self._verdicts.look([*([statuses[0].message] if bad and not silent else []), *limits], not (bad or limits))
+        diagnostics.add_faults(statuses[0], [*faults, *limits, *self._em.wrong_input])
         statuses += [*self._journal.statuses(name), *self._trajectory.statuses(name)]
         counts = self._associator.buffer.counts()
         statuses.append(self._em.sensors.status(name, counts, self._silent(counts)))
@@ -134,6 +143,9 @@ class Reporter:
         # a reset forgets which are unknown, too
         for frame in sorted((self._lost - unknown).intersection(self._associator.buffer.counts())):
             self._node.get_logger().info(f'sensor {frame} has a pose on the robot now')
+        unheard = self._extrinsics.known.keys() - self._associator.buffer.counts().keys()
+        # said once, however many frames are new
+        named = f'; poses are given for {diagnostics.listed(unheard)}: is one of them meant?' if unheard else ''
         for frame in sorted(unknown - self._reported)[: diagnostics.SHOWN]:
             if len(self._reported) >= MOST_FRAMES:
                 break
@@ -151,8 +163,9 @@ class Reporter:
             )
             self._node.get_logger().warning(
                 f'no pose on the robot for sensor {frame}: set sensors.{frame}.pose: [x, y, yaw], or {way}; {why}; '
-                'its readings are rejected'
+                f'its readings are rejected{named}'
             )
+            named = ''
         self._lost = unknown & self._reported
         if not self._far and (far := far_mounts(self._extrinsics.fixed)):
             self._far = True

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import math
+import re
 from collections.abc import Callable
 from typing import Any
 
@@ -152,5 +153,7 @@ def _strangers(given: dict[str, RosParameter]) -> list[str]:
             continue
         near = difflib.get_close_matches(name, NAMES, n=1)
         hint = f'; did you mean {near[0]}?' if near else ''
+        if re.match(r'sensors?\.', name):
+            hint = '; poses of sensors are given as sensors.<frame_id>.pose: [x, y, yaw]'
         warnings.append(f'parameter {name} is not known to this node and is ignored{hint}')
     return warnings

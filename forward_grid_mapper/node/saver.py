@@ -22,6 +22,9 @@ from .em_service import EmService
 from .live import LiveMap
 from .refining import Found
 
+USES = {'ml_map.yaml': ' for Nav2', 'report.html': ' for a browser', 'report.txt': ''}
+"""Files that a caller is told of by name, and what for."""
+
 
 class Account(NamedTuple):
     """What a report says of the node and its readings, as they were when the maps were asked for.
@@ -95,4 +98,12 @@ class Saver:
         report = write_results(folder, maps, account.source, path_xy, account.title, **options)
         for warning in report['warnings']:
             self._logger.warning(f'save_maps: {warning}')
-        return ', '.join(str(folder / name) for name in sorted(path.name for path in folder.iterdir()))
+        names = {path.name for path in folder.iterdir()}
+        shown = [f'{folder / name}{use}' for name, use in USES.items() if name in names]
+        said = [', '.join([*shown, f'and {len(names) - len(shown)} files more'])]
+        # a robot that drives measures on while it is told of its map
+        if newer > 0:
+            said.append(f'{newer} readings came after EM')
+        if count := len(report['warnings']) - (newer > 0):
+            said.append(f'WARNINGS ({count}): see report.txt')
+        return '; '.join(said)

@@ -3,13 +3,19 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from rclpy.qos import DurabilityPolicy, QoSCompatibility, QoSProfile, ReliabilityPolicy, qos_check_compatible
 
+from .diagnostics import listed
+
 PERIOD = 3.0
 """Seconds between two looks."""
+
+KINDS = {'Range': 'sensor_msgs/msg/Range', 'Odometry': 'nav_msgs/msg/Odometry'}
+PARAMETER = {'Range': 'range_topics, or remap sonar', 'Odometry': 'odom_topic, or remap odom'}
+"""What names the topics of a kind."""
 
 
 class Surroundings:
@@ -52,6 +58,25 @@ class Surroundings:
                     self._reported.add(fault)
                     self._node.get_logger().warning(fault)
         return self._faults
+
+    def absent(self, kind: str, topics: Sequence[str]) -> str:
+        """Say why no 'Range' or no 'Odometry' comes on topics, to be put behind what is missing; empty if unknown."""
+        of_kind, said = KINDS[kind], []
+        for topic in topics:
+            types = {publisher.topic_type for publisher in self._node.get_publishers_info_by_topic(topic)}
+            if not types:
+                said.append(f'nobody publishes {topic}')
+            elif of_kind not in types:
+                said.append(f'{topic} carries {", ".join(sorted(types))}, not {of_kind}')
+        if not said:
+            return ''
+        elsewhere = sorted(
+            topic
+            for topic, types in self._node.get_topic_names_and_types()
+            if of_kind in types and topic not in topics and self._node.count_publishers(topic)
+        )
+        remedy = f'; {kind} comes on {listed(elsewhere)}: set {PARAMETER[kind]}' if elsewhere else ''
+        return f': {", ".join(said)}{remedy}'
 
     def _deaf(self) -> list[str]:
         faults = []

@@ -29,6 +29,9 @@ from .journal_drive import read_journal
 
 __all__ = ['Drive', 'Extrinsics', 'read_drive']
 
+NOWHERE = {'unknown_extrinsics', 'after_odometry'}
+"""Why readings are rejected where only the poses of the sensors are missing: nearly every bag ends with a range."""
+
 MOST_OPTIONS = 24
 """Sensors whose options a message spells out, to be copied."""
 
@@ -282,7 +285,7 @@ def _nothing_associated(
             )
         kind = 'Range' if not ranges else 'Odometry'
         return BagError(f'the chosen topics hold no readable {kind} message{f" ({lost})" if lost else ""}')
-    if set(associator.rejected) == {'unknown_extrinsics'}:
+    if associator.unknown_frames and set(associator.rejected) <= NOWHERE:
         return InputError(lookup.advice(associator.base_frame, sorted(associator.unknown_frames)))
     if set(associator.rejected) != {'zero_stamp'} and (ranges[1] < odometry[0] or ranges[0] > odometry[1]):
         a, b, c, d = (stamp / NANOSECONDS for stamp in (*ranges, *odometry))

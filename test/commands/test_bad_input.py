@@ -184,6 +184,13 @@ def test_no_frame_has_a_pose(tmp_path: Path, capsys: pytest.CaptureFixture[str])
     assert 'no /tf_static' in said and f'--sensor {FRAMES[0]}=x,y,yaw' in said and f'sensors.{FRAMES[0]}.pose' in said
 
 
+def test_a_bag_that_ends_with_a_range_is_told_the_same(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    newest = max(message.stamp for message in tape().ranges)
+    odometry = [message for message in tape().odometry if message.stamp < newest - 10**8]
+    said = refused_drive(capsys, tmp_path, tape()._replace(extrinsics=(), odometry=odometry))
+    assert said.startswith('no pose on the robot (frame ') and f'--sensor {FRAMES[0]}=x,y,yaw' in said
+
+
 def test_no_frame_has_a_pose_and_some_readings_are_rejected_for_another_reason(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -350,7 +357,7 @@ def test_the_order_of_logging_does_not_matter(tmp_path: Path, late: type[Message
 def test_a_field_of_view_that_cannot_be(tmp_path: Path, capsys: pytest.CaptureFixture[str], angle: float) -> None:
     drive = tape().with_ranges(field_of_view=angle)
     said = refused_drive(capsys, tmp_path, drive)
-    assert f'{COUNT} bad_field_of_view' in said and 'parameter field_of_view overrides it' in said
+    assert f'{COUNT} bad_field_of_view' in said and 'set the parameter field_of_view to the full angle' in said
     right = tape().ranges[0].field_of_view
     report = mapped(tmp_path / 'bag', tmp_path / 'maps', '--set', f'field_of_view={right!r}')
     assert report['counts']['accepted'] == COUNT

@@ -106,6 +106,14 @@ def test_a_broken_sensor_is_warned_of_and_in_the_table() -> None:
     assert row.split()[1] == '100' and '100.0 %' in row and row.endswith('mostly random')
 
 
+def test_many_random_readings_point_to_drift_unless_a_trajectory_was_looked_for() -> None:
+    maps = made_maps(readings=200)
+    hint = 'many, as where odometry drifts (refine_poses)'
+    for part, source, told in ((50, {}, True), (20, {}, False), (50, {'trajectory': {'refined': False}}, False)):
+        some = dataclasses.replace(maps, unexplained=np.arange(200) < part)
+        assert (hint in ' '.join(report_text(report_data(some, source)).split())) == told
+
+
 def test_an_empty_source_is_enough() -> None:
     text = report_text(report_data(made_maps(), {}))
     assert '60 received, 60 accepted (100.0 %)' in text

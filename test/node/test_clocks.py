@@ -95,6 +95,19 @@ def test_a_sensor_whose_clock_stays_behind_is_told_of(clock: Any) -> None:
     assert faults(robot) == []
 
 
+def test_a_sensor_whose_clock_is_ahead_is_told_of_and_odometry_that_is_rare_is_none(clock: Any) -> None:
+    robot = taking()
+    drive(robot, 6, -2.0, 'sonar')
+    (fault,) = faults(robot)
+    assert fault.startswith('the stamps of sonar are 2.0 s ahead of those of odometry: where a clock is wrong')
+    rare = taking()
+    for k in range(200):
+        if k % 20 == 0:
+            rare.odometry(1000.0 + 0.1 * k)
+        rare.range(1000.0 + 0.1 * k)
+    assert faults(rare) == []
+
+
 def test_a_queue_that_is_worked_off_is_not_behind(clock: Any) -> None:
     """Odometry that is taken before the ranges that came with it."""
     robot = taking()

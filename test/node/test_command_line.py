@@ -101,6 +101,10 @@ def test_options_that_ros_does_not_know(text: str, expected: str) -> None:
             '-p foo is not a valid parameter: it takes -p NAME:=VALUE',
         ),
         (
+            "Couldn't parse parameter override rule: '-p sensors.a.pose:=[0,0.2,1]'. Error: x, at /a/b.c:1",
+            '-p sensors.a.pose:=[0,0.2,1] is not a valid parameter: write each number of a list with a point',
+        ),
+        (
             "failed to initialize rcl: Couldn't parse params file: '--params-file x'. Error: cannot open, at /a/b.c:1",
             '--params-file x: cannot open',
         ),
@@ -110,6 +114,29 @@ def test_options_that_ros_does_not_know(text: str, expected: str) -> None:
 )
 def test_what_rclpy_says_is_told_without_its_sources(text: str, expected: str) -> None:
     assert complaints.of_ros(RuntimeError(text)).startswith(expected)
+
+
+@pytest.mark.parametrize(
+    ('text', 'why', 'expected'),
+    [
+        ('mapper:\n  ros_parameters:\n    a: 1', 'Cannot have a value before', ': ros_parameters: did you mean ros__'),
+        ('p_hit: 0.6', 'Cannot have a value before ros__parameters at line 1', 'stand below /**: and ros__parameters:'),
+        (
+            '/**:\n  ros__parameters:\n    sensors.a.pose: [0.1, 0, 0]',
+            "Sequence should be of same type. Value type 'integer' do not belong at line_num 3",
+            'write each number of a list with a point',
+        ),
+    ],
+)
+def test_what_is_wrong_with_a_parameter_file_is_told_with_a_remedy(
+    tmp_path: Path, text: str, why: str, expected: str
+) -> None:
+    file = tmp_path / 'my.yaml'
+    file.write_text(text)
+    said = complaints.of_ros(
+        RuntimeError(f"Couldn't parse params file: '--params-file {file}'. Error: {why}, at /a.c:1")
+    )
+    assert said.startswith(f'--params-file {file}: ') and expected in said
 
 
 def test_save_directory_of_a_user_who_is_not_there(domain: int, tmp_path: Path) -> None:

@@ -51,7 +51,11 @@ def test_maps_are_published_and_kept_and_the_caller_is_told(robot: EmRobot) -> N
     answer = robot.run_em()
     robot.settle()
     ((success, message),) = answer.sent
-    assert success and message.startswith('5 readings in ') and message.endswith(' s; trajectory refined')
+    assert (
+        success
+        and message.startswith('5 readings in ')
+        and message.endswith(' s; trajectory refined; WARNING: ranges are copies')
+    )
     (ml, uncertainty) = robot.published
     assert ml[:3] == ('ml_map', 3, GRID) and ml[3][0, 0] == 5
     assert uncertainty[:3] == ('uncertainty_map', 3, GRID) and uncertainty[3].dtype == np.float32
@@ -204,7 +208,7 @@ def test_cancelling_is_answered_when_the_run_has_ended(held: EmRobot) -> None:
     assert answer.sent == [(False, 'EM was cancelled by cancel_em')]
     ((success, message),) = cancelled.sent
     assert success and message.startswith('EM was cancelled by cancel_em (after ')
-    assert held.em.maps is None and 'EM: EM was cancelled by cancel_em' in held.node.warned
+    assert held.em.maps is None and 'EM was cancelled by cancel_em' in held.node.warned
     assert held.published == [], 'nothing was shown meanwhile'
 
 
@@ -435,3 +439,33 @@ def test_why_there_is_nothing_to_map(
     robot.settle()
     ((success, message),) = answer.sent
     assert not success and message.startswith('there is nothing to map: ') and said in message
+
+
+def test_without_any_odometry_that_is_what_there_is_to_be_told(make: Callable[..., EmRobot]) -> None:
+    for came, refused, said in (
+        (0, {}, 'no Odometry message has come on /wheels since the start or reset'),
+        (8, {'long_frame_id': 3, 'bad_pose': 5}, 'all 8 odometry messages were rejected as bad_pose: the pose is not'),
+        (9, {'bad_pose': 5}, '6 of 9 readings were rejected as no_odometry: odometry, or its transform'),
+    ):
+        robot = make(count=0)
+        robot.em.odom_topic = '/wheels'
+        robot.error = InputError('there is no reading to map')
+        robot.associator.received, robot.associator.odometry_received = 9, came
+        robot.associator.rejected.update(no_odometry=6)
+        robot.associator.odometry_rejected.update(refused)
+        answer = robot.run_em()
+        robot.settle()
+        ((success, message),) = answer.sent
+        assert not success and message.startswith(f'there is nothing to map: {said}')
+
+
+def test_a_call_that_waits_for_kernels_is_logged_as_such(robot: EmRobot) -> None:
+    said = 'run_em waits for kernels that are being compiled, as at the first start'
+    robot.compiled.clear()
+    robot.run_em()
+    assert robot.node.warned == [said]
+    robot.compiled.add('EM')
+    robot.settle()
+    robot.run_em()
+    robot.settle()
+    assert robot.node.warned.count(said) == 1

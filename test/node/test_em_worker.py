@@ -248,14 +248,14 @@ def test_a_run_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
     said: list[str] = []
     monkeypatch.setattr(em, 'quality_warning', lambda maps: ''.join(said))
     line = (
-        '5 readings, 7 iterations, log-likelihood -1.2, objective -2.5, 8 flips, 9 shifts, 10 occupied cells, '
-        '3.21 seconds'
+        '5 readings, 10 occupied cells, 3.21 seconds '
+        '(7 iterations, 8 flips, 9 shifts, log-likelihood -1.2, objective -2.5)'
     )
     assert em.summary(maps, 3.21) == line
     statistics['converged'] = False
-    assert em.summary(maps, 3.21) == f'{line}, NOT converged: raise max_iterations'
+    assert em.summary(maps, 3.21) == f'{line}; NOT converged: raise max_iterations'
     said.append('it does not fit')
-    assert em.summary(maps, 3.21) == f'{line}, NOT converged: raise max_iterations; BUT it does not fit'
+    assert em.summary(maps, 3.21) == f'{line}; NOT converged: raise max_iterations; WARNING: it does not fit'
 
 
 @pytest.mark.parametrize(('threads', 'expected'), [(0, 6), (2, 2)])

@@ -79,11 +79,11 @@ def test_a_drive_becomes_three_maps_that_late_subscribers_get(
     assert set(np.unique(values(robot.maps['ml_map'][-1]))) == {-1, 0, 100}
     first, second = (robot.call('save_maps') for _ in range(2))
     assert first.success and second.success, first.message
-    paths = [Path(path) for path in first.message.split(', ')]
-    assert {path.name for path in paths} >= {'live_map.pgm', 'ml_map.yaml', 'maps.npz', 'report.json', 'report.txt'}
-    assert all(path.exists() for path in paths)
-    assert set(first.message.split(', ')).isdisjoint(second.message.split(', '))
-    folder = next(path for path in paths if path.name == 'ml_map.yaml').parent
+    folder, other = (Path(answer.message.split(' for Nav2, ')[0]).parent for answer in (first, second))
+    names = {path.name for path in folder.iterdir()}
+    assert names >= {'live_map.pgm', 'ml_map.yaml', 'maps.npz', 'report.json', 'report.txt', 'report.html'}
+    assert f', and {len(names) - 3} files more' in first.message
+    assert folder != other and {path.name for path in other.iterdir()} == names
     # what is published is what is saved
     for name in MAPS:
         message = robot.maps[name][-1]
@@ -99,7 +99,7 @@ def compare(robot: Robot, bag: Path, out: Path, *options: str) -> None:
     assert robot.call('run_em').success
     saved = robot.call('save_maps')
     assert saved.success, saved.message
-    folder = Path(next(path for path in saved.message.split(', ') if path.endswith('maps.npz'))).parent
+    folder = Path(saved.message.split(' for Nav2, ')[0]).parent
     assert process_bag([str(bag), '-o', str(out), '-q', *options]) == 0
     ours, theirs = read_npz(folder / 'maps.npz'), read_npz(out / 'maps.npz')
     counts = [json.loads((f / 'report.json').read_text())['counts'] for f in (folder, out)]

@@ -12,6 +12,7 @@ pytest.importorskip('rclpy', reason='the tests of the node need rclpy')
 from stand_ins import Taking
 
 from forward_grid_mapper.core.common.grid import Grid
+from forward_grid_mapper.core.messages.message_types import Pose2
 from forward_grid_mapper.node import diagnostics
 from forward_grid_mapper.node.diagnostics import Health
 from forward_grid_mapper.node.frames import Extrinsics, Transforms
@@ -181,6 +182,42 @@ def test_what_was_rejected_during_a_pause_is_no_fault_after_it(clock: Any) -> No
     assert seconds(robot, clock, health, 3, 1, 'sonar') == [(OK, 'mapping')] * 3
 
 
+def test_both_that_are_missing_are_told_and_where_they_come_from(clock: Any) -> None:
+    robot, health = Taking(), Health()
+    robot.intake.subscribe()
+    robot.intake.begin()
+
+    def verdict() -> tuple[bytes, str]:
+        made = health.statuses(
+            'mapper',
+            robot.intake,
+            robot.associator,
+            None,
+            'none yet',
+            Grid(0.1, 0, 0, 1, 1),
+            {},
+            absent=lambda kind: f': nobody publishes {kind}',
+        )[0]
+        return made.level, made.message
+
+    assert verdict() == (OK, 'no reading has been accepted so far: none has come')
+    clock.now += 4.0
+    said = 'no odometry for 4 s: nobody publishes Odometry; no Range for 4 s: nobody publishes Range'
+    assert verdict() == (WARN, said)
+
+
+def test_stamps_that_are_all_0_are_told_of_though_readings_are_accepted(clock: Any) -> None:
+    robot, health = Taking(), Health()
+    robot.intake.begin()
+    for _ in range(6):
+        clock.now += 1.0
+        robot.odometry(0.0)
+        robot.range(0.0)
+        level, text = judged(robot, health)
+    assert len(robot.associator.buffer) and level == WARN
+    assert 'its stamp has been 0.000 s for 6 s' in text and 'header.stamp' in text
+
+
 def reporter_of(robot: Taking) -> Any:
     made = Reporter.__new__(Reporter)
     made._node, made._associator, made._no_name = robot.node, robot.associator, False
@@ -216,3 +253,19 @@ def test_without_a_base_frame_no_transform_is_asked_for() -> None:
         reporter._name_frames()
         (text,) = robot.node.warned
         assert 'set sensors.sonar.pose: [x, y, yaw], or ' in text and advice in text
+        assert text.endswith('its readings are rejected')
+
+
+def test_poses_of_frames_that_nobody_sends_are_named_beside_one_without_a_pose() -> None:
+    robot = Taking()
+    robot.intake.begin()
+    drive(robot, 0, 3, 0)
+    reporter = reporter_of(robot)
+    reporter._reported, reporter._lost, reporter._far = set(), set(), False
+    poses = {name: Pose2(0.1, 0.0, 0.0) for name in ('sonar', 'us_left', 'us_right')}
+    reporter._extrinsics = Extrinsics(poses, Transforms())
+    robot.associator.unknown_frames.update(('left', 'right'))
+    reporter._name_frames()
+    text, other = robot.node.warned
+    assert other.endswith('its readings are rejected')
+    assert text.endswith('; poses are given for us_left, us_right: is one of them meant?')

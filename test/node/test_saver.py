@@ -79,7 +79,7 @@ class Node:
 
     def write(self, folder: Path, *arguments: Any, **options: Any) -> dict[str, Any]:
         folder.mkdir(parents=True)
-        for name in ('maps.npz', 'report.txt', 'b.pgm'):
+        for name in ('maps.npz', 'report.txt', 'b.pgm', 'report.html', 'ml_map.yaml'):
             (folder / name).touch()
         self.written.append((folder, *arguments, options))
         return {'warnings': arguments[1]['warnings']}
@@ -97,10 +97,13 @@ def node(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Node:
     return Node(tmp_path / 'saved', monkeypatch)
 
 
-def test_the_files_are_named_in_the_answer_in_order(node: Node) -> None:
+def test_the_answer_names_the_files_to_go_on_with(node: Node) -> None:
     success, message = node.save().answer()
     ((folder, maps, source, path_xy, title, options),) = node.written
-    assert success and message == ', '.join(str(folder / name) for name in ('b.pgm', 'maps.npz', 'report.txt'))
+    assert success and message == (
+        f'{folder}/ml_map.yaml for Nav2, {folder}/report.html for a browser, {folder}/report.txt, and 2 files more; '
+        'WARNINGS (1): see report.txt'
+    )
     assert folder.parent == node.folder.resolve() and folder.name.startswith('maps_2')
     assert maps.live == (GRID, LIVE)
     assert source['warnings'] == ['from the node'] and 'trajectory' not in source
@@ -124,11 +127,13 @@ def test_a_robot_without_a_path_has_one_of_no_points(node: Node) -> None:
 @pytest.mark.parametrize(('newer', 'told'), [(0, False), (1, True), (7, True)])
 def test_readings_that_came_after_em_are_told_of(node: Node, newer: int, told: bool) -> None:
     node.accepted += newer
-    node.save().answer()
+    node.source['warnings'].clear()
+    message = node.save().answer()[1]
     warnings = node.written[0][2]['warnings']
-    assert len(warnings) == 1 + told
+    assert len(warnings) == told and 'WARNINGS' not in message
+    assert message.endswith(f'; {newer} readings came after EM') == told
     if told:
-        assert warnings[1].startswith(f'{newer} readings came after EM: only the live map has them')
+        assert warnings[0].startswith(f'{newer} readings came after EM: only the live map has them')
 
 
 def test_readings_that_were_thinned_are_told_of(node: Node) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -11,6 +12,8 @@ pytest.importorskip('rclpy', reason='the tests of the node need rclpy')
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from robot import Robot
 from sensor_msgs.msg import Range
+
+from forward_grid_mapper.node.surroundings import Surroundings
 
 
 @pytest.mark.slow
@@ -32,3 +35,33 @@ def test_a_publisher_that_does_not_fit_and_a_namesake(start: Any, robot: Robot) 
     node.wait_for('2 nodes are called /forward_grid_mapper', 20.0)
     other.wait_for('2 nodes are called /forward_grid_mapper', 20.0)
     assert 'start each with a name of its own, --ros-args -r __node:=NAME' in other.output
+
+
+@pytest.mark.parametrize(
+    ('published', 'said'),
+    [
+        ({}, ': nobody publishes /sonar'),
+        ({'/sonar': 'sensor_msgs/msg/Range'}, ''),
+        (
+            {'/us': 'sensor_msgs/msg/Range', '/odom': 'nav_msgs/msg/Odometry', '/a': 'sensor_msgs/msg/Range'},
+            ': nobody publishes /sonar; Range comes on /a, /us: set range_topics, or remap sonar',
+        ),
+        (
+            {'/sonar': 'sensor_msgs/msg/LaserScan'},
+            ': /sonar carries sensor_msgs/msg/LaserScan, not sensor_msgs/msg/Range',
+        ),
+    ],
+)
+def test_why_nothing_comes(published: dict[str, str], said: str) -> None:
+    node = SimpleNamespace(
+        get_publishers_info_by_topic=lambda topic: [
+            SimpleNamespace(topic_type=kind) for name, kind in published.items() if name == topic
+        ],
+        # a topic that is only listened to is there, too
+        get_topic_names_and_types=lambda: [
+            *((name, [kind]) for name, kind in published.items()),
+            ('/wanted', ['sensor_msgs/msg/Range']),
+        ],
+        count_publishers=published.__contains__,
+    )
+    assert Surroundings(node, {}).absent('Range', ['/sonar']) == said

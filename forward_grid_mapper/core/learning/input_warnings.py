@@ -49,6 +49,9 @@ STILL = 0.01, 0.01
 STANDS = 8.0
 """Seconds of standing from which on the ranges are looked at."""
 
+JUDGED = 1.0
+"""Metres over which sensors have looked before their reach is judged: from one place all walls may be near or far."""
+
 BLOCK = 3.0
 """Seconds of the parts of such a time whose median ranges are looked at."""
 
@@ -320,6 +323,8 @@ def _reach(readings: Readings) -> str:
         np.isclose(2 * readings.z, readings.z_max) & np.isclose(12 * readings.sigma, readings.z_max)
     )
     heard: Floats = readings.z[echo]
+    if max(np.ptp(readings.x), np.ptp(readings.y)) < JUDGED:
+        return ''
     if len(heard) < ECHOES or np.count_nonzero(~echo) < SILENT * len(readings):
         return ''
     # a few wild echoes reach anywhere

@@ -6,8 +6,6 @@ rejected: neither is an error, and both give a wrong map. So the values are look
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
 from ..common.readings import Floats
@@ -39,7 +37,7 @@ STATED = 1e6
 """A max_range from which on none is stated: drivers send the largest number they know."""
 
 UNITS = {'feet': 3.281, 'inches': 39.37, 'centimetres': 100.0, 'millimetres': 1000.0}
-"""How many of them a metre has."""
+"""How many of them a metre has, in order."""
 
 
 class LimitWatch:
@@ -103,9 +101,9 @@ def _beyond(ranges: Floats, _: Floats, limits: Floats) -> str:
     count = int(counts.sum())
     if count < MANY * len(ranges) or counts.max() > SENTINEL * count:
         return ''
-    # the farthest echoes come near max_range, whatever their unit
+    # no echo comes from beyond max_range, whatever its unit
     ratio = _at(0.98, (ranges / limits)[beyond])
-    unit = min(UNITS, key=lambda name: abs(math.log(UNITS[name] / ratio)))
+    unit = next((name for name, count in UNITS.items() if ratio < BEYOND * count), 'millimetres')
     return (
         f'{count} of {len(ranges)} ranges looked at are larger than max_range ({_middle(limits):g} m), up to '
         f'{ratio:.0f} times as large, and so count as no echo: are the ranges in {unit} and the limits in metres? '

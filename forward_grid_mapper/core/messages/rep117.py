@@ -26,20 +26,22 @@ REASONS = {
     'below_min_range': f'the range is below min_range; {_SILENT_DRIVER}',
     'over_range': 'no echo, and over_range is "discard"',
     'bad_limits': 'min_range or max_range is negative or not finite, or max_range is not above min_range, or below a '
-    'millimetre; the parameter max_range overrides it',
-    'bad_field_of_view': 'the field of view is not between 0 and pi radians (15 degrees are 0.26); the parameter '
-    'field_of_view overrides it',
-    'empty_frame_id': 'the header has no frame_id, so the sensor is unknown',
+    'millimetre; correct the driver, or set the parameter max_range to what the sensor reaches, in metres',
+    'bad_field_of_view': 'the field of view is not between 0 and pi radians; correct the driver, or set the parameter '
+    'field_of_view to the full angle, such as 0.26 for 15 degrees',
+    'empty_frame_id': 'the header has no frame_id; have the driver give each sensor one of its own, such as sonar_left',
     'long_frame_id': 'the frame_id has more than 255 characters',
     'unprintable_frame_id': 'the frame_id has characters that cannot be printed',
     'unknown_extrinsics': 'nothing says where this frame is on the robot: give sensors.<frame_id>.pose in a parameter '
     'file, or its transform',
     'late_transform': 'TF knows this frame, but no transform for the stamp arrived within pose_timeout',
     'steep_sensor': 'the sensor looks up or down, by more than 60° or straight so with a part of its cone',
-    'before_odometry': 'the stamp is before the first odometry, or the message came minutes late',
+    'before_odometry': 'the stamp is before the first odometry, or minutes before the newest; if that goes on, the '
+    'clocks of the drivers differ',
     'zero_stamp': 'header.stamp is 0: have the driver fill it in',
     'after_odometry': 'the recording ended before odometry reached the stamp',
-    'no_odometry': 'odometry, or its transform to map_frame, did not reach the stamp within pose_timeout',
+    'no_odometry': 'odometry, or its transform to map_frame, did not reach the stamp within pose_timeout: has it '
+    'stopped, or do the clocks of the drivers differ?',
     'pose_gap': 'odometry has a gap longer than max_pose_gap here',
     'pose_jump': 'odometry jumps here, faster than anything drives (are its poses in millimetres? They are in metres)',
     'from_the_future': 'odometry went on for pose_timeout and is still before the stamp; is the clock of the sensor '

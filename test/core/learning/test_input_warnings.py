@@ -185,6 +185,10 @@ SCENARIOS: dict[str, tuple[Callable[[], Messages], str]] = {
     ),
     'one echo far away': (far_echo, r'1 of 4808 readings make the map .* range of 80.0 m.*set the parameter max_range'),
     'ranges in centimetres': (lambda: scaled(100, 1), r'are the ranges in centimetres and the limits in metres'),
+    'ranges in centimetres, of near walls': (
+        lambda: scaled(52, 1),
+        r'times as large, and so count as no echo: are the ranges in centimetres',
+    ),
     'ranges in millimetres': (lambda: scaled(1000, 1), r'are the ranges in millimetres and the limits in metres'),
     'ranges in feet': (lambda: scaled(3.281, 1), r'are the ranges in feet and the limits in metres'),
     'ranges in inches': (lambda: scaled(39.37, 1), r'are the ranges in inches and the limits in metres'),
@@ -235,6 +239,19 @@ def test_no_alarm_on_the_recordings(shared: Path, name: str, odometry: str) -> N
     found = read_drive(bag, Parameters(), {}, None, odometry)
     assert found.associator.limits.warnings() == []
     assert input_warnings(found.associator.readings) == []
+
+
+def test_the_reach_of_a_sensor_is_not_judged_from_one_place() -> None:
+    """Six of eight sensors see walls at 1 m, two look along a corridor."""
+    rng = np.random.default_rng(0)
+    frames, pose = list(drive().extrinsics), drive().odometry[0].pose
+    odometry = [OdometryMessage(k * 100_000_000, 'odom', 'base_link', pose) for k in range(301)]
+    ranges = [
+        RangeMessage(k * 100_000_000, frame, math.inf if n < 2 else 1.0 + rng.normal(0, 0.02), 0.1, 5.0, 0.26)
+        for k in range(300)
+        for n, frame in enumerate(frames)
+    ]
+    assert told(Messages(drive().extrinsics, odometry, ranges)) == []
 
 
 def test_a_robot_that_stands_while_people_walk_is_no_fault() -> None:

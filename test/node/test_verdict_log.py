@@ -1,0 +1,64 @@
+"""What the log is told of the input: once what has lasted, and once that it has ended."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+pytest.importorskip('rclpy', reason='the tests of the node need rclpy')
+
+from stand_ins import PlainNode
+
+from forward_grid_mapper.node import verdict_log
+from forward_grid_mapper.node.verdict_log import AGAIN, MOST, VerdictLog
+
+WELL = 'readings are mapped, and nothing is wrong with them any more'
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> Any:
+    made = SimpleNamespace(now=50.0)
+    monkeypatch.setattr(verdict_log.time, 'monotonic', lambda: made.now)
+    return made
+
+
+def test_a_fault_that_lasts_is_told_once_whatever_its_numbers(clock: Any) -> None:
+    node = PlainNode()
+    log = VerdictLog(node)
+    for k in range(3, 200):
+        log.look([f'no Range for {k} s'], False)
+        clock.now += 1.0
+    assert node.warned == ['no Range for 4 s']
+    log.look([], True)
+    log.look([], True)
+    assert node.warned == ['no Range for 4 s', WELL]
+
+
+def test_a_passing_fault_is_not_told(clock: Any) -> None:
+    node = PlainNode()
+    log = VerdictLog(node)
+    for _ in range(5):
+        log.look(['1 of 2 readings were rejected'], False)
+        log.look([], True)
+    assert node.warned == []
+
+
+def test_a_fault_that_comes_and_goes_is_told_once_a_minute(clock: Any) -> None:
+    node = PlainNode()
+    log = VerdictLog(node)
+    for _ in range(int(2 * AGAIN) // 3):
+        for faults in (['gap'], ['gap'], []):
+            log.look(faults, not faults)
+            clock.now += 1.0
+    assert node.warned == ['gap', WELL] * 2
+
+
+def test_faults_of_ever_new_names_take_no_memory(clock: Any) -> None:
+    log = VerdictLog(PlainNode())
+    for k in range(5 * MOST):
+        name = 'x' * k
+        log.look([name], False)
+        log.look([name], False)
+    assert len(log._told) <= MOST
