@@ -17,9 +17,9 @@ things that stand about, v = (φ z)² / 3 + `THING`, and pairs count
 
 where λ echoes are in each bin if ranges are random: sensors do not vote for their own axes, whatever they hear.
 
-The sonars of many robots look past the walls of a corridor on both sides, as eight at equal angles do of which none looks
-straight ahead. A rough wall is heard all the same, where the edge of the cone meets it first: with s the angle from the
-edge to n, an echo then has
+The sonars of many robots look past the walls of a corridor on both sides: three that look ahead do, or eight at equal
+angles if none looks straight ahead. A rough wall is heard all the same, where the edge of the cone meets it first: with
+s the angle from the edge to n, an echo then has
 
     n · p + z cos s = d
 """
@@ -84,8 +84,8 @@ def count_votes(echoes: Any, counts: Any, votes: Any) -> None:
     Parameters
     ----------
     echoes : float64, shape (N, 7)
-        x, y, bearing, half angle and range of each echo, and how far the normal may lie beside the cone to the right and
-        to the left of it, metres and radians.
+        x, y, bearing, half angle and range of each echo, and how far beside its cone the normal may lie, to the right
+        and to the left; metres and radians.
     counts : float64, shape (BINS, 4)
         Workspace: of each bin the echoes, Σ and Σ of squares of where they lie along the wall, Σ of v.
     votes : float64, shape (DIRECTIONS,)
@@ -127,7 +127,7 @@ def count_votes(echoes: Any, counts: Any, votes: Any) -> None:
 
 
 def beside(bearing: Floats, half: Floats) -> Floats:
-    """Return how far beside each cone the normal of a wall may lie, to the right and to the left, radians, shape (N, 2).
+    """Return how far beside cones the normal of a wall may lie, to the right and to the left, shape (N, 2), radians.
 
     It is as far as no cone reaches, and at most `BESIDE`; nothing if a sensor looks straight to a side of the robot.
 
