@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from .pose_graph import Walls
 from .poses import Floats, compose, wrapped
+from .walls import beside
 from .windows import Windows
 
 BLOCK = 3
@@ -42,7 +43,8 @@ MARGIN = math.radians(0.5)
 AHEAD, BESIDE = 0.3, math.radians(3.0)
 """Radians from the yaw of the robot up to which a wall is ahead, and radians beside cones that its normal may then lie
 where none holds it, if no sensor looks straight ahead: sonars often look past it on both sides, a rough wall is heard
-all the same, and walls ahead tell the scale of odometry. With walls beside the robot as well, real drives are worse."""
+all the same, and walls ahead tell the scale of odometry. With walls beside the robot as well, real drives are worse if
+a sensor looks straight to a side; if none does, `walls.beside` says how far they may lie."""
 
 GATE, GATE_OF_SCALE = (0.08, 0.06), (0.04, 0.02)
 """Metres by which a wall may seem to have moved since it was last measured, and that a metre nearer or farther, where
@@ -89,6 +91,7 @@ class Distances:
         readings, first = windows.readings, windows.first
         self._usable = readings.echo & (readings.z < FARTHEST) & ~np.repeat(held_out, np.diff(first))
         self._looks_past = not (np.abs(wrapped(windows.mount[:, 2])) <= readings.half_angle).any()
+        self._beside = beside(windows.mount[:, 2], readings.half_angle)
         rows = [row for k in range(0, len(windows), BLOCK) for row in self._measured(k)]
         table = np.array(rows, np.float64).reshape(-1, 5)
         self.node, self.direction = table[:, 0].astype(np.int64), table[:, 1].astype(np.int64)
@@ -108,13 +111,17 @@ class Distances:
         at = self._nodes[middle]
         rows: list[tuple[float, ...]] = []
         half, z = w.readings.half_angle[which], w.readings.z[which]
+        right, left = self._beside[which].T
         for direction in range(4):
             angle = direction * math.pi / 2 + self._askew[middle]
             off = wrapped(sensor[:, 2] - angle)
             heard, slant = np.abs(off) <= half + MARGIN, np.zeros(len(off))
-            if self._looks_past and heard.sum() < FEWEST and abs(wrapped(at[2] - angle)) < AHEAD:
+            if heard.sum() < FEWEST:
                 # the edge of the cone is the first to meet a wall whose normal lies beside it
-                heard, slant = np.abs(off) <= half + BESIDE, off - np.clip(off, -half, half)
+                ahead = self._looks_past and abs(wrapped(at[2] - angle)) < AHEAD
+                far = np.maximum(np.where(off > 0.0, right, left), BESIDE if ahead else 0.0)
+                if far.any():
+                    heard, slant = np.abs(off) <= half + far, off - np.clip(off, -half, half)
             arm, slant, ranges = sensor[heard, :2] - at[:2], slant[heard], z[heard]
             c, s = math.cos(angle), math.sin(angle)
             distance, lever = arm @ (c, s) + ranges * np.cos(slant), arm @ (s, -c) - ranges * np.sin(slant)

@@ -24,19 +24,25 @@ from forward_grid_mapper.core.trajectory.wall_distances import (
 from forward_grid_mapper.core.trajectory.windows import Odometry, Windows, cut
 
 SIDES = np.radians([-90.0, 0.0, 90.0])
-LENGTH = 16.0
+LENGTH, HALF = 16.0, 0.13
 
 
-def corridor(recess: float = 0.0, noise: float = 0.0) -> Windows:
-    """A straight drive between walls at y = −0.8 and 1.2, the second one set back from 8 m on; the end is at 18 m."""
+def corridor(recess: float = 0.0, noise: float = 0.0, slant: float = 0.0) -> Windows:
+    """A straight drive between walls at y = −0.8 and 1.2, the second one set back from 8 m on; the end is at 18 m.
+
+    The edges of the cones that look to the sides meet the walls at a slant, if one is given: they look more ahead.
+    """
     rng = np.random.default_rng(2)
     x = np.arange(0.0, LENGTH, 0.1)
     stamp = (np.arange(len(x)) * 1e8).astype(np.int64)
     rows = []
     for at, when in zip(x.tolist(), stamp.tolist(), strict=True):
         left = 1.2 + (recess if at > LENGTH / 2 else 0.0)
-        for number, (bearing, z) in enumerate(zip(SIDES, (0.8, 18.0 - at, left), strict=True)):
-            rows.append((at, bearing, min(z + rng.normal(0, 1) * noise, 6.0), when, number))
+        for number, (side, z) in enumerate(zip(SIDES, (0.8, 18.0 - at, left), strict=True)):
+            bearing, far = side, z
+            if slant and side:
+                bearing, far = side - np.sign(side) * (HALF + slant), z / math.cos(slant)
+            rows.append((at, bearing, min(far + rng.normal(0, 1) * noise, 6.0), when, number))
     columns = np.array(rows)
     readings = Readings.from_columns(
         x=columns[:, 0],
@@ -44,7 +50,7 @@ def corridor(recess: float = 0.0, noise: float = 0.0) -> Windows:
         yaw=columns[:, 1],
         z=columns[:, 2],
         z_max=6.0,
-        half_angle=0.13,
+        half_angle=HALF,
         stamp=columns[:, 3].astype(np.int64),
         sensor=columns[:, 4].astype(np.int32),
     )
@@ -69,6 +75,17 @@ def test_distances_are_those_of_the_walls() -> None:
     assert not (found.direction == 2).any()
 
 
+def test_walls_that_all_cones_look_past_are_heard_by_their_edges() -> None:
+    found = measured(corridor(noise=0.01, slant=math.radians(20.0)))
+    for direction, wanted in ((1, 1.2), (3, 0.8)):
+        mine = found.direction == direction
+        assert mine.sum() > 10
+        assert found.distance[mine] == pytest.approx(wanted, abs=0.02)
+    # farther beside the cones nothing is looked for
+    beyond = measured(corridor(noise=0.01, slant=math.radians(32.0)))
+    assert not np.isin(beyond.direction, (1, 3)).any()
+
+
 def test_each_wall_is_one_and_one_that_is_set_back_is_another() -> None:
     for recess, wanted in ((0.0, 3), (0.3, 4)):
         walls = measured(corridor(recess)).walls(strict=True)
@@ -81,8 +98,9 @@ def test_each_wall_is_one_and_one_that_is_set_back_is_another() -> None:
             assert walls.along[mine].mean() == pytest.approx(0.0, abs=1e-9)
 
 
-def test_the_lever_is_the_change_with_the_yaw() -> None:
-    windows = corridor()
+@pytest.mark.parametrize('slant', [0.0, 0.3])
+def test_the_lever_is_the_change_with_the_yaw(slant: float) -> None:
+    windows = corridor(slant=slant)
     turn = 0.002
     # all of the drive turned about each node in turn is what the lever tells of the echoes around that node
     one = measured(windows)
@@ -146,12 +164,13 @@ def test_normals_are_right_angles() -> None:
 
 
 def ahead(*bearings: float, yaw: float = 0.0) -> Windows:
-    """A drive straight up to a rough wall at x = 8 m, with sonars of these bearings; one that looks at it is deaf."""
+    """A drive straight up to a rough wall at x = 8 m, with sonars of these bearings, deaf if they look at it or to a side."""
     half, x = math.radians(7.5), np.arange(0.0, 6.0, 0.1)
     stamp, count = (np.arange(len(x)) * 1e8).astype(np.int64), len(bearings)
     bearing, at = np.tile(bearings, len(x)), np.repeat(x, count)
     # what a cone meets first is its edge
-    z = np.where(bearing == 0.0, np.inf, (8.0 - at) / np.cos(np.maximum(np.abs(bearing) - half, 0.0)))
+    deaf = (bearing == 0.0) | (np.abs(bearing) > 1.0)
+    z = np.where(deaf, np.inf, (8.0 - at) / np.cos(np.maximum(np.abs(bearing) - half, 0.0)))
     readings = Readings.from_columns(
         x=at,
         y=0.0,
@@ -168,15 +187,21 @@ def ahead(*bearings: float, yaw: float = 0.0) -> Windows:
 @pytest.mark.parametrize(('past', 'heard'), [(5.0, True), (10.0, True), (10.4, True), (12.0, False)])
 def test_a_wall_ahead_is_heard_by_cones_that_look_past_it(past, heard) -> None:
     sides = math.radians(past), -math.radians(past)
-    windows = ahead(*sides)
+    windows = ahead(*sides, math.pi / 2)
     found = measured(windows)
     assert set(found.direction.tolist()) == ({0} if heard else set())
     assert found.distance == pytest.approx(8.0 - windows.node[found.node, 0], abs=1e-6)
     walls = found.walls(strict=True)
     assert walls.total == heard
     # beside the robot only cones that hold the normal are asked, and so they are if there is one that looks ahead
-    for other in (ahead(*sides, yaw=AHEAD + 0.1), ahead(*sides, 0.0)):
+    yaw = AHEAD + 0.1
+    for other in (ahead(*sides, math.pi / 2 + yaw, yaw=yaw), ahead(*sides, math.pi / 2, 0.0)):
         assert len(measured(other).node) == (len(found.node) if past < 7.5 else 0)
+
+
+def test_a_robot_without_a_sensor_to_a_side_hears_what_is_far_beside_its_cones() -> None:
+    for past, heard in ((12.0, True), (36.0, True), (39.0, False)):
+        assert bool(len(measured(ahead(math.radians(past), -math.radians(past))).node)) == heard
 
 
 def test_the_lever_of_a_wall_ahead_is_the_change_with_the_yaw() -> None:
