@@ -38,11 +38,19 @@ from forward_grid_mapper.recordings.read_drive import read_drive
 from forward_grid_mapper.simulation.drift import LEVELS, odometry_of, with_drift
 from forward_grid_mapper.simulation.drive import Recording, drive
 from forward_grid_mapper.simulation.score import SURFACE_DEPTH, score_map, visible_surface
-from forward_grid_mapper.simulation.sonar import NoiseModel, front_array, sonar_ring
+from forward_grid_mapper.simulation.sonar import NoiseModel, SonarArray, front_array, sonar_ring
 from forward_grid_mapper.simulation.world import Floorplan, World, building_tour, building_world
+
+
+def octagon() -> SonarArray:
+    """Return eight sonars at equal angles, of which none looks straight ahead or to a side."""
+    ring = sonar_ring(8)
+    return dataclasses.replace(ring, yaws=tuple(yaw + math.pi / 8 for yaw in ring.yaws))
+
 
 ROBOTS = {
     'ring': (lambda: sonar_ring(16), 0.1, NoiseModel(0.02, 0.01, 0.0)),
+    'octagon': (octagon, 0.1, NoiseModel(0.03, 0.04, 0.05)),
     'front': (front_array, 0.1, NoiseModel(0.03, 0.04, 0.05)),
     'cheap': (front_array, 0.15, NoiseModel(0.04, 0.10, 0.3)),
 }
