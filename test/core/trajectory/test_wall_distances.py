@@ -164,7 +164,7 @@ def test_normals_are_right_angles() -> None:
 
 
 def ahead(*bearings: float, yaw: float = 0.0) -> Windows:
-    """A drive straight up to a rough wall at x = 8 m, with sonars of these bearings, deaf if they look at it or to a side."""
+    """A drive straight up to a rough wall at x = 8 m; of these sonars those that look at it, or to a side, are deaf."""
     half, x = math.radians(7.5), np.arange(0.0, 6.0, 0.1)
     stamp, count = (np.arange(len(x)) * 1e8).astype(np.int64), len(bearings)
     bearing, at = np.tile(bearings, len(x)), np.repeat(x, count)
