@@ -103,30 +103,35 @@ class Distances:
         w = self._windows
         end = min(k + BLOCK, len(w))
         middle = k + (end - k) // 2
-        which = np.arange(w.first[k], w.first[end])
-        which = which[self._usable[which]]
-        if len(which) < FEWEST:
+        of_block = np.arange(w.first[k], w.first[end])
+        usable = self._usable[of_block]
+        if usable.sum() < FEWEST:
             return []
-        sensor = compose(w.corrected(w.progress[which], w.robot[which], self._nodes), w.mount[which])
+        sensor = compose(w.corrected(w.progress[of_block], w.robot[of_block], self._nodes), w.mount[of_block])
         at = self._nodes[middle]
         rows: list[tuple[float, ...]] = []
-        half, z = w.readings.half_angle[which], w.readings.z[which]
-        right, left = self._beside[which].T
+        half, z = w.readings.half_angle[of_block], w.readings.z[of_block]
+        right, left = self._beside[of_block].T
         for direction in range(4):
             angle = direction * math.pi / 2 + self._askew[middle]
             off = wrapped(sensor[:, 2] - angle)
-            heard, slant = np.abs(off) <= half + MARGIN, np.zeros(len(off))
-            if heard.sum() < FEWEST:
+            asked, slant, sides = np.abs(off) <= half + MARGIN, np.zeros(len(off)), 0
+            if (asked & usable).sum() < FEWEST:
                 # the edge of the cone is the first to meet a wall whose normal lies beside it
                 ahead = self._looks_past and abs(wrapped(at[2] - angle)) < AHEAD
-                far = np.maximum(np.where(off > 0.0, right, left), BESIDE if ahead else 0.0)
+                beside_it = np.where(off > 0.0, right, left)
+                far = np.maximum(beside_it, BESIDE if ahead else 0.0)
                 if far.any():
-                    heard, slant = np.abs(off) <= half + far, off - np.clip(off, -half, half)
+                    asked, slant = np.abs(off) <= half + far, off - np.clip(off, -half, half)
+                    sides = _sides(slant[asked & (beside_it > 0.0)])
+            heard = asked & usable
             arm, slant, ranges = sensor[heard, :2] - at[:2], slant[heard], z[heard]
             c, s = math.cos(angle), math.sin(angle)
             distance, lever = arm @ (c, s) + ranges * np.cos(slant), arm @ (s, -c) - ranges * np.sin(slant)
-            for same in agreeing(distance, w.progress[which[heard]]):
-                rows.append((middle, direction, distance[same].mean(), lever[same].mean(), at[2]))
+            for same in agreeing(distance, w.progress[of_block[heard]]):
+                # the frame of a door is heard on one side alone
+                if (slant[same] == 0.0).any() or _sides(slant[same]) >= sides:
+                    rows.append((middle, direction, distance[same].mean(), lever[same].mean(), at[2]))
         return rows
 
     def tracked(self, strict: bool) -> NDArray[np.int64]:
@@ -165,6 +170,11 @@ class Distances:
         sigma = max(noise_of(wall, (normal * place).sum(1) + self.distance[kept]), 0.0 if strict else FIRST_SIGMA)
         information = np.full(len(wall), sigma**-2)
         return Walls(node, wall, normal, self.distance[kept], self.lever[kept], self.yaw[kept], along, information)
+
+
+def _sides(slant: Floats) -> int:
+    """Return on how many sides of cones, 0 to 2, a wall lies that they meet at these slants."""
+    return int((slant > 0.0).any()) + int((slant < 0.0).any())
 
 
 def normals_of(direction: NDArray[np.int64], askew: Floats) -> Floats:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import numpy as np
@@ -202,6 +203,17 @@ def test_a_wall_ahead_is_heard_by_cones_that_look_past_it(past, heard) -> None:
 def test_a_robot_without_a_sensor_to_a_side_hears_what_is_far_beside_its_cones() -> None:
     for past, heard in ((12.0, True), (36.0, True), (39.0, False)):
         assert bool(len(measured(ahead(math.radians(past), -math.radians(past))).node)) == heard
+
+
+def test_what_one_cone_hears_beside_it_is_no_wall_if_there_is_one_on_its_other_side() -> None:
+    past = math.radians(20.0)
+    both, one = ahead(past, -past), ahead(past, -past)
+    silent = np.where(one.mount[:, 2] < 0.0, one.readings.z_max, one.readings.z)
+    one = dataclasses.replace(one, readings=dataclasses.replace(one.readings, z=silent))
+    assert len(measured(both).node) > 0
+    assert len(measured(one).node) == 0
+    # without a cone on the other side nothing better is to be had
+    assert len(measured(ahead(past)).node) > 0
 
 
 def test_the_lever_of_a_wall_ahead_is_the_change_with_the_yaw() -> None:
