@@ -80,7 +80,8 @@ class Reporter:
         # what is wrong with frames is told of where each is found out
         silent = statuses[0].message == no_map_frame or statuses[0].message.startswith(diagnostics.NO_POSE)
         bad = statuses[0].level != DiagnosticStatus.OK
-        self._verdicts.look([*([statuses[0].message] if bad and not silent else []), *limits], not (bad or limits))
+        well = statuses[0].message == diagnostics.MAPPING and not (faults or limits)
+        self._verdicts.look([*([statuses[0].message] if bad and not silent else []), *limits], well)
         diagnostics.add_faults(statuses[0], [*faults, *limits, *self._em.wrong_input])
         statuses += [*self._journal.statuses(name), *self._trajectory.statuses(name)]
         counts = self._associator.buffer.counts()
