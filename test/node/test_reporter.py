@@ -255,6 +255,17 @@ def test_odometry_that_waits_is_not_missing(clock: Any) -> None:
     assert (level, early.intake.waiting) == (OK, 20)
 
 
+def test_run_em_names_the_transform_that_odometry_waits_for(inside: Any) -> None:
+    robot = inside().start()
+    robot.node._map_frame = robot.node.intake._map_frame = MapFrame('map', Transforms(), 2.0)
+    for k in range(10):
+        robot.odometry(100.0 + 0.1 * k)
+        robot.range(100.0 + 0.1 * k)
+    success, message = robot.call(robot.node.em.run_em)
+    assert not success
+    assert 'TF has no transform from map (map_frame) to odom: 10 odometry messages wait for it' in message
+
+
 def test_well_is_said_only_where_readings_are_mapped(inside: Any) -> None:
     robot = inside().start()
     node, log = robot.node, PlainNode()
