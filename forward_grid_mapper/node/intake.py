@@ -278,8 +278,13 @@ class Intake:
         elif paused:
             self._associator.reject(message, 'paused')
         else:
-            self._sensor_clocks.note(message.frame_id, message.stamp, self._associator.odometry_stamp)
+            self._sensor_clocks.note(message.frame_id, message.stamp, self._newest_odometry())
             self._associator.add_range(message, sent)
+
+    def _newest_odometry(self) -> int | None:
+        """Return the newest stamp of odometry as it came, also of what waits for TF; None before the first."""
+        stamps = (self._associator.odometry_stamp, self._map_frame.newest_stamp)
+        return max((stamp for stamp in stamps if stamp is not None), default=None)
 
     def _add_odometry(self, message: OdometryMessage, sent: int) -> None:
         self._associator.add_odometry(message, sent)
