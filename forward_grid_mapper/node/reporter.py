@@ -144,7 +144,9 @@ class Reporter:
         # a reset forgets which are unknown, too
         for frame in sorted((self._lost - unknown).intersection(self._associator.buffer.counts())):
             self._node.get_logger().info(f'sensor {frame} has a pose on the robot now')
-        unheard = self._extrinsics.known.keys() - self._associator.buffer.counts().keys()
+        # also those that are rejected, or wait
+        sent = {frame.lstrip('/') for frame in self._intake.heard}
+        unheard = self._extrinsics.known.keys() - sent
         # said once, however many frames are new
         named = f'; poses are given for {diagnostics.listed(unheard)}: is one of them meant?' if unheard else ''
         for frame in sorted(unknown - self._reported)[: diagnostics.SHOWN]:

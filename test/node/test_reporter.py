@@ -295,6 +295,7 @@ def test_well_is_said_only_where_readings_are_mapped(inside: Any) -> None:
 def reporter_of(robot: Taking) -> Any:
     made = Reporter.__new__(Reporter)
     made._node, made._associator, made._no_name = robot.node, robot.associator, False
+    made._intake = robot.intake
     return made
 
 
@@ -336,7 +337,9 @@ def test_poses_of_frames_that_nobody_sends_are_named_beside_one_without_a_pose()
     drive(robot, 0, 3, 0)
     reporter = reporter_of(robot)
     reporter._reported, reporter._lost, reporter._far = set(), set(), False
-    poses = {name: Pose2(0.1, 0.0, 0.0) for name in ('sonar', 'us_left', 'us_right')}
+    # one whose readings wait
+    robot.range(200.0, '/waits')
+    poses = {name: Pose2(0.1, 0.0, 0.0) for name in ('sonar', 'us_left', 'us_right', 'waits')}
     reporter._extrinsics = Extrinsics(poses, Transforms())
     robot.associator.unknown_frames.update(('left', 'right'))
     reporter._name_frames()
