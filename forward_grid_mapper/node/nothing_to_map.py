@@ -25,7 +25,12 @@ def _why(associator: PoseAssociator, range_topics: Sequence[str], odom_topic: st
     if no_map_frame and not came and set(rejected) <= {'no_odometry'}:
         return no_map_frame
     if not rejected:
-        return f'{received} readings have come, and wait for their poses'
+        has = (
+            'reading has come, and waits for its pose'
+            if received == 1
+            else 'readings have come, and wait for their poses'
+        )
+        return f'{received} {has}'
     reason, count = max(rejected.items(), key=lambda row: row[1])
     if reason == 'no_odometry' and not came:
         return f'no Odometry message has come on {odom_topic} since the start or reset'

@@ -424,6 +424,7 @@ def test_closing_cancels_the_run(held: EmRobot) -> None:
     [
         (0, {}, 'no Range message has come on /sonar, /left since'),
         (7, {}, '7 readings have come, and wait for their poses'),
+        (1, {}, '1 reading has come, and waits for its pose'),
         (9, {'nan_range': 2, 'below_min_range': 7}, '7 of 9 readings were rejected as below_min_range: the range is'),
     ],
 )
