@@ -141,9 +141,9 @@ class EmService:
                 warned = [f'WARNING: {warning}' for warning in outcome.warnings]
                 reply.send(True, '; '.join(filter(None, [*said, outcome.trajectory, *warned])))
 
-        if not all(map(self._kernels.has, self._needed())):
-            self._logger.info('run_em waits for kernels that are being compiled, as at the first start')
         run = self.current
+        if (run is None or run.by_itself) and not all(map(self._kernels.has, self._needed())):
+            self._logger.info('run_em waits for kernels that are being compiled, as at the first start')
         if run is None:
             self._start(done)
         elif run.by_itself and run.fresh() and not run.cancelled:

@@ -484,6 +484,9 @@ def test_a_call_that_waits_for_kernels_is_logged_as_such(robot: EmRobot) -> None
     robot.compiled.clear()
     robot.run_em()
     assert robot.node.warned == [said]
+    # one that is refused does not wait
+    assert robot.run_em().sent[0][1].startswith('EM runs already')
+    assert robot.node.warned == [said]
     robot.compiled.add('EM')
     robot.settle()
     robot.run_em()
