@@ -81,9 +81,8 @@ class Bag:
         reasons = self._reasons()
         if reasons is None:
             return None
-        return (
-            f'{self.path.name} is damaged or cut off ({reasons}); what was intact was read; {repair_hint(self.path)}.'
-        )
+        name = self.path.name or self.path.resolve().name
+        return f'{name} is damaged or cut off ({reasons}); what was intact was read; {repair_hint(self.path)}.'
 
     def topics(self) -> dict[str, tuple[str, int]]:
         """Return (message type, number of messages) by topic; several types are joined by ' | '."""

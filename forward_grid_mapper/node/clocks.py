@@ -7,6 +7,7 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from ..core.common.words import counted
 from ..core.messages.message_types import NANOSECONDS
 from ..core.messages.pose_association import MOST_FRAMES, PoseAssociator
 from ..core.messages.rep117 import LONGEST_NAME
@@ -125,16 +126,19 @@ class SensorClocks:
             for frame, window in self._windows.items()
             if abs(window.lag) > APART and odometry is not None and odometry - window.last < 2 * WINDOW
         }
-        if not found:
-            return []
-        most = max(found, key=lambda frame: abs(found[frame]))
-        side = 'behind' if found[most] > 0 else 'ahead of'
-        others = f' (and {len(found) - 1} sensors more)' if len(found) > 1 else ''
-        text = (
-            f'the stamps of {most}{others} are {abs(found[most]) / NANOSECONDS:.1f} s {side} those of odometry: where '
-            'a clock is wrong, its readings are placed wrongly; synchronise the clocks (NTP, PTP)'
-        )
-        if found.keys() - self._told:
-            self._told |= found.keys()
-            self._warn(text)
-        return [text]
+        behind = {frame: lag for frame, lag in found.items() if lag > 0}
+        ahead = {frame: -lag for frame, lag in found.items() if lag < 0}
+        texts = []
+        for lags, side in ((behind, 'behind'), (ahead, 'ahead of')):
+            if not lags:
+                continue
+            most = max(lags, key=lambda frame: lags[frame])
+            others = f' (and {counted(len(lags) - 1, "sensor")} more)' if len(lags) > 1 else ''
+            texts.append(
+                f'the stamps of {most}{others} are {lags[most] / NANOSECONDS:.1f} s {side} those of odometry: where '
+                'a clock is wrong, its readings are placed wrongly; synchronise the clocks (NTP, PTP)'
+            )
+            if lags.keys() - self._told:
+                self._told |= lags.keys()
+                self._warn(texts[-1])
+        return texts

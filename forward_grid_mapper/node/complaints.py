@@ -21,7 +21,8 @@ TOPICS = ('sonar', 'odom')
 HIGHEST_DOMAIN = 232
 """DDS has ports for no more."""
 
-_LIST = re.compile(r':=\s*\[.*\.')
+# a whole number and one with a point
+_MIXED = re.compile(r':=\s*\[(?=(?:.*,)?\s*[-+]?\d+\s*[],])[^]]*\.[^]]*\]\s*$')
 _SOURCE = re.compile(r', at /\S+:\d+')
 _INIT = re.compile(r'^failed to initialize rcl: ')
 _RULE = re.compile(r"Couldn't parse remap rule: '(?:-r|--remap) (?P<rule>.*?)'\.")
@@ -94,7 +95,7 @@ def of_ros(error: BaseException) -> str:
         )
     if found := _PARAMETER.search(text):
         rule = f'-p {found["rule"]} is not a valid parameter'
-        if _LIST.search(found['rule']):
+        if _MIXED.search(found['rule']):
             return f'{rule}: write each number of a list with a point; ROS refuses lists of both kinds'
         return f'{rule}: it takes -p NAME:=VALUE, such as -p resolution:=0.05'
     if found := _FILE.search(text):

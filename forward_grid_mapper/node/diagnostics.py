@@ -19,7 +19,6 @@ from .intake import Intake
 SILENCE = 3.0
 """Seconds without odometry, or without ranges, that are worth a warning."""
 
-
 RECENT = 10.0
 """Seconds for which a sensor that measures rarely is judged by the readings that it has sent, so that the status does
 not change with each of them."""
@@ -33,8 +32,14 @@ NEARLY = 0.9
 SHOWN = 20
 """Names of frames that a message lists."""
 
+STREAMS = ('odometry', 'stamp of odometry', 'range')
+"""What goes on as long as the robot is there."""
+
 NO_POSE = 'no pose on the robot for '
 """How a verdict begins that names frames without a pose."""
+
+MAPPING = 'mapping'
+"""The verdict where readings come, are accepted, and nothing is wrong."""
 
 
 class Health:
@@ -104,12 +109,16 @@ class Health:
         new_rejected = sum(by_reason.values())
         nowhere = self._silence('frames without a pose', associator.rejected['unknown_extrinsics'])
         refused = sum(associator.odometry_rejected.values())
-        silent_odometry = self._silence('odometry', associator.odometry_received - refused)
+        # what the associator has not seen yet has come all the same
+        silent_odometry = self._silence('odometry', intake.odometry_came - refused)
         refused_now, self._refused = refused - self._refused, refused
         stamp = associator.odometry_stamp or 0
         stuck = self._silence('stamp of odometry', stamp)
         silent_ranges = self._silence('range', received)
         if not intake.listening:
+            # nothing is missed that nobody asked for
+            now = time.monotonic()
+            self._last |= {stream: (self._last[stream][0], now) for stream in STREAMS}
             return DiagnosticStatus.OK, 'inactive: nothing is received'
         if intake.paused:
             self._recent.begin_anew()
@@ -122,7 +131,7 @@ class Health:
         missing = []
         if silent_odometry > SILENCE:
             missing.append(f'no odometry for {silent_odometry:.0f} s{absent("Odometry")}')
-        elif stuck > SILENCE and new:
+        elif stuck > SILENCE and new and associator.odometry_stamp is not None:
             return DiagnosticStatus.WARN, (
                 f'odometry comes, but its stamp has been {stamp / NANOSECONDS:.3f} s for {stuck:.0f} s, so that '
                 'readings get no pose, or all the same; have its driver fill in header.stamp'
@@ -155,7 +164,7 @@ class Health:
                 f'{len(associator.buffer)} readings, and max_readings is {bound}: where readings are densest, the '
                 'oldest are removed'
             )
-        return DiagnosticStatus.OK, 'mapping'
+        return DiagnosticStatus.OK, MAPPING
 
     def _silence(self, stream: str, count: int) -> float:
         """Return for how many seconds a number has not changed."""

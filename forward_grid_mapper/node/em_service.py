@@ -84,6 +84,8 @@ class EmService:
         Gives the map to start from, and takes what was found.
     range_topics : sequence of str
         Full names, for what is said where nothing has come, as `odom_topic`.
+    no_map_frame : callable
+        Returns what keeps odometry out of the map frame, in words, or ''.
     extrinsics : callable
         Returns the poses of the sensors that are fixed to the robot, by frame.
     mounts : callable
@@ -109,6 +111,7 @@ class EmService:
         self.online: OnlineWorker | None = None
         self.range_topics: Sequence[str] = ()
         self.odom_topic = ''
+        self.no_map_frame: Callable[[], str] = str
         self.extrinsics: Callable[[], Mapping[str, Pose2]] = dict
         self.mounts: Callable[[], Mapping[str, Pose2]] = dict
         self._parameters, self._associator, self._publishers = parameters, associator, publishers
@@ -138,9 +141,9 @@ class EmService:
                 warned = [f'WARNING: {warning}' for warning in outcome.warnings]
                 reply.send(True, '; '.join(filter(None, [*said, outcome.trajectory, *warned])))
 
-        if not all(map(self._kernels.has, self._needed())):
-            self._logger.info('run_em waits for kernels that are being compiled, as at the first start')
         run = self.current
+        if (run is None or run.by_itself) and not all(map(self._kernels.has, self._needed())):
+            self._logger.info('run_em waits for kernels that are being compiled, as at the first start')
         if run is None:
             self._start(done)
         elif run.by_itself and run.fresh() and not run.cancelled:
@@ -267,7 +270,8 @@ class EmService:
             elif outcome.maps is None and run.asked:
                 outcome.message = 'EM was cancelled by cancel_em'
             elif outcome.maps is None and not len(taken[0][1]):
-                outcome.message = nothing_to_map(self._associator, self.range_topics, self.odom_topic)
+                lack = self.no_map_frame()
+                outcome.message = nothing_to_map(self._associator, self.range_topics, self.odom_topic, lack)
             elif outcome.maps is None and run.then:
                 outcome.message = 'the run that was begun after some way gave way to run_em'
             self._finish(outcome, taken[0][0])

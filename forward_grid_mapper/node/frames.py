@@ -183,10 +183,15 @@ class MapFrame:
         """Whether TF had the transform that was asked for last."""
         return self._lack is None
 
-    def fault(self) -> str:
-        """Return what keeps odometry that comes out of the map frame for `LASTING` seconds now, in words, or ''."""
-        now = time.monotonic()
-        if self._lack is None or now - self._lacking < LASTING or now - self._newest > LASTING:
+    @property
+    def newest_stamp(self) -> int | None:
+        """The stamp of the newest message that is held back, nanoseconds."""
+        return self._held[-1].stamp if self._held else None
+
+    @property
+    def lack(self) -> str:
+        """What kept the newest odometry out of the map frame, in words, or ''."""
+        if self._lack is None:
             return ''
         way = f'from {self._map_frame} (map_frame) to {self._frame}'
         waiting = f'{len(self._held)} odometry messages wait for it, {self.dropped} were dropped'
@@ -195,6 +200,11 @@ class MapFrame:
         if self._lack is LATE:
             return f"TF's transform {way} comes later than pose_timeout, or has stopped: {waiting}"
         return f'TF has no transform {way}: {waiting}; is a localiser running?'
+
+    def fault(self) -> str:
+        """Return what keeps odometry that comes out of the map frame for `LASTING` seconds now, in words, or ''."""
+        now = time.monotonic()
+        return '' if now - self._lacking < LASTING or now - self._newest > LASTING else self.lack
 
     def convert(self, message: OdometryMessage) -> list[OdometryMessage]:
         """Take an odometry message; return those whose pose in the map frame is known now, `LOOKUPS` of them, in order.

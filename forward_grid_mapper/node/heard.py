@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Iterator
 
 from ..core.messages.pose_association import MOST_FRAMES
 from ..core.messages.rep117 import LONGEST_NAME
@@ -32,6 +33,9 @@ class Heard:
 
     def __contains__(self, frame: str) -> bool:
         return frame in self._sensors
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._sensors)
 
     def clear(self) -> None:
         """Forget all sensors."""

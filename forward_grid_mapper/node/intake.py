@@ -46,6 +46,8 @@ class Intake:
         Of each Range topic.
     heard : Heard
         When each sensor sent last.
+    odometry_came : int
+        Odometry messages so far, also those that wait, and those of before a reset.
     """
 
     def __init__(
@@ -75,7 +77,7 @@ class Intake:
         self._odometry_clock = OdometryClock(associator, node.get_logger().warning)
         self._sensor_clocks = SensorClocks(node.get_logger().warning)
         self._held: deque[tuple[RangeMessage | OdometryMessage | _InMapFrame, int, bool]] = deque()
-        self._ranges_held = self._refused = self._told_of = 0
+        self._ranges_held = self._refused = self._told_of = self.odometry_came = 0
         self._last_refused: RangeMessage | None = None
         self._next_warning = 0.0
         self._more = node.create_guard_condition(self.work)
@@ -205,6 +207,7 @@ class Intake:
     def on_odometry(self, message: Odometry, info: dict[str, Any]) -> None:
         """Take an Odometry."""
         made, sent = odometry_message(message), info['source_timestamp']
+        self.odometry_came += 1
         self._odometry_losses.taken(info, made.frame_id, made.stamp)
         if self._ready and not self._held and not self._associator.behind:
             self._take(made, sent, self.paused)
@@ -275,8 +278,13 @@ class Intake:
         elif paused:
             self._associator.reject(message, 'paused')
         else:
-            self._sensor_clocks.note(message.frame_id, message.stamp, self._associator.odometry_stamp)
+            self._sensor_clocks.note(message.frame_id, message.stamp, self._newest_odometry())
             self._associator.add_range(message, sent)
+
+    def _newest_odometry(self) -> int | None:
+        """Return the newest stamp of odometry as it came, also of what waits for TF; None before the first."""
+        stamps = (self._associator.odometry_stamp, self._map_frame.newest_stamp)
+        return max((stamp for stamp in stamps if stamp is not None), default=None)
 
     def _add_odometry(self, message: OdometryMessage, sent: int) -> None:
         self._associator.add_odometry(message, sent)

@@ -134,6 +134,7 @@ class MapperNode(ManagedNode):
         trajectory.refine = lambda: self.mapping and self.em.run_by_itself()
         self._extrinsics = extrinsics
         self.em.range_topics, self.em.odom_topic = ranges, odometry
+        self.em.no_map_frame = lambda: self._map_frame.lack
         self.em.extrinsics, self.em.mounts = lambda: extrinsics.fixed, lambda: extrinsics.known
         self.online = self.em.online = self._online_worker(kernels) if node.online else None
         self.saver = Saver(self.em, self.live, self._account, log)

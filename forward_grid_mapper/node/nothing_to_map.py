@@ -8,19 +8,30 @@ from ..core.messages.pose_association import PoseAssociator
 from ..core.messages.rep117 import ODOMETRY_REASONS, REASONS
 
 
-def nothing_to_map(associator: PoseAssociator, range_topics: Sequence[str], odom_topic: str) -> str:
-    """Return why no reading was accepted; the topics have their full names."""
-    return f'there is nothing to map: {_why(associator, range_topics, odom_topic)}'
+def nothing_to_map(associator: PoseAssociator, range_topics: Sequence[str], odom_topic: str, no_map_frame: str) -> str:
+    """Return why no reading was accepted.
+
+    The topics have their full names; `no_map_frame` says what keeps odometry out of the map frame, if anything does.
+    """
+    return f'there is nothing to map: {_why(associator, range_topics, odom_topic, no_map_frame)}'
 
 
-def _why(associator: PoseAssociator, range_topics: Sequence[str], odom_topic: str) -> str:
+def _why(associator: PoseAssociator, range_topics: Sequence[str], odom_topic: str, no_map_frame: str) -> str:
     received, rejected = associator.received, associator.rejected
     if not received:
         return f'no Range message has come on {", ".join(range_topics)} since the start or reset'
-    if not rejected:
-        return f'{received} readings have come, and wait for their poses'
-    reason, count = max(rejected.items(), key=lambda row: row[1])
     came, refused = associator.odometry_received, associator.odometry_rejected
+    # odometry that waits for TF has not come as far as the associator
+    if no_map_frame and not came and set(rejected) <= {'no_odometry'}:
+        return no_map_frame
+    if not rejected:
+        has = (
+            'reading has come, and waits for its pose'
+            if received == 1
+            else 'readings have come, and wait for their poses'
+        )
+        return f'{received} {has}'
+    reason, count = max(rejected.items(), key=lambda row: row[1])
     if reason == 'no_odometry' and not came:
         return f'no Odometry message has come on {odom_topic} since the start or reset'
     if reason == 'no_odometry' and came == refused.total():

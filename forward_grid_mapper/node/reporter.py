@@ -80,7 +80,8 @@ class Reporter:
         # what is wrong with frames is told of where each is found out
         silent = statuses[0].message == no_map_frame or statuses[0].message.startswith(diagnostics.NO_POSE)
         bad = statuses[0].level != DiagnosticStatus.OK
-        self._verdicts.look([*([statuses[0].message] if bad and not silent else []), *limits], not (bad or limits))
+        well = statuses[0].message == diagnostics.MAPPING and not (faults or limits)
+        self._verdicts.look([*([statuses[0].message] if bad and not silent else []), *limits], well)
         diagnostics.add_faults(statuses[0], [*faults, *limits, *self._em.wrong_input])
         statuses += [*self._journal.statuses(name), *self._trajectory.statuses(name)]
         counts = self._associator.buffer.counts()
@@ -143,7 +144,9 @@ class Reporter:
         # a reset forgets which are unknown, too
         for frame in sorted((self._lost - unknown).intersection(self._associator.buffer.counts())):
             self._node.get_logger().info(f'sensor {frame} has a pose on the robot now')
-        unheard = self._extrinsics.known.keys() - self._associator.buffer.counts().keys()
+        # also those that are rejected, or wait
+        sent = {frame.lstrip('/') for frame in self._intake.heard}
+        unheard = self._extrinsics.known.keys() - sent
         # said once, however many frames are new
         named = f'; poses are given for {diagnostics.listed(unheard)}: is one of them meant?' if unheard else ''
         for frame in sorted(unknown - self._reported)[: diagnostics.SHOWN]:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.common.errors import MapperError
+from ..core.common.words import counted
 from ..core.maps.map_set import MapSet
 from ..files.output_folder import expanded, free_name
 from ..files.quality_warning import thinned
@@ -79,7 +80,10 @@ class Saver:
         newer = account.accepted - explained
         warnings = account.source['warnings']
         if newer > 0:
-            warnings.append(f'{newer} readings came after EM: only the live map has them; call run_em before save_maps')
+            after = f'{counted(newer, "reading")} came after EM'
+            warnings.append(
+                f'{after}: only the live map has {"it" if newer == 1 else "them"}; call run_em before save_maps'
+            )
         if note := thinned(len(maps.readings), explained):
             warnings.append(note)
         parent = expanded(account.folder).resolve()
@@ -100,10 +104,10 @@ class Saver:
             self._logger.warning(f'save_maps: {warning}')
         names = {path.name for path in folder.iterdir()}
         shown = [f'{folder / name}{use}' for name, use in USES.items() if name in names]
-        said = [', '.join([*shown, f'and {len(names) - len(shown)} files more'])]
+        said = [', '.join([*shown, f'and {counted(len(names) - len(shown), "file")} more'])]
         # a robot that drives measures on while it is told of its map
         if newer > 0:
-            said.append(f'{newer} readings came after EM')
+            said.append(f'{counted(newer, "reading")} came after EM')
         if count := len(report['warnings']) - (newer > 0):
             said.append(f'WARNINGS ({count}): see report.txt')
         return '; '.join(said)

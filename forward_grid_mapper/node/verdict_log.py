@@ -16,7 +16,8 @@ AGAIN = 60.0
 MOST = 100
 """Faults that are remembered."""
 
-_NUMBER = re.compile(r'\d+(?:\.\d+)?')
+# of how many seconds a sensor is judged changes with how often it sends
+_NUMBER = re.compile(r'\blast second\b|\blast \d+ s\b|\d+(?:\.\d+)?')
 
 
 class VerdictLog:
@@ -26,6 +27,7 @@ class VerdictLog:
         self._log = logger
         self._seen: dict[str, int] = {}
         self._told: dict[str, float] = {}
+        self._open: set[str] = set()
         self._bad = False
 
     def look(self, faults: Sequence[str], well: bool) -> None:
@@ -33,12 +35,15 @@ class VerdictLog:
         now = time.monotonic()
         kinds = {_NUMBER.sub('#', fault): fault for fault in faults}
         self._seen = {kind: self._seen.get(kind, 0) + 1 for kind in kinds}
+        self._open.intersection_update(kinds)
         for kind, fault in kinds.items():
-            if self._seen[kind] != LOOKS or now < self._told.get(kind, -AGAIN) + AGAIN:
+            # one that came back too early is told of later, if it stays
+            if kind in self._open or self._seen[kind] < LOOKS or now < self._told.get(kind, -AGAIN) + AGAIN:
                 continue
             if len(self._told) >= MOST:
                 self._told.clear()
             self._told[kind] = now
+            self._open.add(kind)
             self._bad = True
             self._log.warning(fault)
         if self._bad and well:

@@ -223,6 +223,16 @@ def test_messages_still_in_the_write_ahead_log(tmp_path: Path) -> None:
         assert opened.topics()['/late'][1] == COUNT
 
 
+def test_a_bag_that_is_the_working_directory_is_called_by_its_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bag = write_sample(tmp_path, 'mcap', name='here')
+    (bag / 'metadata.yaml').write_text('relative_file_paths:\n  - absent.mcap\n')
+    monkeypatch.chdir(bag)
+    with Bag(Path()) as read:
+        assert read.truncated is not None and read.truncated.startswith('here is damaged or cut off (absent.mcap is')
+
+
 def test_a_log_that_cannot_be_read_where_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """SQLite wants to make a file beside it, which a disk that is mounted for reading alone does not let it."""
     bag = write_sample(tmp_path, 'sqlite3')

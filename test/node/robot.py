@@ -121,6 +121,8 @@ class Robot:
         self.odom_out = self.node.create_publisher(Odometry, f'{prefix}odom', RELIABLE)
         self.maps: dict[str, list[OccupancyGrid]] = {name: [] for name in MAPS}
         self.diagnostics: dict[str, Any] = {}
+        # seconds of the node's clock, as it reports
+        self.time = -1
         self.node.create_subscription(DiagnosticArray, '/diagnostics', self._on_diagnostics, 10)
 
     def listen(self) -> None:
@@ -134,6 +136,7 @@ class Robot:
                 part = status.name.rpartition(': ')[2]
                 self.diagnostics[part] = {pair.key: pair.value for pair in status.values}
                 self.diagnostics[part] |= {'message': status.message, 'level': status.level}
+                self.time = message.header.stamp.sec
 
     def spin(self, seconds: float) -> None:
         end = time.monotonic() + seconds

@@ -9,10 +9,13 @@ import pytest
 
 pytest.importorskip('rclpy', reason='the intake takes messages of ROS')
 
+from geometry_msgs.msg import Quaternion, Transform
 from stand_ins import Taking
 
+from forward_grid_mapper.core.messages.extrinsics import LATE
 from forward_grid_mapper.node import clocks
 from forward_grid_mapper.node.clocks import AGAIN, LASTING
+from forward_grid_mapper.node.frames import MapFrame, Transforms
 
 
 @pytest.fixture
@@ -87,7 +90,7 @@ def test_a_sensor_whose_clock_stays_behind_is_told_of(clock: Any) -> None:
         assert fault.startswith('the stamps of left are 10.0 s behind those of odometry')
     assert robot.node.warned == [fault]
     drive(robot, 6, 20.0, 'right', 'left', first=26)
-    assert 'right (and 1 sensors more) are 20.0 s behind' in faults(robot)[0]
+    assert 'right (and 1 sensor more) are 20.0 s behind' in faults(robot)[0]
     # set right, or silent
     drive(robot, 6, 0.0, 'left', first=32)
     assert 'the stamps of right are' in faults(robot)[0]
@@ -106,6 +109,38 @@ def test_a_sensor_whose_clock_is_ahead_is_told_of_and_odometry_that_is_rare_is_n
             rare.odometry(1000.0 + 0.1 * k)
         rare.range(1000.0 + 0.1 * k)
     assert faults(rare) == []
+
+
+def test_sensors_on_both_sides_are_told_of_apart(clock: Any) -> None:
+    robot = taking()
+    for k in range(60):
+        robot.odometry(1000.0 + 0.1 * k)
+        for frame, late in (('old', 3.0), ('older', 4.0), ('young', -2.0)):
+            robot.range(1000.0 + 0.1 * k - late, frame)
+    behind, ahead = faults(robot)
+    assert behind.startswith('the stamps of older (and 1 sensor more) are 4.0 s behind those of odometry')
+    assert ahead.startswith('the stamps of young are 2.0 s ahead of those of odometry')
+    assert robot.node.warned == [behind, ahead]
+
+
+def test_odometry_that_waits_for_tf_makes_no_sensor_ahead(clock: Any) -> None:
+    class Late(Transforms):
+        """TF that has everything 1.5 s later."""
+
+        now = 0.0
+
+        def lookup(self, target: str, source: str, stamp: int) -> Any:
+            return Transform(rotation=Quaternion(w=1.0)) if stamp <= (self.now - 1.5) * 1e9 else LATE
+
+    transforms = Late()
+    robot = Taking(map_frame=MapFrame('map', transforms, 2.0))
+    robot.intake.begin()
+    for k in range(200):
+        transforms.now = 1000.0 + 0.1 * k
+        robot.odometry(transforms.now)
+        robot.range(transforms.now)
+    assert len(robot.associator.buffer) > 100
+    assert faults(robot) == []
 
 
 def test_a_queue_that_is_worked_off_is_not_behind(clock: Any) -> None:

@@ -105,6 +105,10 @@ def test_options_that_ros_does_not_know(text: str, expected: str) -> None:
             '-p sensors.a.pose:=[0,0.2,1] is not a valid parameter: write each number of a list with a point',
         ),
         (
+            "Couldn't parse parameter override rule: '-p sensors.a.pose:=[0.1,0.2'. Error: x, at /a/b.c:1",
+            '-p sensors.a.pose:=[0.1,0.2 is not a valid parameter: it takes -p NAME:=VALUE',
+        ),
+        (
             "failed to initialize rcl: Couldn't parse params file: '--params-file x'. Error: cannot open, at /a/b.c:1",
             '--params-file x: cannot open',
         ),

@@ -424,6 +424,7 @@ def test_closing_cancels_the_run(held: EmRobot) -> None:
     [
         (0, {}, 'no Range message has come on /sonar, /left since'),
         (7, {}, '7 readings have come, and wait for their poses'),
+        (1, {}, '1 reading has come, and waits for its pose'),
         (9, {'nan_range': 2, 'below_min_range': 7}, '7 of 9 readings were rejected as below_min_range: the range is'),
     ],
 )
@@ -459,10 +460,32 @@ def test_without_any_odometry_that_is_what_there_is_to_be_told(make: Callable[..
         assert not success and message.startswith(f'there is nothing to map: {said}')
 
 
+def test_odometry_that_waits_for_a_localiser_is_not_called_missing(make: Callable[..., EmRobot]) -> None:
+    lack = 'TF has no transform from map (map_frame) to odom'
+    for came, rejected, said in (
+        (0, {'no_odometry': 9}, lack),
+        (0, {}, lack),
+        (0, {'nan_range': 9}, '9 of 9 readings were rejected as nan_range'),
+        (5, {'no_odometry': 9}, '9 of 9 readings were rejected as no_odometry'),
+    ):
+        robot = make(count=0)
+        robot.em.odom_topic, robot.em.no_map_frame = '/odom', lambda: lack
+        robot.error = InputError('there is no reading to map')
+        robot.associator.received, robot.associator.odometry_received = 9, came
+        robot.associator.rejected.update(rejected)
+        answer = robot.run_em()
+        robot.settle()
+        ((_, message),) = answer.sent
+        assert message.startswith(f'there is nothing to map: {said}')
+
+
 def test_a_call_that_waits_for_kernels_is_logged_as_such(robot: EmRobot) -> None:
     said = 'run_em waits for kernels that are being compiled, as at the first start'
     robot.compiled.clear()
     robot.run_em()
+    assert robot.node.warned == [said]
+    # one that is refused does not wait
+    assert robot.run_em().sent[0][1].startswith('EM runs already')
     assert robot.node.warned == [said]
     robot.compiled.add('EM')
     robot.settle()

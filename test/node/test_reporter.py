@@ -9,15 +9,16 @@ import pytest
 
 pytest.importorskip('rclpy', reason='the tests of the node need rclpy')
 
-from stand_ins import Taking
+from stand_ins import PlainNode, Taking
 
 from forward_grid_mapper.core.common.grid import Grid
 from forward_grid_mapper.core.messages.message_types import Pose2
 from forward_grid_mapper.node import diagnostics
 from forward_grid_mapper.node.diagnostics import Health
-from forward_grid_mapper.node.frames import Extrinsics, Transforms
+from forward_grid_mapper.node.frames import Extrinsics, MapFrame, Transforms
 from forward_grid_mapper.node.heard import USUAL
 from forward_grid_mapper.node.reporter import Reporter
+from forward_grid_mapper.node.verdict_log import LOOKS, VerdictLog
 
 OK, WARN = b'\x00', b'\x01'
 
@@ -218,9 +219,83 @@ def test_stamps_that_are_all_0_are_told_of_though_readings_are_accepted(clock: A
     assert 'its stamp has been 0.000 s for 6 s' in text and 'header.stamp' in text
 
 
+def test_what_did_not_come_while_nobody_listened_is_not_missed(clock: Any) -> None:
+    robot, health = Taking(), Health()
+    robot.intake.begin()
+
+    def verdict() -> tuple[bytes, str]:
+        made = health.statuses('mapper', robot.intake, robot.associator, None, '', Grid(0.1, 0, 0, 1, 1), {})[0]
+        return made.level, made.message
+
+    for _ in range(600):
+        clock.now += 1.0
+        assert verdict() == (OK, 'inactive: nothing is received')
+    robot.intake.subscribe()
+    for _ in range(3):
+        clock.now += 1.0
+        assert verdict() == (OK, 'no reading has been accepted so far: none has come')
+    clock.now += 1.0
+    assert verdict()[1].startswith('no odometry for 4 s')
+
+
+def test_odometry_that_waits_is_not_missing(clock: Any) -> None:
+    # for the journal of an earlier run, or for a localiser
+    transforms = Transforms()
+    early, lost = Taking(), Taking(map_frame=MapFrame('map', transforms, 2.0))
+    lost.intake.begin()
+    for robot in (early, lost):
+        robot.intake.subscribe()
+        health = Health()
+        for _ in range(20):
+            clock.now += 1.0
+            robot.odometry(clock.now)
+            robot.range(clock.now)
+            level, text = judged(robot, health)
+            assert 'odometry' not in text or 'from map (map_frame)' in text, text
+    assert (level, early.intake.waiting) == (OK, 20)
+
+
+def test_run_em_names_the_transform_that_odometry_waits_for(inside: Any) -> None:
+    robot = inside().start()
+    robot.node._map_frame = robot.node.intake._map_frame = MapFrame('map', Transforms(), 2.0)
+    for k in range(10):
+        robot.odometry(100.0 + 0.1 * k)
+        robot.range(100.0 + 0.1 * k)
+    success, message = robot.call(robot.node.em.run_em)
+    assert not success
+    assert 'TF has no transform from map (map_frame) to odom: 10 odometry messages wait for it' in message
+
+
+def test_well_is_said_only_where_readings_are_mapped(inside: Any) -> None:
+    robot = inside().start()
+    node, log = robot.node, PlainNode()
+    node.reporter._verdicts = VerdictLog(log)
+
+    def looks(count: int) -> None:
+        for _ in range(count):
+            robot.status('readings')
+
+    for k in range(20):
+        robot.odometry(100.0 + 0.1 * k)
+        robot.range(100.0 + 0.1 * k, frame='')
+    looks(LOOKS)
+    (fault,) = log.warned
+    assert 'empty_frame_id' in fault
+    robot.call(node.pause, SimpleNamespace(data=True))
+    looks(LOOKS)
+    robot.call(node.pause, SimpleNamespace(data=False))
+    robot.call(node.reset)
+    looks(LOOKS)
+    assert log.warned == [fault]
+    robot.drive(40, 20)
+    looks(LOOKS)
+    assert log.warned == [fault, 'readings are mapped, and nothing is wrong with them any more']
+
+
 def reporter_of(robot: Taking) -> Any:
     made = Reporter.__new__(Reporter)
     made._node, made._associator, made._no_name = robot.node, robot.associator, False
+    made._intake = robot.intake
     return made
 
 
@@ -262,7 +337,9 @@ def test_poses_of_frames_that_nobody_sends_are_named_beside_one_without_a_pose()
     drive(robot, 0, 3, 0)
     reporter = reporter_of(robot)
     reporter._reported, reporter._lost, reporter._far = set(), set(), False
-    poses = {name: Pose2(0.1, 0.0, 0.0) for name in ('sonar', 'us_left', 'us_right')}
+    # one whose readings wait
+    robot.range(200.0, '/waits')
+    poses = {name: Pose2(0.1, 0.0, 0.0) for name in ('sonar', 'us_left', 'us_right', 'waits')}
     reporter._extrinsics = Extrinsics(poses, Transforms())
     robot.associator.unknown_frames.update(('left', 'right'))
     reporter._name_frames()

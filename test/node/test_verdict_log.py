@@ -55,6 +55,25 @@ def test_a_fault_that_comes_and_goes_is_told_once_a_minute(clock: Any) -> None:
     assert node.warned == ['gap', WELL] * 2
 
 
+def test_a_fault_that_comes_back_for_good_is_told_though_it_came_early(clock: Any) -> None:
+    node = PlainNode()
+    log = VerdictLog(node)
+    for second in range(300):
+        faults = [] if 5 <= second < 10 else ['gap']
+        log.look(faults, not faults)
+        clock.now += 1.0
+    assert node.warned == ['gap', WELL, 'gap']
+
+
+def test_the_time_in_which_readings_were_rejected_makes_no_new_fault(clock: Any) -> None:
+    node = PlainNode()
+    log = VerdictLog(node)
+    for k in range(300):
+        log.look([f'{k} of 300 readings were rejected in the last {("second", "2 s", "10 s")[k % 3]}'], False)
+        clock.now += 1.0
+    assert node.warned == ['1 of 300 readings were rejected in the last 2 s']
+
+
 def test_faults_of_ever_new_names_take_no_memory(clock: Any) -> None:
     log = VerdictLog(PlainNode())
     for k in range(5 * MOST):

@@ -65,12 +65,16 @@ POINT = 2.0
 THING = 0.5**2 / 12
 """Square metres: the variance of places on a thing of half a metre, which has sides but is no wall."""
 
+TENTHS = 3600
+"""Tenths of a degree in a full turn; in whole numbers of them cones are compared, so that left mirrors right."""
+
 BESIDE, COUNTS = math.radians(30.0), 0.5
 """Radians beside a cone up to which the normal of a wall may lie, and what such an echo counts, if no sensor looks
 straight to a side. With one that does, votes are sharper without."""
 
-WELL_INSIDE = 3.0
-"""Degrees from the edge of its cone at least at which a sensor holds what lies straight to a side: yaws waver."""
+WELL_INSIDE = 30
+"""Tenths of a degree from the edge of its cone at least at which a sensor holds what lies straight to a side: yaws
+waver."""
 
 USUAL = 0.05
 """Part of the usual mean of a place's votes that is added for all directions: where hardly any echoes agree, those that
@@ -136,19 +140,22 @@ def beside(bearing: Floats, half: Floats) -> Floats:
     bearing, half : float64, shape (N,)
         Direction of each sensor on the robot, and half angle of its cone, radians.
     """
-    cones, which = np.unique(np.round(np.degrees(np.column_stack([bearing, half])), 1), axis=0, return_inverse=True)
-    middle, wide = cones.T
-    if (np.abs(np.abs(np.remainder(middle + 180.0, 360.0) - 180.0) - 90.0) <= wide - WELL_INSIDE).any():
+    middle, wide = (np.round(np.degrees(angle) * 10.0).astype(np.int64) for angle in (bearing, half))
+    cones, which = np.unique(wide * TENTHS + middle % TENTHS, return_inverse=True)
+    wide, middle = np.divmod(cones, TENTHS)
+    from_a_side = np.abs(np.abs((middle + TENTHS // 2) % TENTHS - TENTHS // 2) - TENTHS // 4)
+    if (from_a_side <= wide - WELL_INSIDE).any():
         return np.zeros((len(bearing), 2))
-    far = np.arange(math.degrees(BESIDE) + 1.0)
+    # of a sensor that turns on the robot there are as many cones as readings
+    first, last = middle - wide, middle + wide
+    changes = np.bincount(first % TENTHS, minlength=TENTHS) - np.bincount((last + 1) % TENTHS, minlength=TENTHS)
+    held = np.cumsum(changes) + np.count_nonzero(first % TENTHS > (last + 1) % TENTHS) > 0
+    far = np.arange(10, round(math.degrees(BESIDE) * 10.0) + 1, 10)
     out = np.empty((len(cones), 2))
-    for k, side in enumerate((-1.0, 1.0)):
+    for k, edge in enumerate((first[:, None] - far, last[:, None] + far)):
         # degree by degree from the edge on
-        asked = (middle + side * wide)[:, None] + side * far[1:]
-        off = np.remainder(asked[..., None] - middle + 180.0, 360.0) - 180.0
-        free = ~(np.abs(off) <= wide).any(-1)
-        out[:, k] = np.radians(far[np.logical_and.accumulate(free, axis=1).sum(1)])
-    return out[which.ravel()]
+        out[:, k] = np.radians(np.logical_and.accumulate(~held[edge % TENTHS], axis=1).sum(1))
+    return out[which]
 
 
 def wall_votes(windows: Windows, held_out: NDArray[np.bool_]) -> tuple[NDArray[np.int64], Floats]:

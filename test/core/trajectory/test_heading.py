@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -138,6 +139,18 @@ def test_cones_reach_as_far_as_no_other_does_if_none_looks_to_a_side() -> None:
 @pytest.mark.parametrize(('bearing', 'to_a_side'), [(97.0, False), (95.0, True), (-95.0, True), (265.0, True)])
 def test_a_cone_that_holds_what_is_straight_to_a_side_is_enough(bearing: float, to_a_side: bool) -> None:
     assert (in_degrees([bearing, 0.0], 9.0) == [[0.0, 0.0]] * 2) == to_a_side
+
+
+def test_many_cones_as_of_a_sensor_that_turns_on_the_robot_take_little_memory() -> None:
+    bearings = np.radians(np.linspace(-75.0, 75.0, 20_000))
+    tracemalloc.start()
+    past = np.degrees(beside(bearings, np.full(len(bearings), math.radians(8.0))))
+    most = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert most < 30e6
+    # right of the rightmost and left of the leftmost
+    assert past[0] == pytest.approx([30.0, 0.0]) and past[-1] == pytest.approx([0.0, 30.0])
+    assert past[5000:-5000].max() == 0.0
 
 
 @pytest.mark.parametrize('side', [1.0, -1.0])

@@ -22,6 +22,7 @@ from forward_grid_mapper.core.trajectory.wall_distances import (
     noise_of,
     normals_of,
 )
+from forward_grid_mapper.core.trajectory.walls import DIRECTIONS, beside, wall_votes
 from forward_grid_mapper.core.trajectory.windows import Odometry, Windows, cut
 
 SIDES = np.radians([-90.0, 0.0, 90.0])
@@ -121,6 +122,66 @@ def test_nodes_that_are_moved_measure_the_same_distances() -> None:
     first, second = (np.lexsort(((d.direction + more) % 4, d.node)) for d, more in ((one, 1), (other, 0)))
     assert np.array_equal((one.direction[first] + 1) % 4, other.direction[second])
     assert one.distance[first] == pytest.approx(other.distance[second], abs=1e-9)
+
+
+def bent_drive(bearings: np.ndarray, halves: np.ndarray, seed: int) -> Windows:
+    """A drive along a bend in a room of 9 m by 5 m, whose rough walls each cone hears where it meets them first."""
+    rng = np.random.default_rng(seed)
+    along = np.arange(0.0, 1.0, 0.01)
+    pose = np.column_stack([1.0 + 6.0 * along, 1.2 + 1.5 * along**2, 0.1 + 0.4 * along])
+    robot = np.repeat(pose, len(bearings), axis=0)
+    mounts = np.column_stack([0.2 * np.cos(bearings), 0.1 * np.sin(bearings) - 0.03, bearings])
+    sensor = compose(robot, np.tile(mounts, (len(pose), 1)))
+    half = np.tile(halves, len(pose))
+    ray = sensor[:, 2:] + half[:, None] * np.linspace(-1.0, 1.0, 41)
+    with np.errstate(divide='ignore'):
+        x, y = (
+            np.where(part > 0, size - at, -at) / part
+            for at, size, part in ((sensor[:, :1], 9.0, np.cos(ray)), (sensor[:, 1:2], 5.0, np.sin(ray)))
+        )
+    z = np.minimum(np.abs(x), np.abs(y)).min(1) + rng.normal(0.0, 0.01, len(ray))
+    stamp = (np.arange(len(pose)) * 1e8).astype(np.int64)
+    readings = Readings.from_columns(
+        x=sensor[:, 0],
+        y=sensor[:, 1],
+        yaw=sensor[:, 2],
+        z=np.minimum(z, 6.0),
+        z_max=6.0,
+        half_angle=half,
+        stamp=np.repeat(stamp, len(bearings)),
+        sensor=np.tile(np.arange(len(bearings), dtype=np.int32), len(pose)),
+    )
+    return cut(readings, Odometry.of(stamp, pose))
+
+
+def mirrored(windows: Windows) -> Windows:
+    """The same drive with left and right exchanged."""
+    w, flip = windows, np.array([1.0, -1.0, -1.0])
+    readings = dataclasses.replace(w.readings, y=-w.readings.y, yaw=-w.readings.yaw)
+    return dataclasses.replace(w, readings=readings, robot=w.robot * flip, mount=w.mount * flip, node=w.node * flip)
+
+
+@pytest.mark.parametrize('seed', range(8))
+def test_a_mirrored_drive_has_the_mirrored_votes_and_distances(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    # sensors to all directions but straight to a side, or any, some of them with wide cones
+    bearings = np.radians(rng.choice([-150, -118, -60, -35, 10, 25, 62, 125, 170] if seed < 6 else np.arange(360), 6))
+    windows = bent_drive(bearings, np.radians(rng.uniform(5.0, 12.0 if seed < 6 else 50.0, 6)), seed)
+    other, everywhere = mirrored(windows), np.zeros(len(windows), bool)
+    past = beside(windows.mount[:, 2], windows.readings.half_angle)
+    assert past.any() or seed >= 6
+    assert np.array_equal(past, beside(other.mount[:, 2], windows.readings.half_angle)[:, ::-1])
+    at, votes = wall_votes(windows, everywhere)
+    same_at, seen = wall_votes(other, everywhere)
+    assert np.array_equal(at, same_at) and np.ptp(votes) > 1.0
+    assert seen == pytest.approx(votes[:, -np.arange(DIRECTIONS) % DIRECTIONS], rel=1e-6)
+    tables = []
+    for found, sign in ((measured(windows), 1), (measured(other), -1)):
+        rows = [found.node, sign * found.direction % 4, found.distance, sign * found.lever, sign * found.yaw]
+        table = np.column_stack(rows)
+        tables.append(table[np.lexsort(table.T[2::-1])])
+    assert len(tables[0]) > 5
+    assert tables[0] == pytest.approx(tables[1], abs=1e-9)
 
 
 def test_held_out_windows_measure_nothing() -> None:
