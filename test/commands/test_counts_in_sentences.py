@@ -27,10 +27,10 @@ def test_messages_that_were_skipped() -> None:
 
 
 def test_the_report_and_the_picture() -> None:
-    one = report_text({'result': {'readings': 4, 'unexplained': 1}})
-    assert '1 reading (25.0 %) is most likely a random measurement\n' in one
-    several = report_text({'result': {'readings': 4, 'unexplained': 2}})
-    assert '2 readings (50.0 %) are most likely random measurements\n' in several
+    one = report_text({'result': {'readings': 40, 'unexplained': 1}})
+    assert '1 reading (2.5 %) is most likely a random measurement\n' in one
+    several = report_text({'result': {'readings': 40, 'unexplained': 2}})
+    assert '2 readings (5.0 %) are most likely random measurements\n' in several
     assert figures_text(1, 0.1, -2.0).startswith('1 reading   ·')
 
 
