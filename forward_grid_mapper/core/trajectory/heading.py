@@ -75,6 +75,9 @@ FEWEST_VOTES = 4
 DOUBTFUL, PAUSE = 0.02, 5
 """Probability of having lost a right angle from where on a place is doubtful, and votes between two such places."""
 
+NEGLIGIBLE = 1e-4
+"""The same up to which nobody needs to look for places that confirm the heading."""
+
 PARTS_ASKEW = 2
 """Parts of a building that stand askew to the first, at the most."""
 
@@ -126,6 +129,8 @@ class Heading:
         Direction of the walls at each place, radians, modulo a right angle: 0 in the first part of the building.
     doubts : tuple of (int, float)
         Nodes where a right angle may have been lost, and the probability of it.
+    slight : tuple of (int, float)
+        Other nodes, and how little probable it is there.
     """
 
     at: NDArray[np.int64]
@@ -138,6 +143,7 @@ class Heading:
     over_odometry: float
     askew: Floats
     doubts: tuple[tuple[int, float], ...] = ()
+    slight: tuple[tuple[int, float], ...] = ()
 
     def turned(self, node: int, angle: float) -> Heading:
         """Return the same with what comes from a node on turned by `angle`, radians."""
@@ -249,14 +255,33 @@ def doubts(at: NDArray[np.int64], certain: Floats) -> tuple[tuple[int, float], .
     certain : float64, shape (B,)
         That probability from the begin of the drive to each node.
     """
-    falls = -np.diff(np.minimum.accumulate(certain), prepend=certain[0])
-    falling = np.flatnonzero(falls > DOUBTFUL / 10)
+    falls = _falls(certain)
     out = []
-    for part in np.split(falling, np.flatnonzero(np.diff(falling) > PAUSE) + 1):
+    for part in _doubtful(falls):
         sums = np.cumsum(falls[part])
-        if len(part) and sums[-1] >= DOUBTFUL:
-            out.append((int(at[part[np.searchsorted(sums, sums[-1] / 2)]]), float(sums[-1])))
+        out.append((int(at[part[np.searchsorted(sums, sums[-1] / 2)]]), float(sums[-1])))
     return tuple(out)
+
+
+def slight(at: NDArray[np.int64], certain: Floats) -> tuple[tuple[int, float], ...]:
+    """Return the other nodes at which that probability falls, and by how much; the parameters are those of `doubts`."""
+    falls = _falls(certain)
+    for part in _doubtful(falls):
+        falls[part] = 0.0
+    return tuple((int(at[k]), float(falls[k])) for k in np.flatnonzero(falls > NEGLIGIBLE))
+
+
+def _falls(certain: Floats) -> Floats:
+    """Return by how much the least probability so far falls at each place, shape (B,)."""
+    out: Floats = -np.diff(np.minimum.accumulate(certain), prepend=certain[0])
+    return out
+
+
+def _doubtful(falls: Floats) -> list[NDArray[np.int64]]:
+    """Return the runs of places that are doubtful."""
+    falling = np.flatnonzero(falls > DOUBTFUL / 10)
+    runs = np.split(falling, np.flatnonzero(np.diff(falling) > PAUSE) + 1)
+    return [run for run in runs if falls[run].sum() >= DOUBTFUL]
 
 
 def yaws_of_votes(votes: Floats, yaw: Floats, correction: Floats) -> tuple[Floats, Floats]:
@@ -323,6 +348,7 @@ def heading(windows: Windows, at: NDArray[np.int64], votes: Floats, noises: Sequ
         total - chain.without_drift(),
         direction,
         doubts(at, certain),
+        slight(at, certain),
     )
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from .heading import Heading
 from .holding_out import LEAST_SIGMAS, blocks_of, foreseen, gain
@@ -83,10 +83,12 @@ def solved(
 def _matched(scans: Scans, heading: Heading, solver: Solver, along: Solution) -> Solved:
     solution, loops = solver.with_matches(along)
     found = Solved(solver, along, solution, loops, heading.certainty)
-    lost = sum(probability for _, probability in _unconfirmed(scans, heading, found))
-    # what is no place by itself, but a little everywhere, stays
-    elsewhere = 1.0 - heading.certainty - sum(probability for _, probability in heading.doubts)
-    return Solved(solver, along, solution, loops, 1.0 - lost - max(elsewhere, 0.0))
+    confirmed_ones = [
+        probability
+        for node, probability in (*heading.doubts, *heading.slight)
+        if confirmed(scans, solution.nodes, loops, node)
+    ]
+    return replace(found, certainty=heading.certainty + sum(confirmed_ones))
 
 
 def _unconfirmed(scans: Scans, heading: Heading, found: Solved) -> list[tuple[int, float]]:

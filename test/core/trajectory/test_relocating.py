@@ -10,7 +10,7 @@ import pytest
 from exact_tour import Tour, quietly, tour_with
 
 from forward_grid_mapper.core.trajectory import solving
-from forward_grid_mapper.core.trajectory.heading import DOUBTFUL, Heading, doubts
+from forward_grid_mapper.core.trajectory.heading import DOUBTFUL, Heading, doubts, slight
 from forward_grid_mapper.core.trajectory.hypotheses import solved
 from forward_grid_mapper.core.trajectory.loops import LENGTH, Loop
 from forward_grid_mapper.core.trajectory.matching import Match
@@ -155,7 +155,14 @@ def test_a_doubt_lies_in_the_middle_of_where_certainty_falls() -> None:
     certain[17:] -= 0.05
     assert [(node, round(p, 6)) for node, p in doubts(at, certain)] == [(21, 0.4), (51, 0.05)]
     assert doubts(at, np.ones(20)) == ()
-    assert doubts(at, np.linspace(1.0, 1.0 - DOUBTFUL / 2, 20)) == ()
+    assert slight(at, certain) == slight(at, np.ones(20)) == ()
+    little = np.linspace(1.0, 1.0 - DOUBTFUL / 2, 20)
+    assert doubts(at, little) == ()
+    assert np.array(slight(at, little)) == pytest.approx(np.column_stack([at[1:], np.full(19, DOUBTFUL / 38)]))
+    # what has no name as a doubt is left, and nothing is counted twice
+    both = certain * little
+    total = sum(p for _, p in (*doubts(at, both), *slight(at, both)))
+    assert total == pytest.approx(1.0 - both[-1], abs=1e-9)
 
 
 @pytest.mark.parametrize('lost', [0, pytest.param(1, marks=pytest.mark.slow)])
@@ -166,10 +173,12 @@ def test_a_right_angle_that_was_lost_is_found_again(there_and_back, lost) -> Non
     def solver_of(other: Heading) -> Solver:
         return Solver(odometry, windows, scans, other, quietly)
 
-    doubtful = replace(heading.turned(node, lost * math.pi / 2), certainty=0.6, doubts=((node, 0.4),))
+    # what is slight is known as well where places were recognised, and stays at the end of the drive
+    little = (node, 0.02), (len(windows) - 2, 0.03)
+    doubtful = replace(heading.turned(node, lost * math.pi / 2), certainty=0.55, doubts=((node, 0.4),), slight=little)
     solver = solver_of(doubtful)
     found = solved(scans, doubtful, solver, solver.along_walls(), solver_of)
-    assert found.certainty > 0.9
+    assert found.certainty == pytest.approx(0.97)
     off = relative(found.solution.nodes[0], found.solution.nodes) - relative(true[0], true)
     assert np.hypot(off[:, 0], off[:, 1]).max() < 0.3
     assert (found.solver is solver) == (lost == 0)
