@@ -3,13 +3,23 @@
 from __future__ import annotations
 
 import sys
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
 sys.path.insert(0, str(Path(__file__).parent))
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> Any:
+    """A monotonic clock that stands at `now`, seconds."""
+    made = SimpleNamespace(now=50.0)
+    monkeypatch.setattr(time, 'monotonic', lambda: made.now)
+    return made
 
 
 @pytest.fixture

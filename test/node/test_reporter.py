@@ -98,13 +98,6 @@ def seconds(robot: Taking, clock: Any, health: Health, count: int, every: int, f
     return found
 
 
-@pytest.fixture
-def clock(monkeypatch: pytest.MonkeyPatch) -> Any:
-    made = SimpleNamespace(now=50.0)
-    monkeypatch.setattr(diagnostics.time, 'monotonic', lambda: made.now)
-    return made
-
-
 def test_a_sensor_that_measures_rarely_has_one_verdict(clock: Any) -> None:
     robot, health = Taking(), Health()
     robot.intake.begin()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -11,17 +10,9 @@ pytest.importorskip('rclpy', reason='the tests of the node need rclpy')
 
 from stand_ins import PlainNode
 
-from forward_grid_mapper.node import verdict_log
 from forward_grid_mapper.node.verdict_log import AGAIN, MOST, VerdictLog
 
 WELL = 'readings are mapped, and nothing is wrong with them any more'
-
-
-@pytest.fixture
-def clock(monkeypatch: pytest.MonkeyPatch) -> Any:
-    made = SimpleNamespace(now=50.0)
-    monkeypatch.setattr(verdict_log.time, 'monotonic', lambda: made.now)
-    return made
 
 
 def test_a_fault_that_lasts_is_told_once_whatever_its_numbers(clock: Any) -> None:

@@ -76,7 +76,7 @@ DOUBTFUL, PAUSE = 0.02, 5
 """Probability of having lost a right angle from where on a place is doubtful, and votes between two such places."""
 
 NEGLIGIBLE = 1e-4
-"""The same up to which nobody needs to look for places that confirm the heading."""
+"""Probability of it below which a place is not named."""
 
 PARTS_ASKEW = 2
 """Parts of a building that stand askew to the first, at the most."""

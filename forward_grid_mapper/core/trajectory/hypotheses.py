@@ -83,12 +83,13 @@ def solved(
 def _matched(scans: Scans, heading: Heading, solver: Solver, along: Solution) -> Solved:
     solution, loops = solver.with_matches(along)
     found = Solved(solver, along, solution, loops, heading.certainty)
-    confirmed_ones = [
+    # what is confirmed was no loss
+    not_lost = [
         probability
         for node, probability in (*heading.doubts, *heading.slight)
         if confirmed(scans, solution.nodes, loops, node)
     ]
-    return replace(found, certainty=heading.certainty + sum(confirmed_ones))
+    return replace(found, certainty=heading.certainty + sum(not_lost))
 
 
 def _unconfirmed(scans: Scans, heading: Heading, found: Solved) -> list[tuple[int, float]]:
