@@ -5,8 +5,9 @@ same how it moves from there on. So what lies between two jumps is a drive of it
 begins: where the robot stood before the jump, or where odometry has it, as where messages are missing. Around both its
 readings are compared with the map of what was driven before.
 
-A turn that is too fast for a robot is most often one of a simulated robot, and right. It is a jump only if readings say
-that the robot did not turn, as where a gyroscope begins anew.
+Two kinds of steps are most often right, and jumps only if readings say that the robot stood. A turn that is too fast
+for a robot is most often one of a simulated robot; else a gyroscope began anew. A step that is long, but no faster than
+this robot drives, is most often one of odometry with few messages.
 """
 
 from __future__ import annotations
@@ -27,16 +28,23 @@ from .registration import SILENT, OnMap, moved_to, readings_moved
 from .windows import Odometry
 
 LONGEST_STEP = 1.0
-"""Metres between two poses of odometry, beyond which it jumped."""
+"""Metres between two poses of odometry up to which nothing is asked."""
+
+USUAL, TIMES_USUAL, FEWEST_STEPS = 0.9, 2.0, 20
+"""Quantile of the lengths and speeds of all steps that is usual; how often as long, or as fast, a step may be; and
+steps from which on that is known."""
+
+LONGEST_GAP, TIMES_GAP = 2.0, 4.0
+"""Seconds between two poses, and how often the median of all, up to either of which no driver was started again."""
 
 LONGEST_TURN, FASTEST_TURN = 0.5, 2 * math.pi
 """Radians between two poses, and radians a second, beyond both of which no robot turns."""
 
-MOST_TURNS = 20
-"""Fast turns that are looked at: a robot that turns so more often does turn."""
+MOST_DOUBTFUL = 20
+"""Doubtful steps that are looked at: a robot that moves so more often does."""
 
 LOOKED_BACK = 20.0
-"""Metres before such a turn that the map is made of on which readings are compared."""
+"""Metres before such a step that the map is made of on which readings are compared."""
 
 LONGEST_OUTLIER = 0.5
 """Seconds between the poses before and after others that are outliers."""
@@ -76,29 +84,36 @@ MOST_SAID = 3
 
 
 def jumps(odometry: Odometry) -> NDArray[np.int64]:
-    """Return the numbers of the poses that odometry jumps to; fast turns are not among them."""
-    found, far = _found(odometry)
-    return found[far > LONGEST_STEP]
+    """Return the numbers of the poses that odometry jumps to; those of doubtful steps are not among them."""
+    found, doubtful = _found(odometry)
+    return found[~doubtful]
 
 
-def fast_turns(odometry: Odometry) -> NDArray[np.int64]:
-    """Return the numbers of the poses that odometry turns to faster than a robot can, but moves to as one may."""
-    found, far = _found(odometry)
-    return found[far <= LONGEST_STEP]
+def doubtful_steps(odometry: Odometry) -> NDArray[np.int64]:
+    """Return the numbers of the poses that odometry turns to faster than a robot can, or drives far to in one step."""
+    found, doubtful = _found(odometry)
+    return found[doubtful]
 
 
-def _found(odometry: Odometry) -> tuple[NDArray[np.int64], Floats]:
-    """Return the numbers of the poses that no robot gets to from the one before, and how far these are, metres."""
-    step, pose = np.diff(odometry.stamp) * 1e-9, odometry.pose
+def _found(odometry: Odometry) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    """Return the numbers of the poses that odometry may have jumped to, and of which of them that is doubtful."""
+    seconds, pose = np.diff(odometry.stamp) * 1e-9, odometry.pose
     far = np.hypot(*np.diff(pose[:, :2], axis=0).T)
-    found = np.flatnonzero(jumped(far, np.diff(pose[:, 2]), step))
-    return found + 1, far[found]
+    moved = (far > 0.0) & (seconds > 0.0)
+    longest, fastest = LONGEST_STEP, 0.0
+    if np.count_nonzero(moved) >= FEWEST_STEPS:
+        longest = max(longest, TIMES_USUAL * float(np.quantile(far[moved], USUAL)))
+        fastest = min(TIMES_USUAL * float(np.quantile(far[moved] / seconds[moved], USUAL)), FASTEST)
+    found = np.flatnonzero((far > longest) | _turned(np.diff(pose[:, 2]), seconds))
+    gap = max(LONGEST_GAP, TIMES_GAP * float(np.median(seconds))) if len(seconds) else 0.0
+    driven = (far <= fastest * seconds) & (seconds <= gap)
+    return found + 1, ((far <= longest) | driven)[found]
 
 
-def jumped(far: Any, turn: Any, seconds: Any) -> Any:
-    """Return whether no robot moves so from one pose to the next: metres, radians, and seconds."""
+def _turned(turn: Any, seconds: Any) -> Any:
+    """Return whether no robot turns so from one pose to the next: radians, and seconds."""
     turn = np.abs(wrapped(turn))
-    return (far > LONGEST_STEP) | ((turn > LONGEST_TURN) & (turn > FASTEST_TURN * np.asarray(seconds)))
+    return (turn > LONGEST_TURN) & (turn > FASTEST_TURN * np.asarray(seconds))
 
 
 def too_far(metres: Any, seconds: Any) -> Any:
@@ -123,7 +138,8 @@ def without_outliers(odometry: Odometry) -> Odometry:
         around = [begin - 1, end]
         seconds = float(np.diff(odometry.stamp[around])[0]) * 1e-9
         x, y, turn = np.diff(odometry.pose[around], axis=0)[0].tolist()
-        if stay[begin - 1] and seconds <= LONGEST_OUTLIER and not jumped(math.hypot(x, y), turn, seconds):
+        back = math.hypot(x, y) <= LONGEST_STEP and not _turned(turn, seconds)
+        if stay[begin - 1] and seconds <= LONGEST_OUTLIER and back:
             stay[begin:end] = False
     return odometry if stay.all() else Odometry.of(odometry.stamp[stay], odometry.pose[stay])
 
@@ -159,14 +175,14 @@ FIRST, STOOD, DRIVEN, UNKNOWN = 'first', 'stood', 'driven', 'unknown'
 where odometry has it, though readings do not tell."""
 
 
-def with_yaw_anew(
+def with_doubtful(
     readings: Readings,
     odometry: Odometry,
     jumped_to: NDArray[np.int64],
     parameters: Parameters,
     stop: NDArray[np.uint8],
 ) -> NDArray[np.int64]:
-    """Return the jumps, and with them those fast turns that the robot did not make, as its readings say.
+    """Return the jumps, and with them those doubtful steps that the robot did not make, as its readings say.
 
     Parameters
     ----------
@@ -183,11 +199,11 @@ def with_yaw_anew(
     Cancelled
         If `stop` was set.
     """
-    turns = fast_turns(odometry).tolist()
-    if not 0 < len(turns) <= MOST_TURNS:
+    doubtful = doubtful_steps(odometry).tolist()
+    if not 0 < len(doubtful) <= MOST_DOUBTFUL:
         return jumped_to
     out, travel = set(jumped_to.tolist()), odometry.travel
-    for at in turns:
+    for at in doubtful:
         begin = max((k for k in out if k < at), default=0)
         end = min((k for k in out if k > at), default=len(odometry.stamp))
         begin = max(begin, int(np.searchsorted(travel, travel[at] - LOOKED_BACK)))
@@ -197,11 +213,11 @@ def with_yaw_anew(
         on_map = _read_along(readings, before)
         if min(len(part.readings), len(on_map)) < FEWEST_READINGS:
             continue
-        # right at the turn odometry has not drifted yet, so nothing is searched
+        # right at the step odometry has not drifted yet, so nothing is searched
         around = OnMap(part.readings, after.pose[0], on_map, parameters, stop)
         usual = _Usual(part, parameters, stop)
-        stood, turned = (usual.fits(around, pose, GOOD_AT_REST) for pose in (before.pose[-1], after.pose[0]))
-        if stood and not turned:
+        stood, went = (usual.fits(around, pose, GOOD_AT_REST) for pose in (before.pose[-1], after.pose[0]))
+        if stood and not went:
             out.add(at)
     return np.array(sorted(out), np.int64)
 

@@ -29,7 +29,7 @@ from .heading import NOISES, Heading, heading
 from .holding_out import LEAST_SIGMAS, Gain, came_back, held_out
 from .hypotheses import solved
 from .judging import chosen, explained_better, over_the_drive, seen_again, turned_right
-from .jumps import MOST_JUMPS, Part, begins_of, jumps, parts_at, with_yaw_anew, without_outliers
+from .jumps import MOST_JUMPS, Part, begins_of, jumps, parts_at, with_doubtful, without_outliers
 from .local_map import for_matching
 from .odometry_model import CALIBRATION
 from .outcome import Refinement, differences, joined_parts, replaced, with_outliers
@@ -130,7 +130,7 @@ class Refiner:
         if len(jumped_to) > MOST_JUMPS:
             reason = f'odometry jumps {len(jumped_to)} times: it is no wheel odometry, or messages are missing'
             return Refinement(False, reason, readings, odometry, {})
-        jumped_to = with_yaw_anew(readings, odometry, jumped_to, self._parameters, self._stop)
+        jumped_to = with_doubtful(readings, odometry, jumped_to, self._parameters, self._stop)
         if not len(jumped_to):
             return self._whole(readings, odometry)
         return self._in_parts(readings, odometry, jumped_to)

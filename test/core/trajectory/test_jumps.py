@@ -14,7 +14,7 @@ from forward_grid_mapper.core.common.readings import Readings
 from forward_grid_mapper.core.trajectory import jumps as jumping
 from forward_grid_mapper.core.trajectory.correction import Correction
 from forward_grid_mapper.core.trajectory.following import Follower
-from forward_grid_mapper.core.trajectory.jumps import fast_turns, jumps, since_jump, without_outliers
+from forward_grid_mapper.core.trajectory.jumps import doubtful_steps, jumps, since_jump, without_outliers
 from forward_grid_mapper.core.trajectory.outcome import Refinement
 from forward_grid_mapper.core.trajectory.poses import compose, relative, rms_after_alignment
 from forward_grid_mapper.core.trajectory.refinement import Refiner
@@ -88,18 +88,77 @@ def off(exact: Recording, path: Odometry) -> float:
 @pytest.mark.parametrize('seed', range(10))
 def test_a_jump_is_what_no_robot_drives(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    seconds = rng.choice([0.01, 0.1, 1.0, 10.0], 60)
-    pose = np.cumsum(rng.normal(0.0, [0.5, 0.5, 1.5], (60, 3)), 0)
+    seconds = rng.choice([0.01, 0.1, 1.0, 10.0], 200)
+    size = np.where(rng.random(200) < 0.07, 1.0, 0.1)
+    pose = np.cumsum(rng.normal(0.0, 1.0, (200, 3)) * np.stack([size, size, 0 * size + 1.5], 1), 0)
     odometry = Odometry.of(np.cumsum(np.round(seconds * 1e9)).astype(np.int64), pose)
-    expected, fast = [], []
-    for k in range(1, 60):
-        far = math.dist(pose[k - 1, :2], pose[k, :2])
+    far = [0.0] + [math.dist(pose[k - 1, :2], pose[k, :2]) for k in range(1, 200)]
+    longest = max(2 * float(np.quantile(far[1:], 0.9)), 1.0)
+    # the speeds of these steps are those of no robot, so at most 3 m/s are taken for driving
+    assert 2 * np.quantile([far[k] / seconds[k] for k in range(1, 200)], 0.9) > 3.0
+    gap = max(2.0, 4 * float(np.median(seconds[1:])))
+    expected, doubtful = [], []
+    for k in range(1, 200):
         turn = abs(math.remainder(pose[k, 2] - pose[k - 1, 2], 2 * math.pi))
-        if far > 1.0 or (turn > 0.5 and turn / seconds[k] > 2 * math.pi):
-            (expected if far > 1.0 else fast).append(k)
+        driven = far[k] <= longest or (far[k] <= 3.0 * seconds[k] and seconds[k] <= gap)
+        if far[k] > longest or (turn > 0.5 and turn / seconds[k] > 2 * math.pi):
+            (doubtful if driven else expected).append(k)
+    assert expected and doubtful
     assert jumps(odometry).tolist() == expected
-    assert fast_turns(odometry).tolist() == fast
+    assert doubtful_steps(odometry).tolist() == doubtful
     assert since_jump(odometry).stamp[0] == odometry.stamp[expected[-1]]
+
+
+@pytest.mark.parametrize(
+    ('far', 'seconds', 'jump'),
+    [(1.1, 1.2, False), (1.1, 1.0, True), (1.9, 1.95, False), (2.2, 1.9, True), (1.9, 2.1, True), (0.9, 0.01, False)],
+)
+def test_a_long_step_is_a_jump_if_this_robot_is_slower_or_odometry_was_silent(
+    far: float, seconds: float, jump: bool
+) -> None:
+    # 0.5 m/s, ten poses a second, and one long step
+    x = np.r_[np.arange(50) * 0.05, 49 * 0.05 + far + np.arange(50) * 0.05]
+    since = np.r_[np.arange(50) * 0.1, 4.9 + seconds + np.arange(50) * 0.1]
+    odometry = Odometry.of(np.round(since * 1e9).astype(np.int64), np.stack([x, 0 * x, 0 * x], 1))
+    assert jumps(odometry).tolist() == ([50] if jump else [])
+    assert doubtful_steps(odometry).tolist() == ([50] if not jump and far > 1.0 else [])
+
+
+def test_of_few_poses_it_is_not_known_how_fast_the_robot_drives() -> None:
+    stamp = np.array([0, 1_000_000_000], np.int64)
+    assert jumps(Odometry.of(stamp, np.array([[0.0, 0.0, 0.0], [1.1, 0.0, 0.0]]))).tolist() == [1]
+
+
+def with_few_poses(readings: Readings, odometry: Odometry, metres: float) -> tuple[Readings, Odometry]:
+    """The same drive with odometry that comes only so often."""
+    travel, stay = odometry.travel, [0]
+    for k in range(1, len(travel)):
+        if travel[k] - travel[stay[-1]] >= metres or k == len(travel) - 1:
+            stay.append(k)
+    seldom = Odometry.of(odometry.stamp[stay], odometry.pose[stay])
+    return moved(readings, odometry, seldom), seldom
+
+
+def test_poses_may_be_more_than_a_metre_apart(bent: tuple[Readings, Odometry]) -> None:
+    _, odometry = with_few_poses(*bent, 1.1)
+    assert np.median(np.hypot(*np.diff(odometry.pose[:, :2], axis=0).T)) > 1.0
+    assert not len(jumps(odometry)) and not len(doubtful_steps(odometry))
+    # nor is it a jump where the robot stood in between
+    stamp = odometry.stamp.copy()
+    stamp[10:] += 60_000_000_000
+    assert not len(jumps(Odometry.of(stamp, odometry.pose)))
+    pose = odometry.pose.copy()
+    pose[10:, 0] += 5.0
+    assert jumps(Odometry.of(odometry.stamp, pose)).tolist() == [10]
+
+
+@pytest.mark.slow
+def test_a_drive_with_few_poses_is_refined(exact: Recording, bent: tuple[Readings, Odometry]) -> None:
+    readings, odometry = with_few_poses(*bent, 1.1)
+    found = Refiner(Parameters()).run(readings, odometry)
+    assert found.accepted and not found.jumps
+    assert off(exact, odometry) > 0.7
+    assert off(exact, found.trajectory) < 0.2
 
 
 def test_driving_is_no_jump(bent: tuple[Readings, Odometry]) -> None:
@@ -203,7 +262,7 @@ def test_a_few_messages_before_a_jump_do_not_matter(exact: Recording, bent: tupl
 def test_a_simulated_robot_may_turn_at_once(exact: Recording, bent: tuple[Readings, Odometry]) -> None:
     _, true = turning_at_once(exact.readings, odometry_of(exact), odometry_of(exact))
     readings, odometry = turning_at_once(*bent, odometry_of(exact))
-    assert len(fast_turns(odometry)) == 8 and not len(jumps(odometry))
+    assert len(doubtful_steps(odometry)) == 8 and not len(jumps(odometry))
     found = Refiner(Parameters()).run(readings, odometry)
     assert found.accepted and not found.jumps
     assert rms_after_alignment(odometry.pose, true.pose) > 0.7
@@ -222,7 +281,7 @@ def test_a_yaw_that_begins_anew_is_told_from_turns(
     first = int(0.55 * len(odometry.stamp))
     x, y, yaw = odometry.pose[first].tolist()
     readings, odometry = begun_anew(readings, odometry, 0.55, (x, y, yaw + 1.2))
-    assert first in fast_turns(odometry) and not len(jumps(odometry))
+    assert first in doubtful_steps(odometry) and not len(jumps(odometry))
     found = Refiner(Parameters()).run(readings, odometry)
     assert found.accepted and found.jumps.count('the readings fit where the robot was before it') == 1
     assert rms_after_alignment(odometry.pose, true.pose) > 1.0
@@ -242,7 +301,7 @@ def test_a_turn_is_a_jump_only_if_readings_fit_where_the_robot_stood_alone(
     where = {tuple(before.tolist()): stood, tuple(odometry.pose[first].tolist()): turned}
     monkeypatch.setattr(jumping._Usual, 'fits', lambda self, around, begin, least: where[tuple(begin.tolist())])
     nothing, stop = np.zeros(0, np.int64), np.zeros(1, np.uint8)
-    found = jumping.with_yaw_anew(readings, odometry, nothing, Parameters(), stop)
+    found = jumping.with_doubtful(readings, odometry, nothing, Parameters(), stop)
     assert found.tolist() == ([first] if stood and not turned else [])
 
 
