@@ -7,7 +7,6 @@ to the same as one.
 
 from __future__ import annotations
 
-import math
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -61,4 +60,5 @@ def quantise_logs(ratios: RatioWorkspace, m: int, out: Any) -> None:
         y = y * f - 2.4999993993e-1
         y = y * f + 3.3333331174e-1
         y = f + f * f * (y * f - 0.5) + 0.6931471805599453 * out[k]
-        out[k] = np.int32(math.floor(y * _SCALE + 0.5))
+        # numpy's floor stays a float: vector instructions for 64-bit integers are not to be had everywhere
+        out[k] = np.int32(np.floor(y * _SCALE + 0.5))
