@@ -42,6 +42,9 @@ LASTING = 1.0
 GROWS = 0.5
 """Metres of driving after which the path is published again."""
 
+RECENT = 60_000_000_000
+"""Nanoseconds of odometry before the last look, which say how far apart its poses are."""
+
 AFTER_JUMP = SHORTEST
 """Metres after a jump of odometry from which on the node refines by itself, if it does at all: then there is something
 to tell by where the robot is."""
@@ -289,16 +292,17 @@ class Trajectory:
 
     def _count(self, before: tuple[int, Pose2], stamp: int, pose: Pose2) -> None:
         """Add the way since the last look, which may be long ago where messages come fast, without jumps."""
-        passed = Odometry(*self._associator.record.since(before[0]))
-        at = jumps(passed)
+        recent = Odometry(*self._associator.record.since(before[0] - RECENT))
+        first, at = int(np.searchsorted(recent.stamp, before[0])), jumps(recent)
+        at = at[at > first]
         if not len(at):
             self.driven += math.dist(before[1][:2], pose[:2])
             return
-        steps = np.hypot(*np.diff(passed.pose[:, :2], axis=0).T)
+        steps = np.hypot(*np.diff(recent.pose[:, :2], axis=0).T)
         far, last = float(steps[at[-1] - 1]), int(at[-1])
-        steps[at - 1] = 0.0
+        steps[:first], steps[at - 1] = 0.0, 0.0
         begin, self.driven = self.driven + float(steps[:last].sum()), self.driven + float(steps.sum())
-        known, self._jump = self._jump is not None, _Jump(int(passed.stamp[last]), far, begin)
+        known, self._jump = self._jump is not None, _Jump(int(recent.stamp[last]), far, begin)
         if self._parameters.node.refine_poses and not known:
             self._node.get_logger().warning(str(self._jump))
 
