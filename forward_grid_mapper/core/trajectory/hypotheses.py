@@ -2,7 +2,8 @@
 
 Votes of walls know the heading modulo 90°. In a hall whose walls are out of reach it may slip over to the next one. If
 places seen before such a hall are recognised after it, it did not. If they are not, the drive is solved with the
-heading turned by a right angle from there on, one way and the other, and what foresees its readings best is right.
+heading turned by a right angle from there on, one way and the other, and what foresees its readings best is right. Of
+several such places, one after the other is asked: what follows the first one is right up to the second.
 """
 
 from __future__ import annotations
@@ -13,15 +14,19 @@ from dataclasses import dataclass, replace
 
 from .heading import Heading
 from .holding_out import LEAST_SIGMAS, blocks_of, foreseen, gain
-from .loops import Loop
+from .loops import APART, Loop
 from .passes import BLOCK
 from .pose_graph import Solution
+from .poses import Floats
 from .relocating import confirmed
 from .scans import Scans
 from .solving import Solver
 
 JUDGED_ON = 60
 """Blocks that solutions are compared on."""
+
+MOST_OPEN = 3
+"""Places that are asked: each takes two solutions more, and of many none is likely to be right."""
 
 
 @dataclass(frozen=True)
@@ -30,7 +35,9 @@ class Solved:
 
     Attributes
     ----------
+    heading : Heading
     solver : Solver
+        Of this heading.
     along : Solution
         By straight walls alone.
     solution : Solution
@@ -40,6 +47,7 @@ class Solved:
         Probability that no right angle was lost.
     """
 
+    heading: Heading
     solver: Solver
     along: Solution
     solution: Solution
@@ -61,37 +69,75 @@ def solved(
     solver_of : callable
         Makes the solver of another heading.
     """
-    first = _matched(scans, heading, solver, along)
-    open_doubts = [node for node, _ in _unconfirmed(scans, heading, first)]
-    # with two of them it would take many solutions, and none is likely to be right
-    if len(open_doubts) != 1:
-        return first
+    best = _matched(scans, heading, solver, along)
+    nodes = _open(scans, best)
+    if not 0 < len(nodes) <= MOST_OPEN:
+        return best
     blocks = blocks_of(len(scans.windows), BLOCK, JUDGED_ON)
-    best, seen = first, foreseen(scans, first.solution.nodes, blocks)
-    for angle in (math.pi / 2, -math.pi / 2):
-        other = heading.turned(open_doubts[0], angle)
-        solver = solver_of(other)
-        tried = _matched(scans, other, solver, solver.along_walls())
-        if not confirmed(scans, tried.solution.nodes, tried.loops, open_doubts[0]):
+    seen = foreseen(scans, best.solution.nodes, blocks)
+    for node in nodes:
+        # it may be known by now, since an earlier one is
+        if node not in _open(scans, best):
             continue
-        now = foreseen(scans, tried.solution.nodes, blocks)
-        if gain(seen, now).sigmas >= LEAST_SIGMAS:
-            best, seen = tried, now
+        tried, values = [best], [seen]
+        for angle in (math.pi / 2, -math.pi / 2):
+            other = best.heading.turned(node, angle)
+            solver = solver_of(other)
+            tried.append(_matched(scans, other, solver, solver.along_walls()))
+            values.append(foreseen(scans, tried[-1].solution.nodes, blocks))
+        right, told = _best(scans, tried, values, node)
+        best, seen = tried[right], values[right]
+        if told:
+            best = _known(best, node)
     return best
+
+
+def _best(scans: Scans, tried: list[Solved], values: list[Floats], node: int) -> tuple[int, bool]:
+    """Return which solution is right, and whether that it foresees readings better than the others tells so by itself.
+
+    Without that, the first one is, unless one that foresees readings better has what was before the node recognised.
+    """
+    for k, now in enumerate(values):
+        if all(gain(other, now).sigmas >= LEAST_SIGMAS for j, other in enumerate(values) if j != k):
+            return k, not _is_confirmed(scans, tried[k], node)
+    right = 0
+    for k in range(1, len(tried)):
+        if _is_confirmed(scans, tried[k], node) and gain(values[right], values[k]).sigmas >= LEAST_SIGMAS:
+            right = k
+    return right, False
+
+
+def _known(found: Solved, node: int) -> Solved:
+    """Return what was found, with no doubt at a node."""
+    probability = dict(found.heading.doubts)[node]
+    heading = replace(
+        found.heading,
+        certainty=found.heading.certainty + probability,
+        doubts=tuple(doubt for doubt in found.heading.doubts if doubt[0] != node),
+    )
+    return replace(found, heading=heading, certainty=found.certainty + probability)
+
+
+def _is_confirmed(scans: Scans, found: Solved, node: int) -> bool:
+    return confirmed(scans, found.solution.nodes, found.loops, node)
 
 
 def _matched(scans: Scans, heading: Heading, solver: Solver, along: Solution) -> Solved:
     solution, loops = solver.with_matches(along)
-    found = Solved(solver, along, solution, loops, heading.certainty)
+    found = Solved(heading, solver, along, solution, loops, heading.certainty)
     # what is confirmed was no loss
     not_lost = [
-        probability
-        for node, probability in (*heading.doubts, *heading.slight)
-        if confirmed(scans, solution.nodes, loops, node)
+        probability for node, probability in (*heading.doubts, *heading.slight) if _is_confirmed(scans, found, node)
     ]
     return replace(found, certainty=heading.certainty + sum(not_lost))
 
 
-def _unconfirmed(scans: Scans, heading: Heading, found: Solved) -> list[tuple[int, float]]:
-    nodes = found.solution.nodes
-    return [doubt for doubt in heading.doubts if not confirmed(scans, nodes, found.loops, doubt[0])]
+def _open(scans: Scans, found: Solved) -> list[int]:
+    """Return the nodes at which a right angle may have been lost, as far as the drive can tell, in its order."""
+    progress = scans.windows.node_progress
+    return [
+        node
+        for node, _ in found.heading.doubts
+        # before the first metres there is nothing to recognise, and hardly anything to turn
+        if progress[node] - progress[0] >= APART and not _is_confirmed(scans, found, node)
+    ]

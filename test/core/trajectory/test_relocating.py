@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from exact_tour import Tour, quietly, tour_with
 
-from forward_grid_mapper.core.trajectory import solving
+from forward_grid_mapper.core.trajectory import hypotheses, solving
 from forward_grid_mapper.core.trajectory.heading import DOUBTFUL, Heading, doubts, slight
-from forward_grid_mapper.core.trajectory.hypotheses import solved
-from forward_grid_mapper.core.trajectory.loops import LENGTH, Loop
+from forward_grid_mapper.core.trajectory.holding_out import Gain
+from forward_grid_mapper.core.trajectory.hypotheses import MOST_OPEN, solved
+from forward_grid_mapper.core.trajectory.loops import APART, LENGTH, Loop
 from forward_grid_mapper.core.trajectory.matching import Match
 from forward_grid_mapper.core.trajectory.passes import Found, ahead
 from forward_grid_mapper.core.trajectory.pose_graph import solution_at
@@ -175,10 +177,12 @@ def test_a_right_angle_that_was_lost_is_found_again(there_and_back, lost) -> Non
 
     # what is slight is known as well where places were recognised, and stays at the end of the drive
     little = (node, 0.02), (len(windows) - 2, 0.03)
-    doubtful = replace(heading.turned(node, lost * math.pi / 2), certainty=0.55, doubts=((node, 0.4),), slight=little)
+    # before the first metres nothing was seen: what lies there is in doubt for good, and in the way of nothing
+    open_doubts = (1, 0.03), (node, 0.4)
+    doubtful = replace(heading.turned(node, lost * math.pi / 2), certainty=0.52, doubts=open_doubts, slight=little)
     solver = solver_of(doubtful)
     found = solved(scans, doubtful, solver, solver.along_walls(), solver_of)
-    assert found.certainty == pytest.approx(0.97)
+    assert found.certainty == pytest.approx(0.94)
     off = relative(found.solution.nodes[0], found.solution.nodes) - relative(true[0], true)
     assert np.hypot(off[:, 0], off[:, 1]).max() < 0.3
     assert (found.solver is solver) == (lost == 0)
@@ -194,9 +198,60 @@ def test_without_a_revisit_a_doubt_stays(there_and_back) -> None:
         return solvers[-1]
 
     last = len(windows) - 2
-    doubtful = replace(heading, certainty=0.6, doubts=((last, 0.25), (last - 1, 0.15)))
+    doubtful = replace(heading, certainty=0.6, doubts=tuple((last - k, 0.1) for k in range(MOST_OPEN + 1)))
     first = solver_of(doubtful)
     found = solved(scans, doubtful, first, first.along_walls(), solver_of)
     assert found.certainty == pytest.approx(0.6)
-    # two doubts would take many solutions
+    # so many would take many solutions
     assert solvers == [first]
+
+
+@pytest.mark.parametrize('recognises', [False, True])
+@pytest.mark.parametrize('lost', [[], [30], [50], [30, 50], [20, 30, 50]])
+def test_right_angles_that_were_lost_are_asked_one_after_the_other(
+    there_and_back, monkeypatch, lost, recognises
+) -> None:
+    """With solutions that are right up to the first right angle that is lost."""
+    _, windows, scans, right = there_and_back
+    asked_at = 20, 30, 50
+    assert windows.node_progress[asked_at[0]] > APART
+    solutions: list[Heading] = []
+
+    def first_lost(heading: Heading) -> float:
+        turns = np.round((heading.correction - right.correction) / (math.pi / 2))
+        before = [int(np.searchsorted(right.at, node)) - 1 for node in asked_at]
+        return min((node for node, k in zip(asked_at, before, strict=True) if turns[k] != turns[k + 1]), default=99.0)
+
+    def matched(scans, heading, solver, along) -> hypotheses.Solved:
+        solutions.append(heading)
+        solution = solution_at(np.full((1, 3), first_lost(heading)), 4)
+        return hypotheses.Solved(heading, solver, solution, solution, [], heading.certainty)
+
+    monkeypatch.setattr(hypotheses, '_matched', matched)
+    monkeypatch.setattr(hypotheses, 'confirmed', lambda scans, nodes, loops, node: recognises and nodes[0, 0] > node)
+    monkeypatch.setattr(hypotheses, 'foreseen', lambda scans, nodes, blocks: nodes[0, :1])
+    monkeypatch.setattr(hypotheses, 'gain', lambda before, after: Gain(float(after[0] - before[0]), 1.0))
+    heading = replace(right, certainty=0.7, doubts=tuple((node, 0.1) for node in asked_at))
+    for node in lost:
+        heading = heading.turned(node, math.pi / 2)
+    solver = SimpleNamespace(along_walls=lambda: None)
+    found = solved(scans, heading, solver, None, lambda other: solver)
+    assert found.heading.correction == pytest.approx(right.correction)
+    # where nothing is recognised all are asked, and known by what foresees readings better
+    assert len(solutions) == 1 + 2 * (len(lost) if recognises else len(asked_at))
+    assert recognises or found.certainty == pytest.approx(1.0)
+
+
+def test_a_doubt_stays_where_no_solution_foresees_readings_better(there_and_back, monkeypatch) -> None:
+    _, _, scans, right = there_and_back
+
+    def matched(scans, heading, solver, along) -> hypotheses.Solved:
+        solution = solution_at(np.zeros((1, 3)), 4)
+        return hypotheses.Solved(heading, solver, solution, solution, [], heading.certainty)
+
+    monkeypatch.setattr(hypotheses, '_matched', matched)
+    monkeypatch.setattr(hypotheses, 'confirmed', lambda scans, nodes, loops, node: False)
+    monkeypatch.setattr(hypotheses, 'foreseen', lambda scans, nodes, blocks: np.zeros(9))
+    heading, solver = replace(right, certainty=0.7, doubts=((30, 0.3),)), SimpleNamespace(along_walls=lambda: None)
+    found = solved(scans, heading, solver, None, lambda other: solver)
+    assert found.heading is heading and found.certainty == 0.7
