@@ -20,7 +20,7 @@ from .core.messages.extrinsics import Mount
 from .core.messages.message_types import Pose2, RangeMessage
 from .core.messages.mounts import FARTHEST, TURN
 from .core.messages.pose_association import PoseAssociator
-from .core.messages.rep117 import ODOMETRY_REASONS, REASONS, rejection_warnings
+from .core.messages.rep117 import ODOMETRY_REASONS, REASONS, rejection_warnings, sensor_rejections
 from .files.pose_files import poses_from_csv, poses_from_tum
 from .files.quality_warning import data_warnings
 from .files.results import write_results
@@ -216,6 +216,7 @@ def make_maps(
         *_told_of_poses(associator),
         *associator.limits.warnings(),
         *rejection_warnings(associator.rejected, len(values), 'ranges'),
+        *sensor_rejections(associator.rejected_by_frame, associator.buffer.counts()),
         *thinning_note(associator),
     ]
     judged = tuple(data_warnings(maps, {'extrinsics': mounted}))

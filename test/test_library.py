@@ -306,6 +306,17 @@ def test_what_an_inclined_sensor_measures_is_that_of_a_level_one_in_the_plane() 
     assert np.array_equal(found.maps.ml, level.maps.ml)
 
 
+def test_one_dead_sensor_of_many_is_named() -> None:
+    arrays = given()
+    name = arrays['sensor_of'][0]
+    ranges = [0.0 if sensor == name else z for sensor, z in zip(arrays['sensor_of'], arrays['ranges'], strict=True)]
+    found = make_maps(**{**arrays, 'ranges': ranges})
+    assert len(found.maps.readings) > 0.8 * found.received
+    assert [
+        text for text in found.warnings if f'nearly all readings of {name} were rejected as below_min_range' in text
+    ]
+
+
 def test_steep_sensors_are_rejected_in_words() -> None:
     arrays = given()
     name, sensor = next(iter(arrays['sensors'].items()))

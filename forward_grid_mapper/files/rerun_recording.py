@@ -6,6 +6,7 @@ file is wanted.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -55,6 +56,10 @@ DOTS = {'hit': -1.2}
 """Radii of dots in pixels, negative as Rerun has them; echoes of walls must not hide them."""
 
 ODOMETRY, CONE = '#cc79a7', (0, 158, 115)
+
+FAR = 10_000.0
+"""Metres from the origin from where on a recording has a corner of the map as its own: Rerun's numbers are of single
+precision, which is half a metre in UTM coordinates."""
 
 Points = NDArray[np.float32]
 
@@ -114,16 +119,26 @@ def write_rerun(
     stream = recording.binary_stream()
     recording.send_recording_name(title)
     readings, causes = _bounded(maps)
+    x, y = _origin(maps.grid)
+    if x or y:
+        report = f'Places are seen from x = {x:.0f} m, y = {y:.0f} m.\n\n{report}'
     _log_maps(recording, maps)
-    _log_paths(recording, path_xy, odometry_xy)
-    entities = _log_readings(recording, readings, causes)
+    _log_paths(recording, path_xy - (x, y), odometry_xy - (x, y))
+    entities = _log_readings(recording, replace(readings, x=readings.x - x, y=readings.y - y), causes)
     recording.log('report', rr.TextDocument(report), static=True)
     everywhere = np.concatenate([path_xy.reshape(-1, 2), odometry_xy])
-    recording.send_blueprint(_blueprint(view_of(maps, everywhere[np.isfinite(everywhere).all(axis=1)]), entities))
+    left, right, bottom, top = view_of(maps, everywhere[np.isfinite(everywhere).all(axis=1)])
+    recording.send_blueprint(_blueprint((left - x, right - x, bottom - y, top - y), entities))
     data = stream.read()
     recording.disconnect()
     with output_errors(path):
         path.write_bytes(data or b'')
+
+
+def _origin(grid: Grid) -> tuple[float, float]:
+    """Return from where places are seen, in whole metres: (0, 0), if the map is not `FAR` from there."""
+    x, y = grid.origin
+    return (float(round(x)), float(round(y))) if max(abs(x), abs(y)) > FAR else (0.0, 0.0)
 
 
 def _bounded(maps: MapSet) -> tuple[Readings, NDArray[np.uint8]]:
@@ -157,7 +172,7 @@ def _grid_map(grid: Grid, values: NDArray[Any]) -> Any:
         data=occupancy_values(values)[::-1].tobytes(),
         format=rr.components.ImageFormat(width=grid.width, height=grid.height, color_model='L', channel_datatype='U8'),
         cell_size=grid.resolution,
-        translation=[*grid.origin, 0.0],
+        translation=[*np.subtract(grid.origin, _origin(grid)), 0.0],
         colormap=rr.components.Colormap.RvizMap,
     )
 

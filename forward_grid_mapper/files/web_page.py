@@ -216,13 +216,14 @@ def _shares(probability: NDArray[np.float32]) -> NDArray[np.uint16]:
     return np.where(np.isnan(probability), UNKNOWN_SHARE, steps).astype(np.uint16)
 
 
-def _thinned(xy: NDArray[np.float64]) -> NDArray[np.float32]:
+def _thinned(xy: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return a path of some `MOST_POINTS` points, the last one among them; rows of NaN, which part drives, stay."""
     which = np.linspace(0, len(xy) - 1, min(len(xy), MOST_POINTS)).astype(np.int64)
     parted = np.flatnonzero(~np.isfinite(xy).all(axis=1))
     ends = np.concatenate([parted - 1, parted, parted + 1])
     which = np.union1d(which, ends[(ends >= 0) & (ends < len(xy))])
-    return xy[which].astype(np.float32)
+    # single precision is half a metre in UTM coordinates
+    return xy[which]
 
 
 def _grid(grid: Grid) -> dict[str, float]:

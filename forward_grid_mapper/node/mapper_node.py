@@ -20,7 +20,7 @@ from ..core.maps.log_odds_map import LogOddsMap
 from ..core.messages.message_types import NANOSECONDS
 from ..core.messages.pose_association import PoseAssociator
 from ..core.messages.reading_buffer import bounded
-from ..core.messages.rep117 import rejection_warnings
+from ..core.messages.rep117 import rejection_warnings, sensor_rejections
 from ..files.output_folder import unwritable
 from . import ros_parameters
 from .background import Inbox, Worker
@@ -403,7 +403,10 @@ class MapperNode(ManagedNode):
         """Return what a report says of the node."""
         associator, node, name = self.associator, self.parameters.node, self.get_fully_qualified_name()
         self._feed()
-        rejections = rejection_warnings(associator.rejected, associator.received)
+        rejections = [
+            *rejection_warnings(associator.rejected, associator.received),
+            *sensor_rejections(associator.rejected_by_frame, associator.buffer.counts()),
+        ]
         source = {
             'node': name,
             'range_topics': list(self.em.range_topics),

@@ -10,7 +10,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from ..core.messages.extrinsics import STEEP
 from ..core.messages.mounts import far_mounts
 from ..core.messages.pose_association import MOST_FRAMES, PoseAssociator
-from ..core.messages.rep117 import REASONS
+from ..core.messages.rep117 import OF_POSES, REASONS, sensor_rejections
 from . import diagnostics
 from .background import Worker
 from .em_service import EmService
@@ -76,7 +76,11 @@ class Reporter:
             lambda kind: self._surroundings.absent(kind, topics[kind]),
         )
         faults = [*self._intake.faults(), *self._surroundings.faults(), *self._nameless()]
-        limits = self._associator.limits.warnings()
+        counts = self._associator.buffer.counts()
+        limits = [
+            *self._associator.limits.warnings(),
+            *sensor_rejections(self._associator.rejected_by_frame, counts, OF_POSES),
+        ]
         # what is wrong with frames is told of where each is found out
         silent = statuses[0].message == no_map_frame or statuses[0].message.startswith(diagnostics.NO_POSE)
         bad = statuses[0].level != DiagnosticStatus.OK
@@ -84,7 +88,6 @@ class Reporter:
         self._verdicts.look([*([statuses[0].message] if bad and not silent else []), *limits], well)
         diagnostics.add_faults(statuses[0], [*faults, *limits, *self._em.wrong_input])
         statuses += [*self._journal.statuses(name), *self._trajectory.statuses(name)]
-        counts = self._associator.buffer.counts()
         statuses.append(self._em.sensors.status(name, counts, self._silent(counts)))
         statuses.append(self._background(name))
         self._out.publish(diagnostics.array(statuses, self._node.get_clock().now().to_msg()))

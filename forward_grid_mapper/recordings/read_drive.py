@@ -20,7 +20,7 @@ from ..core.messages.message_batch import batch_of
 from ..core.messages.message_types import NANOSECONDS, Pose2
 from ..core.messages.mounts import far_mounts
 from ..core.messages.pose_association import PoseAssociator
-from ..core.messages.rep117 import ODOMETRY_REASONS, REASONS, rejection_warnings
+from ..core.messages.rep117 import ODOMETRY_REASONS, REASONS, rejection_warnings, sensor_rejections
 from ..files.journal import drive_file
 from ..files.output_folder import readable
 from .drive import WHOLE, Drive, LogOddsMapOfAll, Part, Spans, length_of, thinning_note, to_and_fro_note
@@ -257,7 +257,8 @@ def _warnings(bag: Bag, associator: PoseAssociator, lookup: Extrinsics) -> list[
             f'{count} of {associator.odometry_received} odometry messages were rejected: {ODOMETRY_REASONS[reason]}'
         )
     told = {'unknown_extrinsics', STEEP} if lookup.steep else {'unknown_extrinsics'}
-    return warnings + rejection_warnings(associator.rejected, associator.received, known=told)
+    warnings += rejection_warnings(associator.rejected, associator.received, known=told)
+    return warnings + sensor_rejections(associator.rejected_by_frame, associator.buffer.counts(), told)
 
 
 def _base_frame(bag: Bag) -> str:

@@ -342,6 +342,12 @@ def test_some_of_the_range_topics(tmp_path: Path) -> None:
     assert_same_maps(tmp_path / 'chosen', tmp_path / 'only_maps')
 
 
+def test_a_sensor_that_sends_zero_is_named(tmp_path: Path) -> None:
+    dead = [m._replace(range=0.0) if m.frame_id == FRAMES[3] else m for m in tape().ranges]
+    report = mapped(write_tape(tmp_path / 'bag', tape()._replace(ranges=dead)), tmp_path / 'maps')
+    assert [w for w in report['warnings'] if w.startswith(f'nearly all readings of {FRAMES[3]} were rejected as')]
+
+
 def test_learning(tmp_path: Path, plain: Path) -> None:
     report = mapped(plain / 'bag', tmp_path / 'maps', '--learn', 1)
     before = report_in(plain / 'maps')['parameters']

@@ -32,16 +32,16 @@ def drive() -> MapSet:
     return Mapper(Parameters()).run(corridor_drive(0).readings)
 
 
-def written(folder: Path, maps: MapSet, **options: Any) -> dict[str, dict[str, list[Any]]]:
+def written(folder: Path, maps: MapSet, path: Any = PATH) -> dict[str, dict[str, list[Any]]]:
     """What is in the recording of these maps: columns by entity."""
     rerun = pytest.importorskip('rerun', reason='the extra rerun is not installed')
     from rerun.chunk import RrdReader
 
     rerun.set_strict_mode(True)
-    path = folder / 'drive.rrd'
-    write_rerun(path, maps, 'the report\n', 'a drive', PATH, **options)
+    file = folder / 'drive.rrd'
+    write_rerun(file, maps, 'the report\n', 'a drive', path)
     found: dict[str, dict[str, list[Any]]] = {}
-    for chunk in RrdReader(path).store().stream().to_chunks():
+    for chunk in RrdReader(file).store().stream().to_chunks():
         batch = chunk.to_record_batch()
         columns = found.setdefault(chunk.entity_path, {})
         for name in batch.schema.names:
@@ -102,6 +102,21 @@ def test_it_holds_the_readings_by_sensor_and_cause(tmp_path: Path) -> None:
                     np.stack([these.x + these.z * np.cos(these.yaw), these.y + these.z * np.sin(these.yaw)], 1),
                     atol=1e-4,
                 )
+
+
+def test_maps_far_from_the_origin_are_as_exact(tmp_path: Path) -> None:
+    far, near = np.array([500_000.0, 5_200_000.0]), corridor_drive(0).readings
+    maps = Mapper(Parameters()).run(dataclasses.replace(near, x=near.x + far[0], y=near.y + far[1]))
+    found, home = written(tmp_path, maps, path=PATH + far), np.round(maps.grid.origin)
+    assert found['/report'] and f'x = {home[0]:.0f} m, y = {home[1]:.0f} m' in column(found['/report'], 'text')[0][0]
+    origin = column(found['/map/standard'], 'translation')[0][0][:2]
+    np.testing.assert_allclose(origin + home, maps.grid.origin, atol=1e-4)
+    path = np.array(column(found['/robot/path'], 'strips')[0][0])[:, :2]
+    np.testing.assert_allclose(path + home, PATH[:2] + far, atol=1e-4)
+    name = maps.readings.sensor_names[0]
+    mine = maps.readings.select(maps.readings.sensor == 0)
+    places = [strip[0][0][:2] for strip in column(found[f'/sonar/{name}'], 'strips')]
+    np.testing.assert_allclose(places + home, np.stack([mine.x, mine.y], 1), atol=1e-4)
 
 
 def test_it_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

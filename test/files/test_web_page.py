@@ -343,6 +343,13 @@ def test_each_drive_has_a_colour_and_the_first_ones_a_name(tmp_path: Path, count
     assert legend == shown + ([f'and {count - len(shown)} more'] if count > len(shown) else [])
 
 
+def test_a_path_far_from_the_origin_is_as_exact(tmp_path: Path) -> None:
+    xy = np.linspace([500_000.0, 5_200_000.0], [500_009.0, 5_200_003.0], 100)
+    maps = made_maps()
+    write_page(tmp_path / 'report.html', maps, report_data(maps, {}), 'far', xy)
+    assert np.array_equal(array(numbers(tmp_path / 'report.html'), 'path').reshape(-1, 2), xy)
+
+
 def test_a_long_path_is_thinned(tmp_path: Path) -> None:
     xy = np.stack([np.linspace(0, 9, 50_000), np.zeros(50_000)], 1)
     maps = made_maps()

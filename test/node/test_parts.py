@@ -333,6 +333,18 @@ def test_the_report_warns_where_many_readings_were_rejected(inside: Callable[...
     assert any(each.startswith('10 of 30 readings were rejected as below_min_range') for each in warnings)
 
 
+def test_a_sensor_whose_readings_are_rejected_is_named_though_they_are_few(inside: Callable[..., Inside]) -> None:
+    robot = inside().start()
+    robot.drive(0, 300)
+    for k in range(40):
+        robot.range(100.0 + 0.05 * k, value=0.0, frame='left')
+    told = 'nearly all readings of left were rejected as below_min_range: '
+    assert told in robot.status('readings')['message']
+    saved = robot.call(robot.node.saver.save_maps)[1]
+    warnings = json.loads((Path(saved.split(', ')[0]).parent / 'report.json').read_text())['warnings']
+    assert any(each.startswith(told) for each in warnings)
+
+
 class Gate:
     """Holds up a function until it is opened."""
 

@@ -31,7 +31,7 @@ AT_ONCE = 0.3
 """Part of a sensor's readings that share their stamp with another one of a different range."""
 
 SHARED = 100
-"""Readings of one frame from which on its ranges are searched for a period; few may have one at random."""
+"""Pairs of readings of one frame from which on its ranges are searched for a period; few may have one at random."""
 
 LONGEST_PERIOD = 32
 """Sensors that may have one frame; more than any ring of sonars has."""
@@ -42,6 +42,10 @@ the upper quartiles, since some readings are random."""
 
 DIFFERS = 0.3
 """Metres by which the ranges of neighbouring sensors differ in a quarter of the cases; less may be noise."""
+
+AS_BEFORE = 0.05
+"""Radians by which a sensor may turn from one reading to the next for a change of range to be told from what it looks
+at: one that a servo swings, or on a robot that spins, sees the same things in turn."""
 
 STILL = 0.01, 0.01
 """Metres and radians within which a robot stands still."""
@@ -165,11 +169,11 @@ def _shared_frame(readings: Readings) -> str:
         z = mine.z
         follows = mine.stamp[1:] == mine.stamp[:-1]
         at_once = np.count_nonzero(follows & (np.abs(np.diff(z)) > DIFFERS)) > AT_ONCE * len(z)
-        steps = np.abs(np.diff(z))
-        neighbours = float(np.quantile(steps, 0.75))
+        steps = np.abs(np.diff(z))[_turned(mine) <= AS_BEFORE]
+        neighbours = float(np.quantile(steps, 0.75)) if len(steps) else 0.0
         periods = range(3, min(LONGEST_PERIOD, len(z) // 10) + 1)
         rounds = [float(np.quantile(np.abs(z[k:] - z[:-k]), 0.75)) for k in periods]
-        takes_turns = len(z) >= SHARED and neighbours > DIFFERS and min(rounds) < REPEATS * neighbours
+        takes_turns = len(steps) >= SHARED and neighbours > DIFFERS and min(rounds) < REPEATS * neighbours
         if at_once or takes_turns:
             suspects.append(name)
     if not suspects:
@@ -295,9 +299,14 @@ def _ceiling(readings: Readings) -> str:
 
 def _moving(mine: Readings) -> NDArray[np.bool_]:
     """Return which readings of a sensor are from another place, or in another direction, than the one before."""
-    turned = np.abs(np.remainder(np.diff(mine.yaw) + math.pi, 2 * math.pi) - math.pi)
-    moved = (np.hypot(np.diff(mine.x), np.diff(mine.y)) > STILL[0]) | (turned > STILL[1])
+    moved = (np.hypot(np.diff(mine.x), np.diff(mine.y)) > STILL[0]) | (_turned(mine) > STILL[1])
     return np.append(False, moved)
+
+
+def _turned(mine: Readings) -> Floats:
+    """Return by how much a sensor turned from each reading to the next, radians, shape (N - 1,)."""
+    turned: Floats = np.abs(np.remainder(np.diff(mine.yaw) + math.pi, 2 * math.pi) - math.pi)
+    return turned
 
 
 def _field_of_view(readings: Readings) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Container, Mapping
 from typing import NamedTuple
 
@@ -42,7 +43,8 @@ REASONS = {
     'after_odometry': 'the recording ended before odometry reached the stamp',
     'no_odometry': 'odometry, or its transform to map_frame, did not reach the stamp within pose_timeout: has it '
     'stopped, or do the clocks of the drivers differ?',
-    'pose_gap': 'odometry has a gap longer than max_pose_gap here',
+    'pose_gap': 'odometry has a gap longer than max_pose_gap here; where its messages come so seldom all the time, set '
+    'max_pose_gap to some more than is between two of them',
     'pose_jump': 'odometry jumps here, faster than anything drives (are its poses in millimetres? They are in metres)',
     'from_the_future': 'odometry went on for pose_timeout and is still before the stamp; is the clock of the sensor '
     'ahead?',
@@ -58,6 +60,29 @@ REASONS = {
 
 MANY = 0.2
 """Part of the readings whose rejection for one reason is worth a warning."""
+
+
+NEARLY_ALL, ENOUGH = 0.9, 30
+"""Part of a sensor's readings whose rejection for one reason is worth a warning however few they are of all; and
+readings from which on."""
+
+
+OF_POSES = {
+    'unknown_extrinsics',
+    'late_transform',
+    'steep_sensor',
+    'before_odometry',
+    'zero_stamp',
+    'after_odometry',
+    'no_odometry',
+    'pose_gap',
+    'pose_jump',
+    'from_the_future',
+    'time_jump',
+    'too_many_waiting',
+    'paused',
+}
+"""Reasons that are none of the message by itself; a node that runs tells of them in other places."""
 
 
 ODOMETRY_REASONS = {
@@ -140,6 +165,39 @@ def rejection_warnings(
         f'{count} of {received} {what} were rejected as {reason}: {REASONS[reason]}'
         for reason, count in rejected.items()
         if count > MANY * received and reason not in known
+    ]
+
+
+def sensor_rejections(
+    by_frame: Mapping[str, Mapping[str, int]], accepted: Mapping[str, tuple[int, int]], known: Container[str] = ()
+) -> list[str]:
+    """Return a warning for each reason, other than known ones, that costs some sensors nearly all of their readings.
+
+    Nothing is said of reasons for which many of all readings are rejected, which `rejection_warnings` names, nor where
+    no sensor is well.
+
+    Parameters
+    ----------
+    by_frame : mapping of str to mapping of str to int
+        How many readings of each frame were rejected, by reason.
+    accepted : mapping of str to (int, int)
+        As `ReadingBuffer.counts` returns it.
+    """
+    rejected: Counter[str] = sum(map(Counter, by_frame.values()), Counter())
+    many = MANY * (rejected.total() + sum(count for count, _ in accepted.values()))
+    lost: dict[str, list[str]] = {}
+    for frame, counts in by_frame.items():
+        received = sum(counts.values()) + accepted.get(frame, (0, 0))[0]
+        reason = max(counts, key=lambda each: counts[each])
+        told = not frame or reason in known or rejected[reason] > many
+        if counts[reason] >= max(NEARLY_ALL * received, ENOUGH) and not told:
+            lost.setdefault(reason, []).append(frame)
+    if not set(accepted).difference(*lost.values()):
+        return []
+    return [
+        f'nearly all readings of {", ".join(sorted(frames)[:8])}{f" and {len(frames) - 8} more" * (len(frames) > 8)} '
+        f'were rejected as {reason}: {REASONS[reason]}'
+        for reason, frames in lost.items()
     ]
 
 

@@ -34,6 +34,9 @@ USUAL, TIMES_USUAL, FEWEST_STEPS = 0.9, 2.0, 20
 """Quantile of the lengths and speeds of all steps that is usual; how often as long, or as fast, a step may be; and
 steps from which on that is known."""
 
+FEW_STEPS = 5
+"""Steps from which on the median is usual: of so few the quantile may be a jump. Of fewer nothing is usual."""
+
 LONGEST_GAP, TIMES_GAP = 2.0, 4.0
 """Seconds between two poses, and how often the median of all, up to either of which no driver was started again."""
 
@@ -100,12 +103,17 @@ def _found(odometry: Odometry) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
     seconds, pose = np.diff(odometry.stamp) * 1e-9, odometry.pose
     far = np.hypot(*np.diff(pose[:, :2], axis=0).T)
     moved = (far > 0.0) & (seconds > 0.0)
-    longest, fastest = LONGEST_STEP, 0.0
-    if np.count_nonzero(moved) >= FEWEST_STEPS:
-        longest = max(longest, TIMES_USUAL * float(np.quantile(far[moved], USUAL)))
-        fastest = min(TIMES_USUAL * float(np.quantile(far[moved] / seconds[moved], USUAL)), FASTEST)
+    longest, fastest, count = LONGEST_STEP, 0.0, np.count_nonzero(moved)
+    apart = float(np.median(seconds)) if len(seconds) else 0.0
+    if count >= FEW_STEPS:
+        usual = USUAL if count >= FEWEST_STEPS else 0.5
+        longest = max(longest, TIMES_USUAL * float(np.quantile(far[moved], usual)))
+        fastest = min(TIMES_USUAL * float(np.quantile(far[moved] / seconds[moved], usual)), FASTEST)
+    elif FASTEST * apart > LONGEST_STEP:
+        # a robot may drive so far from one message to the next
+        fastest = FASTEST
     found = np.flatnonzero((far > longest) | _turned(np.diff(pose[:, 2]), seconds))
-    gap = max(LONGEST_GAP, TIMES_GAP * float(np.median(seconds))) if len(seconds) else 0.0
+    gap = max(LONGEST_GAP, TIMES_GAP * apart)
     driven = (far <= fastest * seconds) & (seconds <= gap)
     return found + 1, ((far <= longest) | driven)[found]
 

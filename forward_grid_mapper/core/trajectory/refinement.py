@@ -343,6 +343,10 @@ def _lost(drive: _Drive, certainty: float) -> _Attempt:
 
 
 def _said(better: Gain) -> str:
+    if not np.isfinite(better.error):
+        return (
+            'there are too few readings on maps of others to tell whether they are predicted better than with odometry'
+        )
     return f'readings are predicted {better.mean:+.3f} ± {better.error:.3f} nats a reading better than with odometry'
 
 

@@ -36,6 +36,12 @@ def drive() -> Messages:
     return Messages(dict(recording.extrinsics), list(recording.odometry), list(recording.ranges))
 
 
+def in_a_room(x: float, y: float, yaw: float) -> float:
+    """The range in a room of 8 by 6 metres."""
+    c, s = math.cos(yaw), math.sin(yaw)
+    return min((math.copysign(4, c) - x) / (c or 1e-9), (math.copysign(3, s) - y) / (s or 1e-9))
+
+
 @lru_cache(maxsize=1)
 def circling() -> Messages:
     """Round and round in a room of 8 by 6 metres, for a minute."""
@@ -48,9 +54,7 @@ def circling() -> Messages:
         pose = Pose2(1.5 * math.cos(angle), 1.5 * math.sin(angle), angle + math.pi / 2)
         odometry.append(OdometryMessage(stamp, 'odom', 'base_link', pose))
         for frame, yaw in zip(extrinsics, yaws, strict=True):
-            c, s = math.cos(pose.yaw + yaw), math.sin(pose.yaw + yaw)
-            z = min((math.copysign(4, c) - pose.x) / (c or 1e-9), (math.copysign(3, s) - pose.y) / (s or 1e-9))
-            z += rng.normal(0, 0.02)
+            z = in_a_room(pose.x, pose.y, pose.yaw + yaw) + rng.normal(0, 0.02)
             ranges.append(RangeMessage(stamp, frame, math.inf if z > 5 else z, 0.1, 5.0, 0.26))
     return Messages(extrinsics, odometry, ranges)
 
@@ -277,6 +281,20 @@ def test_a_robot_that_stands_while_people_walk_is_no_fault() -> None:
 
 def test_no_alarm_where_a_robot_circles() -> None:
     assert told(circling()) == []
+
+
+@pytest.mark.parametrize('swings', [False, True])
+@pytest.mark.parametrize('steps', [5, 10, 16, 25, 32])
+def test_a_sensor_that_turns_sees_the_same_again_and_again(steps: int, swings: bool) -> None:
+    """On a robot that turns on the spot all the time, or that looks to the left and to the right as a servo does."""
+    rng, odometry, ranges = np.random.default_rng(2), [], []
+    for k in range(600):
+        part = k % steps / steps
+        yaw = 2.0 * abs(2 * part - 1) if swings else math.remainder(math.tau * part, math.tau)
+        odometry.append(OdometryMessage(k * 100_000_000, 'odom', 'base_link', Pose2(2.5, 1.5, yaw)))
+        z = in_a_room(2.5, 1.5, yaw) + rng.normal(0, 0.02)
+        ranges.append(RangeMessage(k * 100_000_000, 'sonar', z, 0.1, 8.0, 0.26))
+    assert told(Messages({'sonar': Pose2(0.0, 0.0, 0.0)}, odometry, ranges)) == []
 
 
 def test_few_readings_say_nothing() -> None:

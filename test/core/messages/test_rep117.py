@@ -8,7 +8,16 @@ import pytest
 
 from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.messages.message_types import RangeMessage
-from forward_grid_mapper.core.messages.rep117 import LONGEST_NAME, NEAREST, Measurement, measure, rejection_warnings
+from forward_grid_mapper.core.messages.rep117 import (
+    LONGEST_NAME,
+    NEAREST,
+    OF_POSES,
+    REASONS,
+    Measurement,
+    measure,
+    rejection_warnings,
+    sensor_rejections,
+)
 
 PLAIN = RangeMessage(7, 'sonar', 1.0, 0.1, 4.0, 0.3)
 
@@ -29,6 +38,31 @@ def test_reasons_that_took_many_readings_are_worth_a_warning() -> None:
     rejected = {'below_min_range': 21, 'nan_range': 20, 'unknown_extrinsics': 50}
     (told,) = rejection_warnings(rejected, 100, 'ranges', known={'unknown_extrinsics'})
     assert told.startswith('21 of 100 ranges were rejected as below_min_range') and 'send +inf' in told
+
+
+def test_a_sensor_that_loses_nearly_all_readings_is_named_however_few_they_are() -> None:
+    fine = {f'sonar_{k}': (100, 20) for k in range(20)}
+    by_frame = {'left': {'too_near': 95, 'nan_range': 3}, 'sonar_3': {'too_near': 50}, 'right': {'nan_range': 29}}
+    (told,) = sensor_rejections(by_frame, {**fine, 'left': (2, 0)})
+    assert told.startswith('nearly all readings of left were rejected as too_near: ') and 'dead sensor' in told
+    assert sensor_rejections(by_frame, {**fine, 'left': (20, 0)}) == []
+    assert sensor_rejections(by_frame, fine, known={'too_near'}) == []
+    # a frame without a name is told of by its reason, and so is what costs many of all readings
+    assert sensor_rejections({'': {'empty_frame_id': 50}}, fine) == []
+    assert sensor_rejections({'left': {'too_near': 600}}, fine) == []
+    # what is wrong with all sensors is told by other warnings
+    assert sensor_rejections({'left': {'too_near': 95}}, {'left': (2, 0)}) == []
+    assert sensor_rejections({'left': {'too_near': 95}}, {}) == []
+
+
+def test_reasons_of_poses_are_reasons() -> None:
+    assert OF_POSES < set(REASONS)
+
+
+def test_many_such_sensors_are_not_all_named() -> None:
+    by_frame = {f'sonar_{k:02d}': {'bad_limits': 30} for k in range(12)}
+    (told,) = sensor_rejections(by_frame, {'left': (3000, 0)})
+    assert 'sonar_07 and 4 more were rejected as bad_limits' in told and 'sonar_08' not in told
 
 
 def test_what_a_plain_message_says() -> None:

@@ -124,9 +124,32 @@ def test_a_long_step_is_a_jump_if_this_robot_is_slower_or_odometry_was_silent(
     assert doubtful_steps(odometry).tolist() == ([50] if not jump and far > 1.0 else [])
 
 
-def test_of_few_poses_it_is_not_known_how_fast_the_robot_drives() -> None:
-    stamp = np.array([0, 1_000_000_000], np.int64)
-    assert jumps(Odometry.of(stamp, np.array([[0.0, 0.0, 0.0], [1.1, 0.0, 0.0]]))).tolist() == [1]
+@pytest.mark.parametrize(('seconds', 'jump'), [(0.1, True), (0.3, True), (0.4, False), (1.0, False)])
+def test_of_two_poses_a_long_step_is_driving_only_where_messages_are_far_apart(seconds: float, jump: bool) -> None:
+    stamp = np.array([0, round(seconds * 1e9)], np.int64)
+    odometry = Odometry.of(stamp, np.array([[0.0, 0.0, 0.0], [1.1, 0.0, 0.0]]))
+    assert jumps(odometry).tolist() == ([1] if jump else [])
+    assert doubtful_steps(odometry).tolist() == ([] if jump else [1])
+
+
+@pytest.mark.parametrize('count', [2, 5, 6, 12, 19, 30])
+def test_a_short_drive_with_a_message_a_second_has_no_jumps(count: int) -> None:
+    stamp, x = np.arange(count + 1) * 1_000_000_000, 1.2 * np.arange(count + 1)
+    assert not len(jumps(Odometry.of(stamp, np.stack([x, 0 * x, 0 * x], 1))))
+    # but those that it has
+    x[count // 2 + 1 :] += 5.0
+    assert jumps(Odometry.of(stamp, np.stack([x, 0 * x, 0 * x], 1))).tolist() == [count // 2 + 1]
+
+
+@pytest.mark.parametrize('moves', [0, 1, 4, 10])
+def test_a_robot_that_hardly_moved_may_have_odometry_that_jumps(moves: int) -> None:
+    # fifty messages a second of a robot that stands, but for some small steps
+    x = np.zeros(3000)
+    x[100 : 100 + moves] = 0.01
+    x = np.cumsum(x)
+    x[2000:] += 1.5
+    odometry = Odometry.of(np.arange(3000) * 20_000_000, np.stack([x, 0 * x, 0 * x], 1))
+    assert jumps(odometry).tolist() == [2000]
 
 
 def with_few_poses(readings: Readings, odometry: Odometry, metres: float) -> tuple[Readings, Odometry]:
