@@ -214,7 +214,7 @@ def with_doubtful(
     for at in doubtful:
         begin = max((k for k in out if k < at), default=0)
         end = min((k for k in out if k > at), default=len(odometry.stamp))
-        begin = max(begin, int(np.searchsorted(travel, travel[at] - LOOKED_BACK)))
+        begin = max(begin, int(np.searchsorted(travel, travel[at - 1] - LOOKED_BACK)))
         end = min(end, int(np.searchsorted(travel, travel[at] + OWN)))
         before, after = _piece(odometry, begin, at), _piece(odometry, at, end)
         part = Part(_read_along(readings, after), after, after, False)

@@ -184,6 +184,16 @@ def test_a_drive_with_few_poses_is_refined(exact: Recording, bent: tuple[Reading
     assert off(exact, found.trajectory) < 0.2
 
 
+def test_a_doubtful_step_may_be_longer_than_the_way_that_is_looked_back(bent: tuple[Readings, Odometry]) -> None:
+    readings, _ = bent
+    pose = np.array([[0.0, 0.0, 0.0], [jumping.LOOKED_BACK + 5.0, 0.0, 0.0]])
+    odometry = Odometry.of(readings.stamp.min() + np.array([0, 10_000_000_000]), pose)
+    jumped_to = jumps(odometry)
+    assert doubtful_steps(odometry).tolist() == [1]
+    found = jumping.with_doubtful(readings, odometry, jumped_to, Parameters(), np.zeros(1, np.uint8))
+    assert found.tolist() == jumped_to.tolist() == []
+
+
 def test_driving_is_no_jump(bent: tuple[Readings, Odometry]) -> None:
     _, odometry = bent
     assert not len(jumps(odometry))
