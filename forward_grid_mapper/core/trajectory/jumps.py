@@ -37,6 +37,9 @@ steps from which on that is known."""
 FEW_STEPS = 5
 """Steps from which on the median is usual: of so few the quantile may be a jump. Of fewer nothing is usual."""
 
+STANDING = 0.01
+"""Metres a second up to which a robot stands: poses of a filter tremble meanwhile, and say nothing of how it drives."""
+
 LONGEST_GAP, TIMES_GAP = 2.0, 4.0
 """Seconds between two poses, and how often the median of all, up to either of which no driver was started again."""
 
@@ -102,7 +105,7 @@ def _found(odometry: Odometry) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
     """Return the numbers of the poses that odometry may have jumped to, and of which of them that is doubtful."""
     seconds, pose = np.diff(odometry.stamp) * 1e-9, odometry.pose
     far = np.hypot(*np.diff(pose[:, :2], axis=0).T)
-    moved = (far > 0.0) & (seconds > 0.0)
+    moved = (far > STANDING * seconds) & (seconds > 0.0)
     longest, fastest, count = LONGEST_STEP, 0.0, np.count_nonzero(moved)
     apart = float(np.median(seconds)) if len(seconds) else 0.0
     if count >= FEW_STEPS:

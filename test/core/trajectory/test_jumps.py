@@ -152,6 +152,18 @@ def test_a_robot_that_hardly_moved_may_have_odometry_that_jumps(moves: int) -> N
     assert jumps(odometry).tolist() == [2000]
 
 
+@pytest.mark.parametrize('tremble', [0.0, 1e-6, 1e-3])
+@pytest.mark.parametrize('driven', [1, 4, 60])
+def test_a_robot_that_stood_for_long_may_drive_with_a_message_a_second(driven: int, tremble: float) -> None:
+    x = np.r_[np.zeros(600), 1.2 * np.arange(1, driven + 1)]
+    pose = np.stack([x, 0 * x, 0 * x], 1)
+    pose[:, :2] += np.random.default_rng(0).normal(0.0, tremble, (len(x), 2))
+    assert not len(jumps(Odometry.of(np.arange(len(x)) * 1_000_000_000, pose)))
+    # but odometry of it may jump
+    pose[600:, 0] += 5.0
+    assert jumps(Odometry.of(np.arange(len(x)) * 1_000_000_000, pose)).tolist() == [600]
+
+
 def with_few_poses(readings: Readings, odometry: Odometry, metres: float) -> tuple[Readings, Odometry]:
     """The same drive with odometry that comes only so often."""
     travel, stay = odometry.travel, [0]
