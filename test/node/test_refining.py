@@ -129,6 +129,29 @@ def test_a_jump_of_odometry_is_warned_of_until_a_run_has_looked_at_it(
     assert robot.status('trajectory')['level'] == OK
 
 
+def test_whether_odometry_with_few_messages_jumped_is_told_by_the_last_minute(inside: Callable[..., Inside]) -> None:
+    robot = inside(refine_poses=True).start()
+    trajectory, x = robot.node.trajectory, 0.0
+    # a robot that does 0.6 m/s, and now and then 1.2 m/s
+    for k in range(40):
+        x += 0.54 if k % 8 else 1.08
+        robot.odometry(100.0 + 0.9 * k, x)
+        robot.until(lambda x=x: trajectory._at is not None and trajectory._at[1].x == x)
+    driven = x - 1.08
+    assert trajectory._jump is None and trajectory.driven == pytest.approx(driven)
+    for k, step in enumerate((0.54, 2.5), 40):
+        x += step
+        robot.odometry(100.0 + 0.9 * k, x)
+        robot.until(lambda x=x: trajectory._at[1].x == x)
+    assert 'odometry jumped by 2.5 m' in robot.status('trajectory')['message']
+    assert trajectory.driven == pytest.approx(driven + 0.54), 'nobody drove that, and the way before counts once'
+    # as a run does that has looked at it
+    trajectory._jump = None
+    robot.odometry(100.0 + 0.9 * 42, x + 0.54)
+    robot.until(lambda: trajectory._at[1].x == x + 0.54)
+    assert trajectory._jump is None and trajectory.driven == pytest.approx(driven + 1.08)
+
+
 def test_what_a_run_could_not_place_is_warned_of(
     inside: Callable[..., Inside], quick: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
