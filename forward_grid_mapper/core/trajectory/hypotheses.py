@@ -95,14 +95,16 @@ def solved(
 def _best(scans: Scans, tried: list[Solved], values: list[Floats], node: int) -> tuple[int, bool]:
     """Return which solution is right, and whether that it foresees readings better than the others tells so by itself.
 
-    Without that, the first one is, unless one that foresees readings better has what was before the node recognised.
+    Without that, the first one is, unless others that foresee readings better have what was before the node
+    recognised: then the one of them that foresees them best.
     """
     for k, now in enumerate(values):
         if all(gain(other, now).sigmas >= LEAST_SIGMAS for j, other in enumerate(values) if j != k):
             return k, not _is_confirmed(scans, tried[k], node)
     right = 0
     for k in range(1, len(tried)):
-        if _is_confirmed(scans, tried[k], node) and gain(values[right], values[k]).sigmas >= LEAST_SIGMAS:
+        better = gain(values[0], values[k]).sigmas >= LEAST_SIGMAS and _is_confirmed(scans, tried[k], node)
+        if better and (not right or gain(values[right], values[k]).mean > 0.0):
             right = k
     return right, False
 

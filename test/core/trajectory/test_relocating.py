@@ -255,3 +255,22 @@ def test_a_doubt_stays_where_no_solution_foresees_readings_better(there_and_back
     heading, solver = replace(right, certainty=0.7, doubts=((30, 0.3),)), SimpleNamespace(along_walls=lambda: None)
     found = solved(scans, heading, solver, None, lambda other: solver)
     assert found.heading is heading and found.certainty == 0.7
+
+
+@pytest.mark.parametrize('sign', [1.0, -1.0])
+def test_a_drive_and_its_mirror_image_are_turned_alike(there_and_back, monkeypatch, sign) -> None:
+    """Where both ways are better than none, and blocks are recognised both ways, the better one is taken."""
+    _, _, scans, right = there_and_back
+
+    def matched(scans, heading, solver, along) -> hypotheses.Solved:
+        turned = sign * float((heading.correction - right.correction)[-1])
+        solution = solution_at(np.full((1, 3), {0: 0.0, 1: 5.0, -1: 6.0}[round(2 * turned / math.pi)]), 4)
+        return hypotheses.Solved(heading, solver, solution, solution, [], heading.certainty)
+
+    monkeypatch.setattr(hypotheses, '_matched', matched)
+    monkeypatch.setattr(hypotheses, 'confirmed', lambda scans, nodes, loops, node: nodes[0, 0] > 0.0)
+    monkeypatch.setattr(hypotheses, 'foreseen', lambda scans, nodes, blocks: nodes[0, :1])
+    monkeypatch.setattr(hypotheses, 'gain', lambda before, after: Gain(float(after[0] - before[0]), 1.0))
+    heading, solver = replace(right, certainty=0.7, doubts=((30, 0.3),)), SimpleNamespace(along_walls=lambda: None)
+    found = solved(scans, heading, solver, None, lambda other: solver)
+    assert found.solution.nodes[0, 0] == 6.0
