@@ -121,7 +121,7 @@ def write_rerun(
     readings, causes = _bounded(maps)
     x, y = _origin(maps.grid)
     if x or y:
-        report = f'Places are seen from x = {x:.0f} m, y = {y:.0f} m.\n\n{report}'
+        report = f'Coordinates are relative to x = {x:.0f} m, y = {y:.0f} m of the map frame.\n\n{report}'
     _log_maps(recording, maps)
     _log_paths(recording, path_xy - (x, y), odometry_xy - (x, y))
     entities = _log_readings(recording, replace(readings, x=readings.x - x, y=readings.y - y), causes)
@@ -136,7 +136,7 @@ def write_rerun(
 
 
 def _origin(grid: Grid) -> tuple[float, float]:
-    """Return from where places are seen, in whole metres: (0, 0), if the map is not `FAR` from there."""
+    """Return what coordinates are relative to, in whole metres: (0, 0), if the map is not `FAR` from there."""
     x, y = grid.origin
     return (float(round(x)), float(round(y))) if max(abs(x), abs(y)) > FAR else (0.0, 0.0)
 
