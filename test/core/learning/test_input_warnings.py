@@ -77,12 +77,13 @@ def twice() -> Messages:
     return drive()._replace(ranges=[m for m in drive().ranges for _ in range(2)])
 
 
-def one_frame(apart: int) -> Messages:
+def one_frame(apart: int, given: Messages | None = None) -> Messages:
     """All sensors in one frame, `apart` nanoseconds between two of a sweep."""
-    frames = list(drive().extrinsics)
-    return drive()._replace(
-        extrinsics={'sonar': drive().extrinsics[frames[0]]},
-        ranges=[m._replace(frame_id='sonar', stamp=m.stamp + apart * frames.index(m.frame_id)) for m in drive().ranges],
+    given = given or drive()
+    frames = list(given.extrinsics)
+    return given._replace(
+        extrinsics={'sonar': given.extrinsics[frames[0]]},
+        ranges=[m._replace(frame_id='sonar', stamp=m.stamp + apart * frames.index(m.frame_id)) for m in given.ranges],
     )
 
 
@@ -153,6 +154,10 @@ SCENARIOS: dict[str, tuple[Callable[[], Messages], str]] = {
     ),
     'one frame, one stamp a sweep': (lambda: one_frame(0), r'frame sonar take turns.*one frame_id.*Give each its own'),
     'one frame, one after the other': (lambda: one_frame(8_000_000), r'frame sonar take turns.*one frame_id'),
+    'one frame, one after the other, while it turns': (
+        lambda: one_frame(8_000_000, circling()),
+        r'frame sonar take turns.*one frame_id',
+    ),
     'odometry never moves': (lambda: standing(0.0), r'odometry stands still.*while the ranges.*encoders'),
     'odometry stops in the middle': (lambda: standing(0.5), r'odometry stands still for \d+ s'),
     'poses in centimetres': (lambda: moved_by(100), r'poses move at \d+ m/s: are they in millimetres or centimetres'),

@@ -53,6 +53,9 @@ def test_a_sensor_that_loses_nearly_all_readings_is_named_however_few_they_are()
     # what is wrong with all sensors is told by other warnings
     assert sensor_rejections({'left': {'too_near': 95}}, {'left': (2, 0)}) == []
     assert sensor_rejections({'left': {'too_near': 95}}, {}) == []
+    without_stamps = {'zero_stamp': 900}
+    assert sensor_rejections({'left': {'too_near': 95}, 'right': without_stamps}, {'left': (2, 0)}) == []
+    assert len(sensor_rejections({'left': {'too_near': 95}, 'right': without_stamps}, {'rear': (2, 0)})) == 1
 
 
 def test_reasons_of_poses_are_reasons() -> None:
@@ -60,7 +63,7 @@ def test_reasons_of_poses_are_reasons() -> None:
 
 
 def test_many_such_sensors_are_not_all_named() -> None:
-    by_frame = {f'sonar_{k:02d}': {'bad_limits': 30} for k in range(12)}
+    by_frame = {f'sonar_{k:02d}': {'bad_limits': 30} for k in reversed(range(12))}
     (told,) = sensor_rejections(by_frame, {'left': (3000, 0)})
     assert 'sonar_07 and 4 more were rejected as bad_limits' in told and 'sonar_08' not in told
 

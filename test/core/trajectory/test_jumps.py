@@ -158,10 +158,22 @@ def test_a_robot_that_stood_for_long_may_drive_with_a_message_a_second(driven: i
     x = np.r_[np.zeros(600), 1.2 * np.arange(1, driven + 1)]
     pose = np.stack([x, 0 * x, 0 * x], 1)
     pose[:, :2] += np.random.default_rng(0).normal(0.0, tremble, (len(x), 2))
-    assert not len(jumps(Odometry.of(np.arange(len(x)) * 1_000_000_000, pose)))
+    odometry = Odometry.of(np.arange(len(x)) * 1_000_000_000, pose)
+    assert not len(jumps(odometry))
+    # a few steps say how fast it may drive, and many that they are usual
+    assert driven < 60 or not len(doubtful_steps(odometry))
     # but odometry of it may jump
     pose[600:, 0] += 5.0
     assert jumps(Odometry.of(np.arange(len(x)) * 1_000_000_000, pose)).tolist() == [600]
+
+
+def test_a_robot_that_stood_cannot_have_driven_while_its_odometry_was_silent() -> None:
+    # fifty messages a second, and none for a second and a half
+    pose = np.zeros((200, 3))
+    pose[100:, 0] = 1.5
+    stamp = np.arange(200) * 20_000_000
+    stamp[100:] += 1_500_000_000
+    assert jumps(Odometry.of(stamp, pose)).tolist() == [100]
 
 
 def with_few_poses(readings: Readings, odometry: Odometry, metres: float) -> tuple[Readings, Odometry]:

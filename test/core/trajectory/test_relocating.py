@@ -231,7 +231,8 @@ def test_right_angles_that_were_lost_are_asked_one_after_the_other(
     monkeypatch.setattr(hypotheses, 'confirmed', lambda scans, nodes, loops, node: recognises and nodes[0, 0] > node)
     monkeypatch.setattr(hypotheses, 'foreseen', lambda scans, nodes, blocks: nodes[0, :1])
     monkeypatch.setattr(hypotheses, 'gain', lambda before, after: Gain(float(after[0] - before[0]), 1.0))
-    heading = replace(right, certainty=0.7, doubts=tuple((node, 0.1) for node in asked_at))
+    # one more, before the first metres, is neither asked nor counted
+    heading = replace(right, certainty=0.65, doubts=((1, 0.05), *((node, 0.1) for node in asked_at)))
     for node in lost:
         heading = heading.turned(node, math.pi / 2)
     solver = SimpleNamespace(along_walls=lambda: None)
@@ -239,7 +240,9 @@ def test_right_angles_that_were_lost_are_asked_one_after_the_other(
     assert found.heading.correction == pytest.approx(right.correction)
     # where nothing is recognised all are asked, and known by what foresees readings better
     assert len(solutions) == 1 + 2 * (len(lost) if recognises else len(asked_at))
-    assert recognises or found.certainty == pytest.approx(1.0)
+    # what is recognised was counted by what matched
+    assert found.certainty == pytest.approx(0.65 if recognises else 0.95)
+    assert [node for node, _ in found.heading.doubts] == [1, *(asked_at if recognises else ())]
 
 
 def test_a_doubt_stays_where_no_solution_foresees_readings_better(there_and_back, monkeypatch) -> None:
