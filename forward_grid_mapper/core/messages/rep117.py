@@ -85,6 +85,10 @@ OF_POSES = {
 """Reasons that are none of the message by itself; a node that runs tells of them in other places."""
 
 
+CHOSEN = {'over_range', 'paused'}
+"""Reasons that the user chose, and that say nothing against a sensor: one may look where there is nothing to hear."""
+
+
 ODOMETRY_REASONS = {
     'bad_pose': 'the pose is not finite, absurdly far away or tilted too far, or its quaternion is not normalised',
     'long_frame_id': 'the frame_id or child_frame_id has more than 255 characters',
@@ -173,8 +177,8 @@ def sensor_rejections(
 ) -> list[str]:
     """Return a warning for each reason, other than known ones, that costs some sensors nearly all of their readings.
 
-    Nothing is said of reasons for which many of all readings are rejected, which `rejection_warnings` names, nor where
-    no sensor is well.
+    Nothing is said of reasons that the user chose, nor of those for which many of all readings are rejected, which
+    `rejection_warnings` names, nor where no sensor is well.
 
     Parameters
     ----------
@@ -189,7 +193,7 @@ def sensor_rejections(
     for frame, counts in by_frame.items():
         received = sum(counts.values()) + accepted.get(frame, (0, 0))[0]
         reason = max(counts, key=lambda each: counts[each])
-        told = not frame or reason in known or rejected[reason] > many
+        told = not frame or reason in CHOSEN or reason in known or rejected[reason] > many
         if counts[reason] >= max(NEARLY_ALL * received, ENOUGH) and not told:
             lost.setdefault(reason, []).append(frame)
     if not set(accepted).difference(*lost.values()):

@@ -9,6 +9,7 @@ import pytest
 from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.messages.message_types import RangeMessage
 from forward_grid_mapper.core.messages.rep117 import (
+    CHOSEN,
     LONGEST_NAME,
     NEAREST,
     OF_POSES,
@@ -50,6 +51,8 @@ def test_a_sensor_that_loses_nearly_all_readings_is_named_however_few_they_are()
     # a frame without a name is told of by its reason, and so is what costs many of all readings
     assert sensor_rejections({'': {'empty_frame_id': 50}}, fine) == []
     assert sensor_rejections({'left': {'too_near': 600}}, fine) == []
+    # nor is a sensor dead that hears nothing, where that is to be discarded
+    assert sensor_rejections({'left': {'over_range': 95}, 'right': {'paused': 50}}, fine) == []
     # what is wrong with all sensors is told by other warnings
     assert sensor_rejections({'left': {'too_near': 95}}, {'left': (2, 0)}) == []
     assert sensor_rejections({'left': {'too_near': 95}}, {}) == []
@@ -59,7 +62,7 @@ def test_a_sensor_that_loses_nearly_all_readings_is_named_however_few_they_are()
 
 
 def test_reasons_of_poses_are_reasons() -> None:
-    assert OF_POSES < set(REASONS)
+    assert OF_POSES | CHOSEN < set(REASONS)
 
 
 def test_many_such_sensors_are_not_all_named() -> None:
