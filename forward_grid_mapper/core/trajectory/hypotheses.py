@@ -77,7 +77,8 @@ def solved(
     seen = foreseen(scans, best.solution.nodes, blocks)
     for node in nodes:
         # it may be known by now, since an earlier one is
-        if node not in _open(scans, best):
+        still = _open(scans, best)
+        if node not in still:
             continue
         tried, values = [best], [seen]
         for angle in (math.pi / 2, -math.pi / 2):
@@ -87,7 +88,8 @@ def solved(
             values.append(foreseen(scans, tried[-1].solution.nodes, blocks))
         right, told = _best(scans, tried, values, node)
         best, seen = tried[right], values[right]
-        if told:
+        # of two right angles that make up for each other, neither is better turned alone
+        if told and (right or len(still) == 1):
             best = _known(best, node)
     return best
 

@@ -238,11 +238,13 @@ def test_right_angles_that_were_lost_are_asked_one_after_the_other(
     solver = SimpleNamespace(along_walls=lambda: None)
     found = solved(scans, heading, solver, None, lambda other: solver)
     assert found.heading.correction == pytest.approx(right.correction)
-    # where nothing is recognised all are asked, and known by what foresees readings better
+    # where nothing is recognised all are asked, and those known that are foreseen better turned: of several of which
+    # none is, two may make up for each other
     assert len(solutions) == 1 + 2 * (len(lost) if recognises else len(asked_at))
     # what is recognised was counted by what matched
-    assert found.certainty == pytest.approx(0.65 if recognises else 0.95)
-    assert [node for node, _ in found.heading.doubts] == [1, *(asked_at if recognises else ())]
+    known = [] if recognises else lost
+    assert found.certainty == pytest.approx(0.65 + 0.1 * len(known))
+    assert [node for node, _ in found.heading.doubts] == [1, *(node for node in asked_at if node not in known)]
 
 
 def test_a_doubt_stays_where_no_solution_foresees_readings_better(there_and_back, monkeypatch) -> None:
@@ -258,6 +260,28 @@ def test_a_doubt_stays_where_no_solution_foresees_readings_better(there_and_back
     heading, solver = replace(right, certainty=0.7, doubts=((30, 0.3),)), SimpleNamespace(along_walls=lambda: None)
     found = solved(scans, heading, solver, None, lambda other: solver)
     assert found.heading is heading and found.certainty == 0.7
+
+
+@pytest.mark.parametrize('turned_at', [(30,), (30, 50)])
+def test_what_foresees_readings_best_as_it_is_is_known_if_it_is_the_only_doubt(
+    there_and_back, monkeypatch, turned_at
+) -> None:
+    _, _, scans, right = there_and_back
+
+    def matched(scans, heading, solver, along) -> hypotheses.Solved:
+        off = float(np.abs(heading.correction - right.correction).max())
+        solution = solution_at(np.full((1, 3), -off), 4)
+        return hypotheses.Solved(heading, solver, solution, solution, [], heading.certainty)
+
+    monkeypatch.setattr(hypotheses, '_matched', matched)
+    monkeypatch.setattr(hypotheses, 'confirmed', lambda scans, nodes, loops, node: False)
+    monkeypatch.setattr(hypotheses, 'foreseen', lambda scans, nodes, blocks: nodes[0, :1])
+    monkeypatch.setattr(hypotheses, 'gain', lambda before, after: Gain(float(after[0] - before[0]), 0.1))
+    heading = replace(right, certainty=0.7, doubts=tuple((node, 0.1) for node in turned_at))
+    solver = SimpleNamespace(along_walls=lambda: None)
+    found = solved(scans, heading, solver, None, lambda other: solver)
+    assert found.heading.correction == pytest.approx(right.correction)
+    assert found.certainty == pytest.approx(0.8 if len(turned_at) == 1 else 0.7)
 
 
 @pytest.mark.parametrize('sign', [1.0, -1.0])
