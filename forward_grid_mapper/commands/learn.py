@@ -12,7 +12,7 @@ from pathlib import Path
 
 from ..core.common.errors import OutputError, ParameterError
 from ..core.common.shell import command_line
-from ..core.foresight import only_if_foreseen
+from ..core.cross_validation import only_if_validated
 from ..core.joint_learning import learn_jointly
 from ..core.learning.sensor_health import health_warning, sensor_health
 from ..files.learned_text import learned_data, learned_text, parameter_file_text, write_new_file
@@ -105,7 +105,7 @@ def learn(options: argparse.Namespace) -> int:
         )
         found = learn_jointly(drives.readings, parameters, options.rounds, options.keep_going, ticker.mapping)
         if not options.keep_going:
-            found = only_if_foreseen(found, drives.readings, parameters, options.rounds, ticker.mapping)
+            found = only_if_validated(found, drives.readings, parameters, options.rounds, ticker.mapping)
         suspects = health_warning(sensor_health(found.maps))
     warnings = (
         *drives.source['warnings'],

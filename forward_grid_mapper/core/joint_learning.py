@@ -82,7 +82,7 @@ class Round:
         return sum(stretch.length for stretch in self.lost)
 
 
-class Foresight(NamedTuple):
+class CrossValidation(NamedTuple):
     """Mean log-likelihood of a reading held out, nats: of the map of the first values and of that of the learned ones.
 
     Each is judged at the first values and at the learned ones; `error_at_…` is the standard error of the difference of
@@ -127,8 +127,8 @@ class Learned:
     maps : MapSet
         Of the accepted round.
     warnings : tuple of str
-    foresight : Foresight, optional
-        What readings that were held out say of the values, where they were asked (`foresight`).
+    cross_validation : CrossValidation, optional
+        What readings that were held out say of the values, where they were asked (`cross_validated`).
     """
 
     parameters: Parameters
@@ -138,7 +138,7 @@ class Learned:
     converged: bool
     maps: MapSet
     warnings: tuple[str, ...]
-    foresight: Foresight | None = None
+    cross_validation: CrossValidation | None = None
 
 
 def settle(forward: ForwardModel, occupied: NDArray[Any]) -> ModelParameters:

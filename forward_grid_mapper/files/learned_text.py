@@ -57,7 +57,7 @@ def learned_data(learned: Learned) -> dict[str, Any]:
         'rounds': rounds,
         'accepted_round': learned.accepted,
         'converged': learned.converged,
-        'foresight': learned.foresight and learned.foresight._asdict(),
+        'cross_validation': learned.cross_validation and learned.cross_validation._asdict(),
         'parameters': learned.parameters.flat(),
     }
 
@@ -82,7 +82,7 @@ def _values(learned: Learned) -> Iterator[str]:
         error = f'{estimate.error:.4f}' if known else '–'
         interval = f'{estimate.low:.4f} … {estimate.high:.4f}' if known else '–'
         yield f'{row}{error:>11}{interval:>19}{estimate.readings:>11,.0f} readings'
-    if seen := learned.foresight:
+    if seen := learned.cross_validation:
         at_first, at_learned = seen.gains
         yield (
             f'  Held-out readings, nats each that the map of the learned values gains: {at_first:+.3f} ± '

@@ -101,7 +101,7 @@ def test_values_that_held_out_readings_speak_against_are_not_handed_out(
 ) -> None:
     file = tmp_path / 'learned.yaml'
     found = json.loads(said(capsys, bag, '--rounds', 2, '--json', '-o', file))
-    seen = found['foresight']
+    seen = found['cross_validation']
     better = all(
         seen[f'learned_at_{values}'] - seen[f'first_at_{values}'] > seen[f'error_at_{values}']
         for values in ('first', 'learned')

@@ -27,7 +27,7 @@ LEFT = math.radians(3.0)
 """By how much the yaw strays after scan matching, and after each round, radians a √metre."""
 
 WORTH_A_TRIAL = 1.5
-"""Standard errors by which scan matching must foresee readings near by better than nodes that are known, for more to be
+"""Standard errors by which scan matching must predict readings near by better than nodes that are known, for more to be
 tried. In 3 drives where corners were wrongly taken for square ones it was 3.5 to 7, in 4 others 0 to 0.6."""
 
 ROUNDS = 4
@@ -64,7 +64,7 @@ def matched(
     """Return where a drive is by matches alone; None if the map along it explains its readings no better.
 
     It has to explain them better than the map along odometry, and than the one along the nodes that are `known`. More
-    than scan matching is tried only if that foresees readings better than these.
+    than scan matching is tried only if that predicts readings better than these.
 
     Parameters
     ----------

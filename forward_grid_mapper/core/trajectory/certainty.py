@@ -9,7 +9,7 @@ whose residuals say how certain it is.
 
 Scale and heading are not measured that way: where readings say nothing of how far the robot drove, as along a bare
 corridor, the trajectory follows the odometry and would agree with itself. They are asked from readings directly: f(c)
-is the mean log ratio of a block of readings, foreseen by the map of what lies around it, where all motions have the
+is the mean log ratio of a block of readings, predicted by the map of what lies around it, where all motions have the
 calibration c. Over blocks b with slopes g_b and curvatures h_b at c,
 
     top − c  =  −Σ g_b / Σ h_b        σ²  =  Σ (g_b + h_b (top − c))² / (Σ h_b)²
@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from ..common.parameters import Parameters
 from ..common.readings import Readings
-from .holding_out import blocks_of, foreseen, held_out
+from .holding_out import blocks_of, held_out, predicted
 from .local_map import for_matching
 from .odometry_model import CALIBRATION, calibrated, with_yaw
 from .poses import Floats, wrapped
@@ -164,7 +164,7 @@ def of_ways(
 
     def value_at(trial: dict[str, float]) -> Floats:
         ways = np.array([trial['scale'], trial['heading'], 0.0, 0.0])
-        return foreseen(scans, calibrated(turned, ways).at(windows.node_stamp), blocks, SPAN)
+        return predicted(scans, calibrated(turned, ways).at(windows.node_stamp), blocks, SPAN)
 
     start = {name: calibration.get(name, 0.0) for name in STEPS}
     middle = value_at(start)

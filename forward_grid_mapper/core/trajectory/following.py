@@ -5,9 +5,9 @@ odometry, calibrated as the whole drive has it, from the directions of walls and
 and from places that were mapped before. So the search for a window costs the same however long the drive is; what grows
 with the drive is the path, which is copied at each window, and the readings that it keeps to recognise places by.
 
-What is followed has to prove itself. Every few windows a block is foreseen, before its readings are used, once where it
-is followed and once where the correction is kept as it was. Where following foresees clearly better, the correction of
-then is the one to beat from there on; where it foresees worse, that one is in force until it does so no longer.
+Following has to prove itself. Every few windows the readings of a block are predicted before they are used, once with
+the correction that is followed and once with the last one that was proven. If the first predicts clearly better, it is
+proven from then on. While it predicts worse, the proven correction is in force.
 """
 
 from __future__ import annotations
@@ -122,7 +122,7 @@ class Follower:
     correction : Correction
         In force.
     kept : bool
-        Whether it is kept as it was, since what is followed foresees readings worse.
+        Whether it is kept as it was, since what is followed predicts readings worse.
     windows : int
         Followed so far.
     places : int
@@ -281,7 +281,7 @@ class Follower:
         return Edges(np.zeros(1, np.int64), block[-1:], match.pose[None], match.information[None])
 
     def _judge(self, scans: Scans, followed: Floats, block: NDArray[np.int64]) -> None:
-        """Compare how a block is foreseen where it is followed, shape (K, 3), and by the correction that is proven."""
+        """Compare how a block is predicted where it is followed, shape (K, 3), and by the correction that is proven."""
         w, proven = scans.windows, self._proven
         kept = relative(self._axes, compose(proven.last, w.node))
         early = w.node_stamp <= proven.end
@@ -298,7 +298,7 @@ class Follower:
         self._gains = [*self._gains[1 - JUDGED :], (said[0] - said[1]) / count]
 
     def _put_in_force(self, tail: _Tail, windows: Windows) -> None:
-        """Set the correction: that of the tail, or the proven one where this foresees readings better."""
+        """Set the correction: that of the tail, or the proven one where this predicts readings better."""
         odometry = tail.odometry
         pose = windows.corrected(odometry.progress, odometry.pose, tail.nodes)
         # the first pose is that of a window's begin

@@ -1,4 +1,4 @@
-"""Readings that are held out: how well a trajectory and the map along it foresee readings that are not on the map.
+"""Readings that are held out: how well a trajectory and the map along it predict readings that are not on the map.
 
 A trajectory is judged by the mean log ratio of the readings of a block of windows, given the local map of all others
 that are near in space. A trajectory that matching has fitted to these readings would be judged by what it was made of.
@@ -26,7 +26,7 @@ NEAR = 4.0
 """Metres between nodes of windows that belong on one map."""
 
 LEAST_SIGMAS = 2.3
-"""Standard errors by which readings must be foreseen better: by chance it is so in one of 100."""
+"""Standard errors by which readings must be predicted better: by chance it is so in one of 100."""
 
 LATER = 10.0
 """Metres of progress after which a place that the robot is at was seen before, rather than just now."""
@@ -44,7 +44,7 @@ def held_out(count: int) -> NDArray[np.bool_]:
     return out
 
 
-def foreseen(scans: Scans, nodes: Floats, blocks: list[NDArray[np.int64]], span: float = np.inf) -> Floats:
+def predicted(scans: Scans, nodes: Floats, blocks: list[NDArray[np.int64]], span: float = np.inf) -> Floats:
     """Return the mean log ratio of the readings of each block, shape (n,), in nats; NaN where there is none.
 
     Parameters
@@ -61,12 +61,12 @@ def foreseen(scans: Scans, nodes: Floats, blocks: list[NDArray[np.int64]], span:
     for i, block in enumerate(blocks):
         asked = along, block.tobytes(), span
         if asked not in scans.judged:
-            scans.judged[asked] = _foreseen(scans, nodes, block, span)
+            scans.judged[asked] = _predicted(scans, nodes, block, span)
         out[i] = scans.judged[asked]
     return out
 
 
-def _foreseen(scans: Scans, nodes: Floats, block: NDArray[np.int64], span: float) -> float:
+def _predicted(scans: Scans, nodes: Floats, block: NDArray[np.int64], span: float) -> float:
     """Return the mean log ratio of the readings of a block, nats, NaN where there is none."""
     progress, middle = scans.windows.node_progress, block[len(block) // 2]
     near = np.hypot(*(nodes[:, :2] - nodes[middle, :2]).T) < NEAR
@@ -93,7 +93,7 @@ class Gain(NamedTuple):
 
 
 def gain(before: Floats, after: Floats) -> Gain:
-    """Return the gain of one trajectory over another, by what `foreseen` says of the same blocks."""
+    """Return the gain of one trajectory over another, by what `predicted` says of the same blocks."""
     more = after - before
     more = more[np.isfinite(more)]
     if len(more) < FEWEST_BLOCKS:

@@ -2,7 +2,7 @@
 
 Votes of walls know the heading modulo 90°. In a hall whose walls are out of reach it may slip over to the next one. If
 places seen before such a hall are recognised after it, it did not. If they are not, the drive is solved with the
-heading turned by a right angle from there on, one way and the other, and what foresees its readings best is right. Of
+heading turned by a right angle from there on, one way and the other, and what predicts its readings best is right. Of
 several such places, one after the other is asked: what follows the first one is right up to the second.
 """
 
@@ -13,7 +13,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 from .heading import Heading
-from .holding_out import LEAST_SIGMAS, blocks_of, foreseen, gain
+from .holding_out import LEAST_SIGMAS, blocks_of, gain, predicted
 from .loops import APART, Loop
 from .passes import BLOCK
 from .pose_graph import Solution
@@ -74,7 +74,7 @@ def solved(
     if not 0 < len(nodes) <= MOST_OPEN:
         return best
     blocks = blocks_of(len(scans.windows), BLOCK, JUDGED_ON)
-    seen = foreseen(scans, best.solution.nodes, blocks)
+    seen = predicted(scans, best.solution.nodes, blocks)
     for node in nodes:
         # it may be known by now, since an earlier one is
         still = _open(scans, best)
@@ -85,7 +85,7 @@ def solved(
             other = best.heading.turned(node, angle)
             solver = solver_of(other)
             tried.append(_matched(scans, other, solver, solver.along_walls()))
-            values.append(foreseen(scans, tried[-1].solution.nodes, blocks))
+            values.append(predicted(scans, tried[-1].solution.nodes, blocks))
         right, told = _best(scans, tried, values, node)
         best, seen = tried[right], values[right]
         # of two right angles that make up for each other, neither is better turned alone
@@ -95,10 +95,10 @@ def solved(
 
 
 def _best(scans: Scans, tried: list[Solved], values: list[Floats], node: int) -> tuple[int, bool]:
-    """Return which solution is right, and whether that it foresees readings better than the others tells so by itself.
+    """Return which solution is right, and whether that it predicts readings better than the others tells so by itself.
 
-    Without that, the first one is, unless others that foresee readings better have what was before the node
-    recognised: then the one of them that foresees them best.
+    Without that, the first one is, unless others that predict readings better have what was before the node
+    recognised: then the one of them that predicts them best.
     """
     for k, now in enumerate(values):
         if all(gain(other, now).sigmas >= LEAST_SIGMAS for j, other in enumerate(values) if j != k):

@@ -1,4 +1,4 @@
-"""Judging: whether readings speak for one trajectory rather than another, by what each foresees of readings not used.
+"""Judging: whether readings speak for one trajectory rather than another, by what each predicts of readings not used.
 
 All over the drive, maps of a few metres of it are compared: so the drift of odometry shows. At places seen before, maps
 of all times are compared with windows that were held out: so a drive that is bent as a whole shows.
@@ -10,7 +10,7 @@ import math
 
 import numpy as np
 
-from .holding_out import FEWEST_BLOCKS, Gain, blocks_of, foreseen, gain, held_out_blocks
+from .holding_out import FEWEST_BLOCKS, Gain, blocks_of, gain, held_out_blocks, predicted
 from .passes import BLOCK, Progress
 from .poses import Floats, wrapped
 from .scans import Scans
@@ -23,15 +23,15 @@ JUDGED_ON, HELD_OUT = 60, 40
 """Blocks of `over_the_drive`, and held-out windows of `chosen`, at the most."""
 
 MOST_WORSE = 1.0
-"""Standard errors by which matching may foresee what was held out worse."""
+"""Standard errors by which matching may predict what was held out worse."""
 
 TURNED, LEAST_SIGMAS_OF_TURNS = math.radians(8.0), 1.5
 """Radians by which odometry must turn otherwise within `SPAN` for readings to tell it, and by how many standard errors
-they must then be foreseen better: with corners that are not square it is -4 to -6, with drift 2 to 7."""
+they must then be predicted better: with corners that are not square it is -4 to -6, with drift 2 to 7."""
 
 
 def over_the_drive(scans: Scans, before: Floats, after: Floats, watch: Progress) -> Gain:
-    """Return by how much one trajectory foresees readings better than another, all over the drive.
+    """Return by how much one trajectory predicts readings better than another, all over the drive.
 
     Parameters
     ----------
@@ -42,24 +42,24 @@ def over_the_drive(scans: Scans, before: Floats, after: Floats, watch: Progress)
     """
     blocks = blocks_of(len(before), BLOCK, JUDGED_ON)
     # places of another time are left out: where they overlap by half they contradict, far apart they say nothing
-    one = foreseen(scans, before, blocks, SPAN)
+    one = predicted(scans, before, blocks, SPAN)
     watch(0.5)
-    return gain(one, foreseen(scans, after, blocks, SPAN))
+    return gain(one, predicted(scans, after, blocks, SPAN))
 
 
 def seen_again(scans: Scans, before: Floats, after: Floats) -> Gain:
-    """Return by how much what was held out is foreseen better on maps of all times that the robot came by."""
+    """Return by how much what was held out is predicted better on maps of all times that the robot came by."""
     # it is the only proof, so all that was held out has a say
     blocks = held_out_blocks(scans, len(before))
-    return gain(foreseen(scans, before, blocks), foreseen(scans, after, blocks))
+    return gain(predicted(scans, before, blocks), predicted(scans, after, blocks))
 
 
 def chosen(scans: Scans, first: Floats, *others: Floats) -> Floats:
-    """Return the last nodes that do not foresee what was held out from them worse than those before."""
+    """Return the last nodes that do not predict what was held out from them worse than those before."""
     blocks = held_out_blocks(scans, HELD_OUT)
-    best, seen = first, foreseen(scans, first, blocks)
+    best, seen = first, predicted(scans, first, blocks)
     for nodes in others:
-        now = foreseen(scans, nodes, blocks)
+        now = predicted(scans, nodes, blocks)
         if gain(seen, now).sigmas > -MOST_WORSE:
             best, seen = nodes, now
     return best
@@ -90,7 +90,7 @@ def turned_right(scans: Scans, nodes: Floats) -> bool:
     sharp = [blocks[k] for k in np.sort(np.argsort(-by, kind='stable')[:JUDGED_ON]) if by[k] > TURNED]
     if len(sharp) < FEWEST_BLOCKS:
         return True
-    better = gain(*(foreseen(scans, each, sharp, SPAN) for each in (windows.node, nodes)))
+    better = gain(*(predicted(scans, each, sharp, SPAN) for each in (windows.node, nodes)))
     return bool(np.isinf(better.error)) or better.sigmas > LEAST_SIGMAS_OF_TURNS
 
 

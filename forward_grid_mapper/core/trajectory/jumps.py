@@ -321,7 +321,7 @@ def _begin_after(
     blocks = max(int(part.path.travel[-1] / BLOCK), 1)
     found = [around.search(guess, SIGMA, blocks) for guess in guesses]
     usual = _Usual(part, parameters, stop)
-    stood, driven, exactly = (_said(around.foreseen(pose, blocks)) for pose in (*found, guesses[1]))
+    stood, driven, exactly = (_said(around.predicted(pose, blocks)) for pose in (*found, guesses[1]))
     better = compared(driven, stood).sigmas
     if usual.fits(around, found[0], GOOD_AT_REST if fast else GOOD) and (fast or better >= LEAST_SIGMAS):
         return Begin(found[0], STOOD)

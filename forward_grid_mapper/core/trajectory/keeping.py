@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ..common.parameters import Parameters
 from ..common.readings import Readings
 from .correction import Correction
-from .holding_out import LEAST_SIGMAS, Gain, foreseen, gain, held_out, held_out_blocks
+from .holding_out import LEAST_SIGMAS, Gain, gain, held_out, held_out_blocks, predicted
 from .judging import HELD_OUT
 from .local_map import for_matching
 from .outcome import Refinement, differences, replaced
@@ -89,8 +89,8 @@ def _begins(correction: Correction, odometry: Odometry) -> bool:
 def _odometry_better(
     readings: Readings, odometry: Odometry, path: Odometry, parameters: Parameters, stop: NDArray[np.uint8]
 ) -> Gain:
-    """Return by how much odometry foresees the readings that are held out better than a path does."""
+    """Return by how much odometry predicts the readings that are held out better than a path does."""
     windows = cut(readings, odometry)
     scans = Scans(windows, parameters, stop, held_out(len(windows)))
     blocks = held_out_blocks(scans, HELD_OUT) if scans.held_out.any() else []
-    return gain(foreseen(scans, path.at(windows.node_stamp), blocks), foreseen(scans, windows.node, blocks))
+    return gain(predicted(scans, path.at(windows.node_stamp), blocks), predicted(scans, windows.node, blocks))

@@ -37,7 +37,7 @@ class Refinement:
     loops : int
         Places that were recognised.
     gain : float
-        Nats by which a reading is foreseen better.
+        Nats by which a reading is predicted better.
     lost : bool
         Whether odometry is off by so much that its heading could not be followed: then it stays, but nothing should be
         fitted to it.

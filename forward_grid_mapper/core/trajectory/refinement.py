@@ -53,7 +53,7 @@ LEAST_SENSORS = 2
 LEAST_WITNESS, LEAST_SIGMAS_WITH_WALLS = 10.0, -1.0
 """Nats that the votes of walls must say against odometry's yaw, beyond what sensors say by where they look, to be a
 witness of their own, and the standard errors that are then enough where the robot came to no place twice: readings must
-not be foreseen worse. Little drift hardly shows in a few metres."""
+not be predicted worse. Little drift hardly shows in a few metres."""
 
 LEAST_CERTAINTY = 0.9
 """Probability that the heading did not get lost by a right angle."""

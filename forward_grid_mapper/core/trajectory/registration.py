@@ -87,7 +87,7 @@ def register(
     """
     around = OnMap(readings, begin, others, parameters, stop)
     found = around.search(begin, SIGMA)
-    better = gain(around.foreseen(begin, BLOCKS), around.foreseen(found, BLOCKS))
+    better = gain(around.predicted(begin, BLOCKS), around.predicted(found, BLOCKS))
     return Registration(found if better.sigmas >= LEAST_SIGMAS else begin, better)
 
 
@@ -116,7 +116,7 @@ class OnMap:
         scan, far = self._scan, self._far
         if blocks:
             parts = np.array_split(scan.readings, blocks)
-            told = [p for p, value in zip(parts, self.foreseen(begin, blocks), strict=True) if abs(value) > SILENT]
+            told = [p for p, value in zip(parts, self.predicted(begin, blocks), strict=True) if abs(value) > SILENT]
             if not told:
                 return begin
             scan = Scan(np.concatenate(told), scan.weight)
@@ -135,7 +135,7 @@ class OnMap:
         each = [scores(Scan(readings[k : k + 1], weight), self._around, begin[None])[0] for k in range(len(readings))]
         return np.array(each)
 
-    def foreseen(self, begin: Floats, blocks: int) -> Floats:
+    def predicted(self, begin: Floats, blocks: int) -> Floats:
         """Return the mean log ratio of the readings of each of so many blocks, in order of time, shape (blocks,).
 
         It is NaN where they are few.

@@ -34,7 +34,7 @@ class Scans:
         How many of them may be used; none of windows that are held out.
     held_out : bool, shape (K,)
     judged : dict
-        What `holding_out.foreseen` found, since the same is asked several times.
+        What `holding_out.predicted` found, since the same is asked several times.
     """
 
     def __init__(

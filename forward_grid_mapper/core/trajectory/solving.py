@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .heading import Heading
-from .holding_out import LEAST_SIGMAS, foreseen, gain
+from .holding_out import LEAST_SIGMAS, gain, predicted
 from .loops import Looked, Loop, find_loops, loops_of
 from .odometry_model import (
     CALIBRATION,
@@ -150,7 +150,7 @@ class MatchSolver:
         rest = [loop for loop, out in zip(loops, across, strict=True) if not out]
         tried, kept = self._with_loops(self._walls(nodes, True), matches, [*rest, *found], solution)
         parts = [stretch[k : k + BLOCK] for k in range(0, len(stretch), BLOCK)]
-        if gain(foreseen(scans, nodes, parts), foreseen(scans, tried.nodes, parts)).sigmas < LEAST_SIGMAS:
+        if gain(predicted(scans, nodes, parts), predicted(scans, tried.nodes, parts)).sigmas < LEAST_SIGMAS:
             return solution, loops
         return tried, kept
 

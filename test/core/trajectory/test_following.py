@@ -1,4 +1,4 @@
-"""Following: better than keeping the correction, the same in any portions, and never against what is foreseen."""
+"""Following: better than keeping the correction, the same in any portions, and never against what is predicted."""
 
 from __future__ import annotations
 
@@ -194,7 +194,7 @@ def test_it_can_be_cancelled(sample: Sample) -> None:
     assert follower.correction is sample.correction
 
 
-def test_what_foresees_worse_is_not_in_force(sample: Sample, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_predicts_worse_is_not_in_force(sample: Sample, monkeypatch: pytest.MonkeyPatch) -> None:
     # walls that lead astray: they turn the robot by 0.1 rad more from place to place
     real = following.yaws_of_votes
 
@@ -228,7 +228,7 @@ def test_the_correction_that_has_proved_itself_is_the_one_to_keep(
     assert proven[0] is sample.correction
     assert any(each is not sample.correction for each in proven)
     first = kept.index(True)
-    assert not all(kept[first:]), 'and it goes on when it foresees better again'
+    assert not all(kept[first:]), 'and it goes on when it predicts better again'
     assert proven[first] is not sample.correction
 
 

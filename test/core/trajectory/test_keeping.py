@@ -66,7 +66,7 @@ def test_it_stays_and_goes_on(sample: Sample) -> None:
     assert found.readings.x == pytest.approx(expected.x, abs=1e-6)
 
 
-def test_it_goes_where_odometry_foresees_readings_better(sample: Sample) -> None:
+def test_it_goes_where_odometry_predicts_readings_better(sample: Sample) -> None:
     # what was found is wrong, and odometry is exact
     wrong = Correction(first_of(sample.true, 0.7), first_of(sample.odometry, 0.7))
     refused = replace(sample.refused, readings=sample.exact.readings, trajectory=sample.true)

@@ -101,7 +101,7 @@ def no_matches(*rest) -> None:
 
 
 def test_places_seen_before_prove_what_nothing_nearby_does(tour, bent, monkeypatch, solved_once) -> None:
-    # wheels that are right over metres foresee what is near better than the yaws of walls
+    # wheels that are right over metres predict what is near better than the yaws of walls
     monkeypatch.setattr(refinement, 'matched', no_matches)
     monkeypatch.setattr(refinement, 'over_the_drive', lambda *rest: Gain(-0.05, 0.01))
     found, true = Refiner(Parameters()).run(*bent), odometry_of(tour).pose

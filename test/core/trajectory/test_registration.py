@@ -72,7 +72,7 @@ def test_blocks_are_the_readings_one_by_one_and_what_is_new_says_nothing(two: tu
     for begin in (other.robot[0], compose(other.robot[0], np.array([0.3, -0.2, 0.2]))):
         each = around.of_each(begin, len(other.readings))
         blocks = np.array_split(each, 7)
-        assert around.foreseen(begin, 7) == pytest.approx(np.array([block.mean() for block in blocks]))
+        assert around.predicted(begin, 7) == pytest.approx(np.array([block.mean() for block in blocks]))
         assert around.of_each(begin, 50) == pytest.approx(each[:50])
     far = other.robot[0] + np.array([100.0, 0.0, 0.0])
     assert np.abs(around.of_each(far, 200)).max() < SILENT

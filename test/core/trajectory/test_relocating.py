@@ -87,7 +87,7 @@ def test_what_was_led_astray_is_put_where_it_belongs(there_and_back) -> None:
     assert len(loops) > FEW
 
 
-def test_another_place_is_taken_only_if_readings_are_foreseen_better(there_and_back, monkeypatch) -> None:
+def test_another_place_is_taken_only_if_readings_are_predicted_better(there_and_back, monkeypatch) -> None:
     true, first = there_and_back.windows.node, turning(there_and_back)
 
     def aside(scans, nodes, stretch) -> Floats:
@@ -229,7 +229,7 @@ def test_right_angles_that_were_lost_are_asked_one_after_the_other(
 
     monkeypatch.setattr(hypotheses, '_matched', matched)
     monkeypatch.setattr(hypotheses, 'confirmed', lambda scans, nodes, loops, node: recognises and nodes[0, 0] > node)
-    monkeypatch.setattr(hypotheses, 'foreseen', lambda scans, nodes, blocks: nodes[0, :1])
+    monkeypatch.setattr(hypotheses, 'predicted', lambda scans, nodes, blocks: nodes[0, :1])
     monkeypatch.setattr(hypotheses, 'gain', lambda before, after: Gain(float(after[0] - before[0]), 1.0))
     # one more, before the first metres, is neither asked nor counted
     heading = replace(right, certainty=0.65, doubts=((1, 0.05), *((node, 0.1) for node in asked_at)))
@@ -238,7 +238,7 @@ def test_right_angles_that_were_lost_are_asked_one_after_the_other(
     solver = SimpleNamespace(along_walls=lambda: None)
     found = solved(scans, heading, solver, None, lambda other: solver)
     assert found.heading.correction == pytest.approx(right.correction)
-    # where nothing is recognised all are asked, and those known that are foreseen better turned: of several of which
+    # where nothing is recognised all are asked, and those known that are predicted better turned: of several of which
     # none is, two may make up for each other
     assert len(solutions) == 1 + 2 * (len(lost) if recognises else len(asked_at))
     # what is recognised was counted by what matched
@@ -247,7 +247,7 @@ def test_right_angles_that_were_lost_are_asked_one_after_the_other(
     assert [node for node, _ in found.heading.doubts] == [1, *(node for node in asked_at if node not in known)]
 
 
-def test_a_doubt_stays_where_no_solution_foresees_readings_better(there_and_back, monkeypatch) -> None:
+def test_a_doubt_stays_where_no_solution_predicts_readings_better(there_and_back, monkeypatch) -> None:
     _, _, scans, right = there_and_back
 
     def matched(scans, heading, solver, along) -> hypotheses.Solved:
@@ -256,14 +256,14 @@ def test_a_doubt_stays_where_no_solution_foresees_readings_better(there_and_back
 
     monkeypatch.setattr(hypotheses, '_matched', matched)
     monkeypatch.setattr(hypotheses, 'confirmed', lambda scans, nodes, loops, node: False)
-    monkeypatch.setattr(hypotheses, 'foreseen', lambda scans, nodes, blocks: np.zeros(9))
+    monkeypatch.setattr(hypotheses, 'predicted', lambda scans, nodes, blocks: np.zeros(9))
     heading, solver = replace(right, certainty=0.7, doubts=((30, 0.3),)), SimpleNamespace(along_walls=lambda: None)
     found = solved(scans, heading, solver, None, lambda other: solver)
     assert found.heading is heading and found.certainty == 0.7
 
 
 @pytest.mark.parametrize('turned_at', [(30,), (30, 50)])
-def test_what_foresees_readings_best_as_it_is_is_known_if_it_is_the_only_doubt(
+def test_what_predicts_readings_best_as_it_is_is_known_if_it_is_the_only_doubt(
     there_and_back, monkeypatch, turned_at
 ) -> None:
     _, _, scans, right = there_and_back
@@ -275,7 +275,7 @@ def test_what_foresees_readings_best_as_it_is_is_known_if_it_is_the_only_doubt(
 
     monkeypatch.setattr(hypotheses, '_matched', matched)
     monkeypatch.setattr(hypotheses, 'confirmed', lambda scans, nodes, loops, node: False)
-    monkeypatch.setattr(hypotheses, 'foreseen', lambda scans, nodes, blocks: nodes[0, :1])
+    monkeypatch.setattr(hypotheses, 'predicted', lambda scans, nodes, blocks: nodes[0, :1])
     monkeypatch.setattr(hypotheses, 'gain', lambda before, after: Gain(float(after[0] - before[0]), 0.1))
     heading = replace(right, certainty=0.7, doubts=tuple((node, 0.1) for node in turned_at))
     solver = SimpleNamespace(along_walls=lambda: None)
@@ -296,7 +296,7 @@ def test_a_drive_and_its_mirror_image_are_turned_alike(there_and_back, monkeypat
 
     monkeypatch.setattr(hypotheses, '_matched', matched)
     monkeypatch.setattr(hypotheses, 'confirmed', lambda scans, nodes, loops, node: nodes[0, 0] > 0.0)
-    monkeypatch.setattr(hypotheses, 'foreseen', lambda scans, nodes, blocks: nodes[0, :1])
+    monkeypatch.setattr(hypotheses, 'predicted', lambda scans, nodes, blocks: nodes[0, :1])
     monkeypatch.setattr(hypotheses, 'gain', lambda before, after: Gain(float(after[0] - before[0]), 1.0))
     heading, solver = replace(right, certainty=0.7, doubts=((30, 0.3),)), SimpleNamespace(along_walls=lambda: None)
     found = solved(scans, heading, solver, None, lambda other: solver)

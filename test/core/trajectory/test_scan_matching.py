@@ -362,7 +362,7 @@ def test_what_explains_readings_no_better_than_what_is_known_is_not_looked_for_l
         assert len(trials.asked) == rounds
 
 
-def test_scan_matching_foresees_readings_better_than_corners_that_are_taken_for_square_ones(exact, scans) -> None:
+def test_scan_matching_predicts_readings_better_than_corners_that_are_taken_for_square_ones(exact, scans) -> None:
     true = odometry_of(exact).at(scans.windows.node_stamp)
     start = scan_matched(scans, TRUST, quietly)
     assert over_the_drive(scans, as_if_square(true, true), start, quietly).sigmas > any_angle.WORTH_A_TRIAL

@@ -5,19 +5,19 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from forward_grid_mapper.core import foresight as module
+from forward_grid_mapper.core import cross_validation as module
 from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.common.readings import Readings
-from forward_grid_mapper.core.foresight import (
+from forward_grid_mapper.core.cross_validation import (
     FOLDS,
     blocks_of,
+    cross_validated,
     folds_of,
-    foresight,
     log_likelihoods,
-    only_if_foreseen,
+    only_if_validated,
     standard_error,
 )
-from forward_grid_mapper.core.joint_learning import Foresight, learn_jointly
+from forward_grid_mapper.core.joint_learning import CrossValidation, learn_jointly
 from forward_grid_mapper.core.mapping import Mapper
 from forward_grid_mapper.simulation.drive import door_drive
 from forward_grid_mapper.simulation.sonar import NOISY, front_array
@@ -47,7 +47,7 @@ def test_readings_held_out_have_no_part_in_learning(monkeypatch: pytest.MonkeyPa
 
     monkeypatch.setattr(module, 'learn_jointly', learn)
     monkeypatch.setattr(module, 'log_likelihoods', judge)
-    assert foresight(READINGS, Parameters(), 1) == Foresight(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    assert cross_validated(READINGS, Parameters(), 1) == CrossValidation(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     assert len(learned_from) == FOLDS and len(judged) == 4 * FOLDS
     for k, stamps in enumerate(learned_from):
         assert all(not stamps & held for held in judged[4 * k : 4 * k + 4])
@@ -86,23 +86,23 @@ def test_the_standard_error_is_that_of_sums_of_blocks() -> None:
 @pytest.mark.parametrize(
     ('seen', 'better'),
     [
-        (Foresight(1.0, 1.0, 1.0, 1.0, 0.0, 0.0), False),
-        (Foresight(1.0, 1.0, 1.1, 1.2, 0.04, 0.04), True),
-        (Foresight(1.0, 1.0, 1.1, 1.2, 0.11, 0.04), False),
-        (Foresight(1.0, 1.0, 1.2, 1.1, 0.04, 0.11), False),
-        (Foresight(1.0, 1.0, 0.9, 3.0, 0.01, 0.01), False),
-        (Foresight(1.0, 1.0, 3.0, 0.9, 0.01, 0.01), False),
+        (CrossValidation(1.0, 1.0, 1.0, 1.0, 0.0, 0.0), False),
+        (CrossValidation(1.0, 1.0, 1.1, 1.2, 0.04, 0.04), True),
+        (CrossValidation(1.0, 1.0, 1.1, 1.2, 0.11, 0.04), False),
+        (CrossValidation(1.0, 1.0, 1.2, 1.1, 0.04, 0.11), False),
+        (CrossValidation(1.0, 1.0, 0.9, 3.0, 0.01, 0.01), False),
+        (CrossValidation(1.0, 1.0, 3.0, 0.9, 0.01, 0.01), False),
     ],
 )
-def test_a_map_has_to_be_better_by_both_values_and_by_more_than_chance(seen: Foresight, better: bool) -> None:
+def test_a_map_has_to_be_better_by_both_values_and_by_more_than_chance(seen: CrossValidation, better: bool) -> None:
     assert seen.better == better
 
 
 def test_a_short_drive_is_told_of() -> None:
     first = READINGS.select(READINGS.stamp < READINGS.stamp.min() + 5_000_000_000)
-    assert foresight(first, Parameters(), 1) is None
+    assert cross_validated(first, Parameters(), 1) is None
     found = learn_jointly(first, Parameters(), 1, keep_going=True)
-    kept = only_if_foreseen(found, first, Parameters(), 1)
+    kept = only_if_validated(found, first, Parameters(), 1)
     assert kept.parameters == found.parameters
     assert 'no readings could be held out' in kept.warnings[-1]
 
@@ -112,9 +112,9 @@ def test_values_are_accepted_where_the_first_ones_are_wrong_and_refused_where_th
     readings = door_drive(3, NOISY, 0).readings
     for given, accepted in (({'sigma': 0.6}, True), ({}, False)):
         parameters = Parameters().varied(given)
-        found = only_if_foreseen(learn_jointly(readings, parameters, 2), readings, parameters, 2)
+        found = only_if_validated(learn_jointly(readings, parameters, 2), readings, parameters, 2)
         assert (found.accepted > 0) == accepted
-        assert found.foresight is not None and found.foresight.better == accepted
+        assert found.cross_validation is not None and found.cross_validation.better == accepted
         assert (found.parameters == parameters) != accepted
         assert (found.maps.parameters == found.parameters) and (len(found.estimates) > 0) == accepted
     assert 'the learned values are refused' in found.warnings[-1]

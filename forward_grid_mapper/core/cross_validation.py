@@ -1,4 +1,4 @@
-"""Whether learned values are any good, by readings that had no part in learning them.
+"""Cross-validation of learned values, by readings that had no part in learning them.
 
 The drive is cut into blocks of `BLOCK` seconds, and every fifth block is held out in turn. From the rest, values are
 learned and two maps made, one with the values from the start and one with the learned values. Both maps are asked how
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from .common.grid import UNKNOWN
 from .common.parameters import ModelParameters, Parameters
 from .common.readings import Floats, Readings
-from .joint_learning import SURE, Foresight, Learned, Watch, learn_jointly
+from .joint_learning import SURE, CrossValidation, Learned, Watch, learn_jointly
 from .mapping import Mapper
 from .maps.map_set import MapSet
 from .messages.message_types import NANOSECONDS
@@ -44,9 +44,9 @@ def blocks_of(readings: Readings) -> NDArray[np.int64]:
     return np.asarray(since // BLOCK, np.int64)
 
 
-def foresight(
+def cross_validated(
     readings: Readings, parameters: Parameters, rounds: int, watch: Watch = lambda stage, progress: None
-) -> Foresight | None:
+) -> CrossValidation | None:
     """Return how likely readings are that had no part in learning; None if the drive is too short to hold any out.
 
     Parameters
@@ -73,7 +73,7 @@ def foresight(
             for j, values in enumerate((parameters.model, learned.parameters.model)):
                 log_likelihood[i, j, fold == k] = log_likelihoods(held, maps, values)
     errors = [standard_error(readings, log_likelihood[1, j] - log_likelihood[0, j]) for j in range(2)]
-    return Foresight(*log_likelihood.mean(axis=2).ravel().tolist(), *errors)
+    return CrossValidation(*log_likelihood.mean(axis=2).ravel().tolist(), *errors)
 
 
 def standard_error(readings: Readings, differences: Floats) -> float:
@@ -99,7 +99,7 @@ def log_likelihoods(held: Readings, maps: MapSet, values: ModelParameters) -> Fl
     )
 
 
-def only_if_foreseen(
+def only_if_validated(
     found: Learned,
     readings: Readings,
     parameters: Parameters,
@@ -112,12 +112,12 @@ def only_if_foreseen(
     """
     if not found.accepted:
         return found
-    seen = foresight(readings, parameters, rounds, watch)
+    seen = cross_validated(readings, parameters, rounds, watch)
     if seen is None:
         short = f'the drive is shorter than {FOLDS * BLOCK:.0f} s: no readings could be held out to judge the values by'
         return dataclasses.replace(found, warnings=(*found.warnings, short))
     if seen.better:
-        return dataclasses.replace(found, foresight=seen)
+        return dataclasses.replace(found, cross_validation=seen)
     at_first, at_learned = seen.gains
     why = (
         f'the learned values are refused, and the values from the start are kept: the map of the learned values does '
@@ -133,5 +133,5 @@ def only_if_foreseen(
         accepted=0,
         maps=Mapper(parameters).run(readings, watch),
         warnings=(*found.warnings, why),
-        foresight=seen,
+        cross_validation=seen,
     )
