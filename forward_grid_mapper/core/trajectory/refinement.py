@@ -38,7 +38,7 @@ from .relocating import LEAST_RECOGNISED, recognised_part
 from .scans import Scans
 from .solving import Solver
 from .walls import wall_votes
-from .windows import Odometry, Windows, corrected, cut
+from .windows import TRAVEL, Odometry, Windows, corrected, cut
 
 SHORTEST = 8.0
 """Metres of a drive below which nothing is refined: its drift is small, and there is little to judge it by."""
@@ -69,6 +69,10 @@ NO_WALLS = (
 )
 
 NOR_MATCHES = '; matches alone tell no better trajectory'
+
+SCAN_MATCHED = 2 * TRAVEL
+"""Metres between poses, for half of the way, up to which matching alone is tried. Scan matching takes the shape of two
+windows from odometry, and readings between poses are on a straight line: turns are lost."""
 
 Watch = Callable[[str, float], None]
 """Receives what is going on, and how much of it is done, from 0 to 1."""
@@ -227,6 +231,9 @@ class Refiner:
         """Return the trajectory that matches alone say, if it is better than what walls at right angles say."""
         readings, odometry, windows, scans = drive
         known = by_walls.nodes if by_walls.refinement.accepted else None
+        apart = usual_step(odometry)
+        if apart > SCAN_MATCHED:
+            return _stays(by_walls.refinement, too_sparse_words(apart))
         try:
             found = matched(odometry, scans, self._say, self._parameters.association.odometry_noise, known)
         except InputError:
@@ -317,6 +324,20 @@ def too_little_words(moved: float) -> str:
     return f'odometry is off by {moved:.2f} m, which is no more than sonar can tell'
 
 
+def usual_step(odometry: Odometry) -> float:
+    """Return the median distance between two poses over the way of the robot, metres."""
+    steps = np.sort(np.diff(odometry.travel))
+    return float(steps[np.searchsorted(np.cumsum(steps), steps.sum() / 2)])
+
+
+def too_sparse_words(apart: float) -> str:
+    """Return why matches alone are not tried where poses are so far apart, metres."""
+    return (
+        f'; poses of odometry are usually {apart:.1f} m apart, and matches alone need one every {SCAN_MATCHED:g} m: '
+        f'record odometry at a higher rate'
+    )
+
+
 def lost_words(certainty: float) -> str:
     """Return why a drive stays whose heading is this certain."""
     return f'the heading was lost somewhere: that it is not off by a right angle is only {certainty:.0%} certain'
@@ -332,9 +353,9 @@ def refined(odometry: Odometry, windows: Windows, nodes: Floats) -> Odometry:
     return Odometry(odometry.stamp, pose)
 
 
-def _stays(found: Refinement) -> Refinement:
-    """Return what walls said, after matches alone told nothing better."""
-    return found if found.accepted else replace(found, reason=found.reason + NOR_MATCHES)
+def _stays(found: Refinement, why: str = NOR_MATCHES) -> Refinement:
+    """Return what walls said, where matches alone told nothing better, or were not tried."""
+    return found if found.accepted else replace(found, reason=found.reason + why)
 
 
 def _lost(drive: _Drive, certainty: float) -> _Attempt:

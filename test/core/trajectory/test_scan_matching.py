@@ -206,6 +206,28 @@ def test_what_readings_do_not_speak_for_is_left(bent, matched, monkeypatch) -> N
     assert left.reason == refinement.NO_WALLS + refinement.NOR_MATCHES
 
 
+def test_matching_alone_needs_poses_within_its_windows(bent, matched, monkeypatch) -> None:
+    recording, odometry = bent
+    monkeypatch.setattr(Refiner, '_heading', no_walls)
+    monkeypatch.setattr(refinement, 'matched', lambda *rest: Matched(matched, [], np.inf, 1.0))
+    monkeypatch.setattr(refinement, 'seen_again', lambda *rest: Gain(0.1, 0.01))
+    assert Refiner(Parameters()).run(recording.readings, odometry).accepted
+    # a pose every metre, as of a recording at 0.5 Hz
+    kept = np.unique(np.searchsorted(odometry.travel, np.arange(0.0, odometry.travel[-1])))
+    sparse = Odometry(odometry.stamp[[*kept, -1]], odometry.pose[[*kept, -1]])
+    assert refinement.usual_step(sparse) == pytest.approx(1.0, abs=0.05)
+    left = Refiner(Parameters()).run(recording.readings, sparse)
+    assert not left.accepted
+    assert left.reason == refinement.NO_WALLS + refinement.too_sparse_words(refinement.usual_step(sparse))
+
+
+def test_the_usual_step_is_that_of_most_of_the_way() -> None:
+    # a hundred small steps where the robot hardly moves, and most of the way in steps of half a metre
+    along = np.concatenate([np.arange(101) * 0.01, 1.0 + np.arange(1, 11) * 0.5])
+    pose = np.stack([along, np.zeros_like(along), np.zeros_like(along)], axis=1)
+    assert refinement.usual_step(Odometry(np.arange(len(along)), pose)) == pytest.approx(0.5)
+
+
 def test_a_drive_too_large_for_cells_of_one_size_keeps_what_walls_say(bent, scans) -> None:
     recording, odometry = bent
     drive_of = _Drive(recording.readings, odometry, scans.windows, scans)
