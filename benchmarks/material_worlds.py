@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -326,7 +326,17 @@ def _count_passes(pose: Floats, angles: Floats, far: Floats, end: Floats, low: F
     passed += np.bincount(cells[on], minlength=passed.size).reshape(passed.shape)
 
 
-def building_case(seed: int, sensors: int | None = None, mostly: bool = False) -> Case:
+class BuildingDrive(NamedTuple):
+    """A drive through a building drawn at random: sensors, faces (world frame), exact poses and readings."""
+
+    sonars: SonarArray
+    segments: Floats
+    poses: Floats
+    stamps: NDArray[np.int64]
+    readings: Readings
+
+
+def building_drive(seed: int, sensors: int | None = None, there_and_back: bool = False) -> BuildingDrive:
     """Return the drive of a seed.
 
     Parameters
@@ -334,8 +344,8 @@ def building_case(seed: int, sensors: int | None = None, mostly: bool = False) -
     seed : int
     sensors : int, optional
         Which of `SENSORS`; by default, the seed chooses.
-    mostly : bool
-        What the truth calls a wall, as in `seen_by_laser`.
+    there_and_back : bool
+        Whether the robot drives back as well, and then another way through the building.
     """
     rng = np.random.default_rng([seed, 77])
     sonars, spacing = SENSORS[(seed if sensors is None else sensors) % len(SENSORS)]
@@ -343,12 +353,14 @@ def building_case(seed: int, sensors: int | None = None, mostly: bool = False) -
     plan.corridor(rng.uniform(9.0, 20.0), rng.uniform(1.5, 2.6))
     physics, turn = physics_of(rng), rng.uniform(-math.pi, math.pi)
     points = way_through(plan, rng)
+    if there_and_back:
+        points = np.concatenate([points, points[::-1], way_through(plan, rng)])
     c, s = math.cos(turn), math.sin(turn)
     poses = poses_along(points @ np.array([[c, s], [-s, c]]), spacing)
     segments = _rays(plan, turn)
     z = measure(plan, segments, sonars, poses, physics, rng)
     x, y, yaw = sonars.poses(poses).reshape(-1, 3).T
-    count = len(sonars.yaws)
+    count, stamps = len(sonars.yaws), np.arange(len(poses)) * int(spacing * 2e9)
     readings = Readings.from_columns(
         sonars.names,
         x=x,
@@ -357,9 +369,23 @@ def building_case(seed: int, sensors: int | None = None, mostly: bool = False) -
         z=np.minimum(z, sonars.max_range),
         z_max=sonars.max_range,
         half_angle=sonars.field_of_view / 2,
-        stamp=np.repeat(np.arange(len(poses)) * int(spacing * 2e9), count),
+        stamp=np.repeat(stamps, count),
         sensor=np.tile(np.arange(count), len(poses)),
     )
-    truth, origin = seen_by_laser(segments, poses, mostly)
+    return BuildingDrive(sonars, segments, poses, stamps, readings)
+
+
+def building_case(seed: int, sensors: int | None = None, mostly: bool = False) -> Case:
+    """Return the drive of a seed, and what a laser would have seen.
+
+    Parameters
+    ----------
+    seed, sensors
+        As in `building_drive`.
+    mostly : bool
+        What the truth calls a wall, as in `seen_by_laser`.
+    """
+    driven = building_drive(seed, sensors)
+    truth, origin = seen_by_laser(driven.segments, driven.poses, mostly)
     nobody = np.zeros((0, 0), np.int64)
-    return Case(f'materials {seed}', readings, poses[:, :2], truth, origin, CELL, None, nobody)
+    return Case(f'materials {seed}', driven.readings, driven.poses[:, :2], truth, origin, CELL, None, nobody)

@@ -4,6 +4,7 @@
     python benchmarks/trajectories.py --robot front --level wheels --seeds 2
     python benchmarks/trajectories.py --maps                # and the maps that are made of them
     python benchmarks/trajectories.py --shared ../shared/data
+    python benchmarks/trajectories.py --drawn 12            # buildings of many materials, drawn at random
     python benchmarks/trajectories.py --distance 250 500 1000    # how time and memory grow
 
 Each run prints the absolute trajectory error (rms after rigid alignment, metres) of odometry and of what `Refiner`
@@ -24,18 +25,20 @@ from types import ModuleType
 from typing import Any
 
 import numpy as np
+from material_worlds import building_drive
 from quality_worlds import scoring_tool
 
 from forward_grid_mapper.core.common.grid import UNKNOWN
 from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.common.readings import Readings
 from forward_grid_mapper.core.mapping import Mapper
+from forward_grid_mapper.core.trajectory.outcome import replaced
 from forward_grid_mapper.core.trajectory.poses import compose, rms_after_alignment
 from forward_grid_mapper.core.trajectory.refinement import Refiner
 from forward_grid_mapper.core.trajectory.windows import Odometry
 from forward_grid_mapper.core.warm_up import warm_up
 from forward_grid_mapper.recordings.read_drive import read_drive
-from forward_grid_mapper.simulation.drift import LEVELS, odometry_of, with_drift
+from forward_grid_mapper.simulation.drift import LEVELS, drifted, odometry_of, with_drift
 from forward_grid_mapper.simulation.drive import Recording, drive
 from forward_grid_mapper.simulation.score import SURFACE_DEPTH, score_map, visible_surface
 from forward_grid_mapper.simulation.sonar import NoiseModel, SonarArray, front_array, sonar_ring
@@ -185,6 +188,20 @@ def simulated(robot: str, level: str, seeds: range, first: int, maps: bool) -> l
     return rows
 
 
+def drawn(level: str, seeds: range) -> list[dict[str, Any]]:
+    """Run drives through buildings of many materials, turned by any angle, with sensors that the seed chooses."""
+    rows = []
+    for seed in seeds:
+        _, _, poses, stamps, readings = building_drive(seed, there_and_back=True)
+        true = Odometry.of(stamps, poses)
+        odometry = Odometry.of(stamps, drifted(true.pose, LEVELS[level], seed) if level != 'none' else poses)
+        count = len(readings.sensor_names)
+        angle = 2 * math.degrees(readings.half_angle[0])
+        title = f'drawn, {level}, {count} x {angle:.0f}°, {true.travel[-1]:.0f} m, seed {seed}'
+        rows.append(run(title, replaced(readings, true, odometry), odometry, true))
+    return rows
+
+
 def far(robot: str, level: str, distances: list[float], seed: int) -> None:
     """Run drives around one building, longer and longer ones, and print time and the most memory so far."""
     sonars, spacing, noise = ROBOTS[robot]
@@ -257,6 +274,7 @@ def main() -> None:
     parser.add_argument('--first-seed', type=int, default=0, help='0 to 9, 20 and 21 were tuned on')
     parser.add_argument('--maps', action='store_true', help='score the maps of simulated runs, too')
     parser.add_argument('--shared', type=Path, help='folder of recordings with corrected odometry, instead')
+    parser.add_argument('--drawn', type=int, help='so many buildings drawn at random, instead')
     parser.add_argument('--distance', type=float, nargs='+', help='metres of longer and longer drives, instead')
     options = parser.parse_args()
     warm_up()
@@ -267,6 +285,11 @@ def main() -> None:
         return
     if options.shared:
         summary('recordings', recorded(options.shared))
+        return
+    if options.drawn:
+        for level in options.level or ['wheels']:
+            rows = drawn(level, range(options.first_seed, options.first_seed + options.drawn))
+            summary(f'drawn, {level}', rows)
         return
     for robot in options.robot or ROBOTS:
         for level in options.level or ('none', *LEVELS):
