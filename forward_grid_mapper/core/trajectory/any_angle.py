@@ -11,7 +11,7 @@ import math
 from collections.abc import Callable
 from typing import NamedTuple
 
-from .judging import over_the_drive
+from .judging import gain_over_drive
 from .loops import Loop
 from .odometry_model import CALIBRATION, sensitivity
 from .passes import Progress
@@ -23,7 +23,7 @@ from .scans import Scans
 from .solving import SETTLED, MatchSolver
 from .windows import Odometry
 
-LEFT = math.radians(3.0)
+REMAINING_YAW_NOISE = math.radians(3.0)
 """By how much the yaw strays after scan matching, and after each round, radians a √metre."""
 
 WORTH_A_TRIAL = 1.5
@@ -34,7 +34,7 @@ ROUNDS = 4
 """Times that the pose graph is made from what was found before, at the most."""
 
 
-class Matched(NamedTuple):
+class MatchedDrive(NamedTuple):
     """Where a drive is by matches alone.
 
     Attributes
@@ -54,13 +54,13 @@ class Matched(NamedTuple):
     part: float
 
 
-def matched(
+def match_drive(
     odometry: Odometry,
     scans: Scans,
-    say: Callable[[str], Progress],
+    start_stage: Callable[[str], Progress],
     noise: float = 0.0,
     known: Floats | None = None,
-) -> Matched | None:
+) -> MatchedDrive | None:
     """Return where a drive is by matches alone; None if the map along it explains its readings no better.
 
     It has to explain them better than the map along odometry, and than the one along the nodes that are `known`. More
@@ -70,7 +70,7 @@ def matched(
     ----------
     odometry : Odometry
     scans : Scans
-    say : callable
+    start_stage : callable
         Receives a stage, and returns what receives how much of it is done.
     noise : float
         By how much the yaw of odometry strays, radians a √metre; 0 if nobody knows.
@@ -80,10 +80,12 @@ def matched(
     if known is not None:
         value = max(value, scans.objective(known))
     for trust in TRUSTS:
-        start = scan_matched(scans, trust._replace(yaw=noise or trust.yaw), say('scan matching'))
-        if known is not None and over_the_drive(scans, known, start, say('judgement')).sigmas < WORTH_A_TRIAL:
+        start = scan_matched(scans, trust._replace(yaw=noise or trust.yaw), start_stage('scan matching'))
+        if known is not None and gain_over_drive(scans, known, start, start_stage('judgement')).sigmas < WORTH_A_TRIAL:
             break
-        found = _in_rounds(odometry, scans, say, start, min(LEFT, noise or LEFT), value)
+        found = _match_repeatedly(
+            odometry, scans, start_stage, start, min(REMAINING_YAW_NOISE, noise or REMAINING_YAW_NOISE), value
+        )
         if found is not None:
             best, value = found, found.value
         # a drive that fits together hardly gains from another trial, nor does one that is better explained already
@@ -92,17 +94,17 @@ def matched(
     return best
 
 
-def _in_rounds(
-    odometry: Odometry, scans: Scans, say: Callable[[str], Progress], start: Floats, noise: float, least: float
-) -> Matched | None:
+def _match_repeatedly(
+    odometry: Odometry, scans: Scans, start_stage: Callable[[str], Progress], start: Floats, noise: float, least: float
+) -> MatchedDrive | None:
     """Return the best of what is found by matching again and again from what was found; None if it is not better."""
     change, nodes = sensitivity(odometry, scans.windows), start
     best = None
     for _ in range(ROUNDS):
-        solver = MatchSolver(scans.windows, scans, say, relative(nodes[:-1], nodes[1:]), noise, change)
+        solver = MatchSolver(scans.windows, scans, start_stage, relative(nodes[:-1], nodes[1:]), noise, change)
         solution, loops = solver.with_matches(solution_at(nodes, len(CALIBRATION)))
         before, nodes = nodes, solution.nodes
-        found = Matched(nodes, loops, scans.objective(nodes), recognised_part(scans, nodes, loops))
+        found = MatchedDrive(nodes, loops, scans.objective(nodes), recognised_part(scans, nodes, loops))
         if found.value <= least:
             break
         best, least = found, found.value

@@ -43,7 +43,7 @@ FEWEST_PIECES = 8
 STEPS = {'scale': 0.02, 'heading': math.radians(1.0)}
 """By how much scale and heading are changed: parts, and radians."""
 
-ASKED, LENGTH, SPAN = 40, 3, 5.0
+MOST_BLOCKS, LENGTH, SPAN = 40, 3, 5.0
 """Blocks that are asked, the windows of each, and metres of progress around it that its map is made of."""
 
 DENSITY = 80.0
@@ -54,32 +54,32 @@ FEWEST_BLOCKS = 8
 FARTHEST = 2.0
 """Steps that the top may lie away."""
 
-LEAST = {'scale': 0.004, 'heading': math.radians(0.3), 'bias': math.radians(0.05), 'turn_scale': 0.003}
+LEAST_SIGMA = {'scale': 0.004, 'heading': math.radians(0.3), 'bias': math.radians(0.05), 'turn_scale': 0.003}
 """σ that is stated at the least."""
 
-MOST = {'scale': 0.012, 'heading': math.radians(0.6), 'bias': math.radians(0.5), 'turn_scale': 0.015}
+LARGEST_SIGMA = {'scale': 0.012, 'heading': math.radians(0.6), 'bias': math.radians(0.5), 'turn_scale': 0.015}
 """σ from which on nothing is told."""
 
 
-OF_YAW = ('bias', 'turn_scale')
-"""What `of_yaw` tells."""
+YAW_ERRORS = ('bias', 'turn_scale')
+"""What `yaw_errors` tells."""
 
 
-class Told(NamedTuple):
+class Estimate(NamedTuple):
     """A figure of the calibration, and its standard deviation."""
 
     value: float
     sigma: float
 
 
-def certain(
+def determined_calibration(
     readings: Readings,
     odometry: Odometry,
     trajectory: Odometry,
     calibration: dict[str, float],
     parameters: Parameters,
     stop: NDArray[np.uint8],
-) -> dict[str, Told]:
+) -> dict[str, Estimate]:
     """Return what a drive tells of its odometry with certainty, by the names of `CALIBRATION`.
 
     Parameters
@@ -99,13 +99,13 @@ def certain(
     Cancelled
         If `stop` was set.
     """
-    found = of_yaw(odometry, trajectory)
-    found |= of_ways(readings, odometry, trajectory, calibration, parameters, stop)
-    stated = {name: Told(value, math.hypot(sigma, LEAST[name])) for name, (value, sigma) in found.items()}
-    return {name: stated[name] for name in CALIBRATION if name in stated and stated[name].sigma <= MOST[name]}
+    found = yaw_errors(odometry, trajectory)
+    found |= translation_errors(readings, odometry, trajectory, calibration, parameters, stop)
+    stated = {name: Estimate(value, math.hypot(sigma, LEAST_SIGMA[name])) for name, (value, sigma) in found.items()}
+    return {name: stated[name] for name in CALIBRATION if name in stated and stated[name].sigma <= LARGEST_SIGMA[name]}
 
 
-def after(first: Mapping[str, float], told: Mapping[str, Told]) -> dict[str, Told]:
+def combined_calibration(first: Mapping[str, float], told: Mapping[str, Estimate]) -> dict[str, Estimate]:
     """Return what a drive tells of its odometry, where `told` is of odometry that `first` was applied to."""
     one = {name: first.get(name, 0.0) for name in CALIBRATION}
     found = {}
@@ -117,11 +117,11 @@ def after(first: Mapping[str, float], told: Mapping[str, Told]) -> dict[str, Tol
             both = (1 + turns) * one[name] + value * (1 + one['scale'])
         else:
             both = (1 + one[name]) * (1 + value) - 1
-        found[name] = Told(both, sigma)
+        found[name] = Estimate(both, sigma)
     return found
 
 
-def of_yaw(odometry: Odometry, trajectory: Odometry) -> dict[str, Told]:
+def yaw_errors(odometry: Odometry, trajectory: Odometry) -> dict[str, Estimate]:
     """Return bias and scale of turns from the yaw of a trajectory; empty if the drive is too short."""
     ends = np.arange(0.0, odometry.progress[-1], PIECE)
     if len(ends) <= FEWEST_PIECES:
@@ -132,48 +132,48 @@ def of_yaw(odometry: Odometry, trajectory: Odometry) -> dict[str, Told]:
     steps = np.diff(pose[:, :2], axis=0)
     ahead = np.concatenate([[0.0], np.cumsum(np.cos(middle) * steps[:, 0] + np.sin(middle) * steps[:, 1])])
     columns = [np.diff(np.interp(ends, knots, column)) for column in (ahead, pose[:, 2])]
-    more = np.diff(np.interp(ends, knots, np.unwrap(wrapped(trajectory.pose[:, 2] - pose[:, 2]))))
-    given = np.stack(columns, axis=1)
-    gram = given.T @ given
+    difference = np.diff(np.interp(ends, knots, np.unwrap(wrapped(trajectory.pose[:, 2] - pose[:, 2]))))
+    regressors = np.stack(columns, axis=1)
+    gram = regressors.T @ regressors
     if np.linalg.matrix_rank(gram) < 2:
         return {}
     inverse = np.linalg.inv(gram)
-    values = inverse @ (given.T @ more)
-    left = more - given @ values
+    values = inverse @ (regressors.T @ difference)
+    residual = difference - regressors @ values
     # each residual by itself: wheels slip now and then
-    spread = given * (left * math.sqrt(len(left) / (len(left) - 2)))[:, None]
+    spread = regressors * (residual * math.sqrt(len(residual) / (len(residual) - 2)))[:, None]
     sigma = np.sqrt(np.diag(inverse @ (spread.T @ spread) @ inverse))
-    return {name: Told(float(v), float(s)) for name, v, s in zip(OF_YAW, values, sigma, strict=True)}
+    return {name: Estimate(float(v), float(s)) for name, v, s in zip(YAW_ERRORS, values, sigma, strict=True)}
 
 
-def of_ways(
+def translation_errors(
     readings: Readings,
     odometry: Odometry,
     trajectory: Odometry,
     calibration: dict[str, float],
     parameters: Parameters,
     stop: NDArray[np.uint8],
-) -> dict[str, Told]:
+) -> dict[str, Estimate]:
     """Return scale and heading as readings tell them; what they do not tell is left out."""
     parameters = for_matching(parameters)
     every = max(int(len(readings) / max(DENSITY * odometry.travel[-1], 1.0)), 1)
     windows = cut(thinned(readings, every), odometry)
     scans = Scans(windows, parameters, stop, np.zeros_like(held_out(len(windows))))
     turned = with_yaw(odometry, odometry.progress, np.unwrap(wrapped(trajectory.pose[:, 2] - odometry.pose[:, 2])))
-    blocks = blocks_of(len(windows), LENGTH, ASKED)
+    blocks = blocks_of(len(windows), LENGTH, MOST_BLOCKS)
 
     def value_at(trial: dict[str, float]) -> Floats:
-        ways = np.array([trial['scale'], trial['heading'], 0.0, 0.0])
-        return predicted(scans, calibrated(turned, ways).at(windows.node_stamp), blocks, SPAN)
+        translation = np.array([trial['scale'], trial['heading'], 0.0, 0.0])
+        return predicted(scans, calibrated(turned, translation).at(windows.node_stamp), blocks, SPAN)
 
     start = {name: calibration.get(name, 0.0) for name in STEPS}
     middle = value_at(start)
     found = {}
     for name, step in STEPS.items():
         low, high = (value_at({**start, name: start[name] + sign * step}) for sign in (-1, 1))
-        told = top_of(low, middle, high)
-        if told is not None:
-            found[name] = Told(start[name] + step * told.value, step * told.sigma)
+        estimate = parabola_top(low, middle, high)
+        if estimate is not None:
+            found[name] = Estimate(start[name] + step * estimate.value, step * estimate.sigma)
     return found
 
 
@@ -187,7 +187,7 @@ def thinned(readings: Readings, every: int) -> Readings:
     return readings.select(stay)
 
 
-def top_of(low: Floats, middle: Floats, high: Floats) -> Told | None:
+def parabola_top(low: Floats, middle: Floats, high: Floats) -> Estimate | None:
     """Return where the sum of blocks' values is highest, in steps from the middle; None if they do not say.
 
     Parameters
@@ -207,4 +207,4 @@ def top_of(low: Floats, middle: Floats, high: Floats) -> Told | None:
     if abs(top) > FARTHEST:
         return None
     off = slope + curvature * top
-    return Told(top, float(np.sqrt((off**2).sum())) / -total)
+    return Estimate(top, float(np.sqrt((off**2).sum())) / -total)

@@ -38,7 +38,7 @@ from .pose_graph import Edges, Graph, Yaws, joined, no_edges, no_walls, solve
 from .poses import Floats, axes_at, compose, interpolated, relative
 from .refinement import SHORTEST
 from .scans import FEWEST_ON_MAP, Scans
-from .solving import LEAST_YAW, UNSEEN
+from .solving import LEAST_YAW, NOISE_FACTOR
 from .wall_distances import Distances
 from .walls import wall_votes
 from .windows import TRAVEL, TURN, Odometry, Windows, cut
@@ -67,7 +67,7 @@ REACH, STEPS = np.array([0.6, 0.6, math.radians(7.5)]), (0.2, 0.2, math.radians(
 
 SIGMAS = 2.5
 
-ASKED, MEASURED, CLIMBS = 60, 100, 3
+EVALUATED, MEASURED, CLIMBS = 60, 100, 3
 """Readings that the search asks, those that measure the best pose, and parabolas that it is moved to the top of."""
 
 GOOD = 0.65
@@ -140,12 +140,12 @@ class Follower:
         right_angles: bool = True,
     ) -> None:
         self._right_angles = right_angles
-        self.correction = self._before = self._proven = self._now = correction
+        self.correction = self._settled = self._proven = self._followed = correction
         self.kept, self.windows, self.places, self.obstacle = False, 0, 0, ''
         self._parameters, self._stop = for_matching(parameters), np.zeros(1, np.uint8)
         self._calibration = np.array([calibration.get(name, 0.0) for name in CALIBRATION])
         known = parameters.association.odometry_noise or noise
-        self._noise = Noise(yaw=max(LEAST_YAW, UNSEEN * known)) if known else Noise()
+        self._noise = Noise(yaw=max(LEAST_YAW, NOISE_FACTOR * known)) if known else Noise()
         self._tail: _Tail | None = None
         self._axes = np.zeros(3)
         self._past = Readings.from_columns(z=[], x=[], y=[], yaw=[], z_max=[], half_angle=[])
@@ -174,12 +174,12 @@ class Follower:
         """
         was, newest = self.correction, readings.stamp.max(initial=0)
         if self._tail is None and not self.obstacle:
-            self._tail = self._begun(readings)
+            self._tail = self._first_tail(readings)
         tail = self._tail
         while tail is not None and not self.obstacle:
             check(self._stop)
             whole = _continued(tail.odometry, odometry)
-            u = _steps(whole)
+            u = _window_coordinate(whole)
             end = int(np.searchsorted(u, len(tail.nodes) + 1))
             if end == len(u) or whole.stamp[end] + LATE > newest:
                 break
@@ -191,7 +191,7 @@ class Follower:
             tail = self._tail = self._step(tail, readings, part)
         return self.correction is not was
 
-    def _begun(self, readings: Readings) -> _Tail | None:
+    def _first_tail(self, readings: Readings) -> _Tail | None:
         """Return the tail where the whole drive ends, and remember what was mapped before it."""
         path, whole = self.correction.trajectory, self.correction.odometry
         odometry = since_jump(whole)
@@ -210,7 +210,7 @@ class Follower:
         if early.any():
             before = self.correction.apply(in_canonical_order(readings.select(early)))
             sensors = np.stack([before.x, before.y, before.yaw], axis=1)
-            self._past = _both(at_poses(before, relative(self._axes, sensors)), self._past)
+            self._past = _concatenated(at_poses(before, relative(self._axes, sensors)), self._past)
         nodes = relative(self._axes, nodes[begin:])
         nodes[:, 2] = np.unwrap(nodes[:, 2])
         return _Tail(_from_step(odometry, begin), nodes, len(nodes), no_edges())
@@ -221,14 +221,14 @@ class Follower:
         windows = cut(in_canonical_order(readings.select(within)), odometry)
         count, none = len(windows), np.zeros(len(windows), np.bool_)
         motion = motions(calibrated(odometry, self._calibration), windows)
-        nodes, places = _ahead(tail.nodes, motion), tail.places
+        nodes, places = _extrapolated(tail.nodes, motion), tail.places
         if count >= 2 * BLOCK and count % BLOCK in (0, RECOGNISING):
             scans = Scans(windows, self._parameters, self._stop, none)
             block = np.arange(count - BLOCK, count)
             if count % BLOCK:
                 places = joined(places, self._recognised(scans, nodes, block))
             else:
-                self._judge(scans, _ahead(tail.nodes[: block[0]], motion), block)
+                self._judge(scans, _extrapolated(tail.nodes[: block[0]], motion), block)
         solution = solve(self._graph(windows, motion, nodes, tail._replace(places=places)), nodes, np.zeros(0))
         self.windows += count - len(tail.nodes)
         tail = _Tail(odometry, solution.nodes, tail.settled, places)
@@ -269,7 +269,7 @@ class Follower:
         around = local_map(placed, self._parameters, self._stop)
         at = relative(nodes[0], guess)
         poses = grid_around(at, REACH, STEPS)
-        values = scores(joint, around, poses, max(len(joint.readings) // ASKED, 1))
+        values = scores(joint, around, poses, max(len(joint.readings) // EVALUATED, 1))
         off = relative(at, poses) * SIGMAS / REACH
         best = poses[int((values - 0.5 * (off**2).sum(1)).argmax())]
         for _ in range(CLIMBS):
@@ -287,15 +287,15 @@ class Follower:
         early = w.node_stamp <= proven.end
         kept[early] = followed[early]
         members = np.flatnonzero(w.node_progress[block[0]] - w.node_progress[: block[0]] < BEHIND)
-        count, place, said = int(scans.count[block].sum()), int(members[-1]), []
+        count, place, block_scores = int(scans.count[block].sum()), int(members[-1]), []
         for nodes in (followed, kept):
             around = scans.map(members, nodes[place], nodes)
             if around is None or not count:
                 return
             at = relative(nodes[place], nodes)
-            said.append(sum(float(scores(scans.scan[k], around, at[k : k + 1])[0]) for k in block))
-        self._score, self._scored = self._score + said[0], self._scored + count
-        self._gains = [*self._gains[1 - JUDGED :], (said[0] - said[1]) / count]
+            block_scores.append(sum(float(scores(scans.scan[k], around, at[k : k + 1])[0]) for k in block))
+        self._score, self._scored = self._score + block_scores[0], self._scored + count
+        self._gains = [*self._gains[1 - JUDGED :], (block_scores[0] - block_scores[1]) / count]
 
     def _put_in_force(self, tail: _Tail, windows: Windows) -> None:
         """Set the correction: that of the tail, or the proven one where this predicts readings better."""
@@ -303,22 +303,22 @@ class Follower:
         pose = windows.corrected(odometry.progress, odometry.pose, tail.nodes)
         # the first pose is that of a window's begin
         stamp, path = odometry.stamp[1:], compose(self._axes, pose[1:])
-        now = self._before.continued(Odometry(stamp, odometry.pose[1:]), Odometry(stamp, path))
+        now = self._settled.continued(Odometry(stamp, odometry.pose[1:]), Odometry(stamp, path))
         better = gain(np.zeros(len(self._gains)), np.array(self._gains)).sigmas
         if better > LEAST_SIGMAS:
             self._proven, self._gains = now, []
         self.kept = better < (0.0 if self.kept else -MOST_WORSE)
-        self.correction, self._now = (self._proven if self.kept else now), now
+        self.correction, self._followed = (self._proven if self.kept else now), now
 
     def _shifted(self, tail: _Tail, windows: Windows) -> _Tail:
         """Return the tail without its first windows; what they read is of another time from here on."""
         w, end = windows, windows.first[SHIFT]
         robot = w.corrected(w.progress[:end], w.robot[:end], tail.nodes)
         leaving = at_poses(w.readings.select(slice(0, end)), compose(robot, w.mount[:end]))
-        self._past = _both(self._past, leaving)
+        self._past = _concatenated(self._past, leaving)
         odometry = _from_step(tail.odometry, SHIFT)
-        self._before = self._now.until(max(int(odometry.stamp[0]), self._before.end))
-        places = _seen_from(tail.places, relative(tail.nodes[SHIFT], tail.nodes[0]), SHIFT)
+        self._settled = self._followed.until(max(int(odometry.stamp[0]), self._settled.end))
+        places = _edges_from(tail.places, relative(tail.nodes[SHIFT], tail.nodes[0]), SHIFT)
         return _Tail(odometry, tail.nodes[SHIFT:], SETTLED, places)
 
 
@@ -334,7 +334,7 @@ def direction_of_walls(windows: Windows, nodes: Floats) -> float:
     return direction - float((off * sure).sum() / max(sure.sum(), 1e-9))
 
 
-def _ahead(nodes: Floats, motion: Floats) -> Floats:
+def _extrapolated(nodes: Floats, motion: Floats) -> Floats:
     """Return nodes and those that follow from the motions behind them, shape (K, 3)."""
     out = list(nodes)
     for step in motion[len(nodes) - 1 :]:
@@ -342,7 +342,7 @@ def _ahead(nodes: Floats, motion: Floats) -> Floats:
     return np.array(out)
 
 
-def _steps(odometry: Odometry) -> Floats:
+def _window_coordinate(odometry: Odometry) -> Floats:
     """Return u of each pose, as in `windows`."""
     out: Floats = odometry.travel / TRAVEL + odometry.turn / TURN
     return out
@@ -350,7 +350,7 @@ def _steps(odometry: Odometry) -> Floats:
 
 def _from_step(odometry: Odometry, begin: int) -> Odometry:
     """Return the odometry from where u is `begin` on."""
-    u = _steps(odometry)
+    u = _window_coordinate(odometry)
     first = int(np.searchsorted(u, begin, side='right'))
     part = (begin - u[first - 1]) / (u[first] - u[first - 1])
     stamp = odometry.stamp[first - 1] + round(part * (odometry.stamp[first] - odometry.stamp[first - 1]))
@@ -365,7 +365,7 @@ def _continued(tail: Odometry, odometry: Odometry) -> Odometry:
     return Odometry.of(stamp, np.concatenate([tail.pose, odometry.pose[first:]]))
 
 
-def _seen_from(places: Edges, first: Floats, leaving: int) -> Edges:
+def _edges_from(places: Edges, first: Floats, leaving: int) -> Edges:
     """Return places without those of settled nodes when so many nodes leave.
 
     Parameters
@@ -381,7 +381,7 @@ def _seen_from(places: Edges, first: Floats, leaving: int) -> Edges:
     return Edges(places.first[stay], places.second[stay] - leaving, compose(first, places.pose[stay]), information)
 
 
-def _both(one: Readings, other: Readings) -> Readings:
+def _concatenated(one: Readings, other: Readings) -> Readings:
     """Return readings, and later ones of the same drive."""
     columns: dict[str, Any] = {
         column.name: np.concatenate([getattr(one, column.name), getattr(other, column.name)])

@@ -37,7 +37,7 @@ STATES = 2 * DIRECTIONS
 
 STEP = math.radians(90.0 / STATES)
 
-DOUBT = 0.3
+UNIFORM_PART = 0.3
 """Weight of a vote that says nothing: boxes and people have directions too."""
 
 SLIPS = 0.03
@@ -189,7 +189,7 @@ class _Chain:
         ends = np.column_stack([votes, votes[:, :1]])
         places = np.arange(DIRECTIONS + 1)
         rows = np.stack([np.interp(place, places, row) for place, row in zip(seen, ends, strict=True)])
-        self.likelihood: Floats = (DOUBT + (1.0 - DOUBT) * rows) ** temper
+        self.likelihood: Floats = (UNIFORM_PART + (1.0 - UNIFORM_PART) * rows) ** temper
         self._anywhere = np.full(self.states, 1 / self.states)
         self._other = -np.expm1(-ENTERED * self.length) if len(askew) > 1 else np.zeros(len(self.length))
 
@@ -235,7 +235,7 @@ class _Chain:
         return float(each.max() + math.log(np.exp(each - each.max()).mean()))
 
 
-def _followed(chain: _Chain, belief: Floats) -> tuple[Floats, Floats]:
+def _most_probable(chain: _Chain, belief: Floats) -> tuple[Floats, Floats]:
     """Return the most probable right angle's mean δ at each place, without jumps, and its probability."""
     half = (np.abs(chain.off(0.0)) < math.pi / 4).astype(np.float64)
     masses = np.fft.irfft(np.fft.rfft(belief, axis=1) * np.conj(np.fft.rfft(half)), chain.states, axis=1)
@@ -318,7 +318,7 @@ def heading(windows: Windows, at: NDArray[np.int64], votes: Floats, noises: Sequ
     chain = _Chain(windows, at, votes)
     best, value = _fitted(chain, Drifts(0.0, 0.0, noises[len(noises) // 2]), noises)
     while len(askew) <= PARTS_ASKEW:
-        angle, noise, likelier = _another(windows, at, votes, askew, best, noises)
+        angle, noise, likelier = _further_direction(windows, at, votes, askew, best, noises)
         if likelier <= value:
             break
         other = _Chain(windows, at, votes, [*askew, angle])
@@ -334,7 +334,7 @@ def heading(windows: Windows, at: NDArray[np.int64], votes: Floats, noises: Sequ
     first = chain.grid[int(chain.smooth(best)[0].sum(0).argmax())]
     start = (np.abs(circle.off(first)) < math.pi / 4).astype(np.float64)
     belief = circle.smooth(best, start)
-    correction, certain = _followed(circle, belief.sum(1))
+    correction, certain = _most_probable(circle, belief.sum(1))
     direction = np.array(askew)[belief.sum(2).argmax(1)]
     measured, information = yaws_of_votes(votes, windows.node[at, 2] - direction, correction)
     return Heading(
@@ -352,7 +352,7 @@ def heading(windows: Windows, at: NDArray[np.int64], votes: Floats, noises: Sequ
     )
 
 
-def _value(chain: _Chain, drifts: Drifts) -> float:
+def _log_posterior(chain: _Chain, drifts: Drifts) -> float:
     """Return the log-likelihood of all votes, with the prior of a calibration."""
     prior = (drifts.bias / BIAS_SIGMA) ** 2 + (drifts.turn_scale / TURN_SCALE_SIGMA) ** 2
     return chain.log_likelihood(drifts) - 0.5 * prior
@@ -362,11 +362,11 @@ def _fitted(chain: _Chain, drifts: Drifts, noises: Sequence[float]) -> tuple[Dri
     """Return the likeliest drift, one figure after the other, and its value."""
     for name, values in (('bias', BIASES), ('turn_scale', TURN_SCALES), ('noise', noises)):
         tried = [drifts._replace(**{name: float(value)}) for value in values]
-        drifts = max(tried, key=lambda each: _value(chain, each))
-    return drifts, _value(chain, drifts)
+        drifts = max(tried, key=lambda each: _log_posterior(chain, each))
+    return drifts, _log_posterior(chain, drifts)
 
 
-def _another(
+def _further_direction(
     windows: Windows,
     at: NDArray[np.int64],
     votes: Floats,
@@ -382,7 +382,7 @@ def _another(
         tried = []
         for angle in angles:
             chain = _Chain(windows, at, votes, [*askew, angle])
-            tried += [(angle, noise, _value(chain, drifts._replace(noise=noise))) for noise in noises]
+            tried += [(angle, noise, _log_posterior(chain, drifts._replace(noise=noise))) for noise in noises]
         return max(tried, key=lambda each: each[2])
 
     quarter = math.pi / 2

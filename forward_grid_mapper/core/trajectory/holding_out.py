@@ -28,7 +28,7 @@ NEAR = 4.0
 LEAST_SIGMAS = 2.3
 """Standard errors by which readings must be predicted better: by chance it is so in one of 100."""
 
-LATER = 10.0
+REVISIT_AFTER = 10.0
 """Metres of progress after which a place that the robot is at was seen before, rather than just now."""
 
 FEWEST = 5
@@ -59,10 +59,10 @@ def predicted(scans: Scans, nodes: Floats, blocks: list[NDArray[np.int64]], span
     along = hashlib.sha256(nodes.tobytes()).digest()
     out = np.empty(len(blocks))
     for i, block in enumerate(blocks):
-        asked = along, block.tobytes(), span
-        if asked not in scans.judged:
-            scans.judged[asked] = _predicted(scans, nodes, block, span)
-        out[i] = scans.judged[asked]
+        key = along, block.tobytes(), span
+        if key not in scans.predictions:
+            scans.predictions[key] = _predicted(scans, nodes, block, span)
+        out[i] = scans.predictions[key]
     return out
 
 
@@ -94,11 +94,11 @@ class Gain(NamedTuple):
 
 def gain(before: Floats, after: Floats) -> Gain:
     """Return the gain of one trajectory over another, by what `predicted` says of the same blocks."""
-    more = after - before
-    more = more[np.isfinite(more)]
-    if len(more) < FEWEST_BLOCKS:
+    difference = after - before
+    difference = difference[np.isfinite(difference)]
+    if len(difference) < FEWEST_BLOCKS:
         return Gain(0.0, np.inf)
-    return Gain(float(more.mean()), float(more.std(ddof=1) / np.sqrt(len(more))))
+    return Gain(float(difference.mean()), float(difference.std(ddof=1) / np.sqrt(len(difference))))
 
 
 def blocks_of(count: int, length: int, most: int) -> list[NDArray[np.int64]]:
@@ -115,13 +115,13 @@ def held_out_blocks(scans: Scans, most: int) -> list[NDArray[np.int64]]:
     return [chosen[k] for k in blocks_of(len(chosen), 1, most)]
 
 
-def came_back(scans: Scans, nodes: Floats) -> bool:
-    """Return whether the robot came back to places, by this trajectory of the nodes, float64, shape (K, 3).
+def has_revisits(scans: Scans, nodes: Floats) -> bool:
+    """Return whether the robot came back to places, along nodes of shape (K, 3).
 
-    So it is where windows that are held out lie near what was driven `LATER` or before; it takes `FEWEST_BLOCKS`.
+    At least `FEWEST_BLOCKS` held-out windows must lie near a node more than `REVISIT_AFTER` away along the drive.
     """
     progress, count = scans.windows.node_progress, 0
     for k in np.flatnonzero(scans.held_out):
         near = np.hypot(*(nodes[:, :2] - nodes[k, :2]).T) < NEAR
-        count += bool((near & (np.abs(progress - progress[k]) > LATER)).any())
+        count += bool((near & (np.abs(progress - progress[k]) > REVISIT_AFTER)).any())
     return count >= FEWEST_BLOCKS

@@ -25,7 +25,7 @@ from .solving import Solver
 JUDGED_ON = 60
 """Blocks that solutions are compared on."""
 
-MOST_OPEN = 3
+MOST_DOUBTFUL = 3
 """Places that are asked: each takes two solutions more, and of many none is likely to be right."""
 
 
@@ -55,7 +55,7 @@ class Solved:
     certainty: float
 
 
-def solved(
+def solve_hypotheses(
     scans: Scans, heading: Heading, solver: Solver, along: Solution, solver_of: Callable[[Heading], Solver]
 ) -> Solved:
     """Return the drive solved with the heading that was followed, or with another one if that is right.
@@ -69,28 +69,28 @@ def solved(
     solver_of : callable
         Makes the solver of another heading.
     """
-    best = _matched(scans, heading, solver, along)
-    nodes = _open(scans, best)
-    if not 0 < len(nodes) <= MOST_OPEN:
+    best = _solve_with(scans, heading, solver, along)
+    doubtful_nodes = _doubtful_nodes(scans, best)
+    if not 0 < len(doubtful_nodes) <= MOST_DOUBTFUL:
         return best
     blocks = blocks_of(len(scans.windows), BLOCK, JUDGED_ON)
-    seen = predicted(scans, best.solution.nodes, blocks)
-    for node in nodes:
+    best_values = predicted(scans, best.solution.nodes, blocks)
+    for node in doubtful_nodes:
         # it may be known by now, since an earlier one is
-        still = _open(scans, best)
-        if node not in still:
+        doubtful = _doubtful_nodes(scans, best)
+        if node not in doubtful:
             continue
-        tried, values = [best], [seen]
+        tried, values = [best], [best_values]
         for angle in (math.pi / 2, -math.pi / 2):
             other = best.heading.turned(node, angle)
             solver = solver_of(other)
-            tried.append(_matched(scans, other, solver, solver.along_walls()))
+            tried.append(_solve_with(scans, other, solver, solver.along_walls()))
             values.append(predicted(scans, tried[-1].solution.nodes, blocks))
-        right, told = _best(scans, tried, values, node)
-        best, seen = tried[right], values[right]
+        right, decisive = _best(scans, tried, values, node)
+        best, best_values = tried[right], values[right]
         # of two right angles that make up for each other, neither is better turned alone
-        if told and (right or len(still) == 1):
-            best = _known(best, node)
+        if decisive and (right or len(doubtful) == 1):
+            best = _without_doubt(best, node)
     return best
 
 
@@ -111,7 +111,7 @@ def _best(scans: Scans, tried: list[Solved], values: list[Floats], node: int) ->
     return right, False
 
 
-def _known(found: Solved, node: int) -> Solved:
+def _without_doubt(found: Solved, node: int) -> Solved:
     """Return what was found, with no doubt at a node."""
     probability = dict(found.heading.doubts)[node]
     heading = replace(
@@ -126,7 +126,7 @@ def _is_confirmed(scans: Scans, found: Solved, node: int) -> bool:
     return confirmed(scans, found.solution.nodes, found.loops, node)
 
 
-def _matched(scans: Scans, heading: Heading, solver: Solver, along: Solution) -> Solved:
+def _solve_with(scans: Scans, heading: Heading, solver: Solver, along: Solution) -> Solved:
     solution, loops = solver.with_matches(along)
     found = Solved(heading, solver, along, solution, loops, heading.certainty)
     # what is confirmed was no loss
@@ -136,7 +136,7 @@ def _matched(scans: Scans, heading: Heading, solver: Solver, along: Solution) ->
     return replace(found, certainty=heading.certainty + sum(not_lost))
 
 
-def _open(scans: Scans, found: Solved) -> list[int]:
+def _doubtful_nodes(scans: Scans, found: Solved) -> list[int]:
     """Return the nodes at which a right angle may have been lost, as far as the drive can tell, in its order."""
     progress = scans.windows.node_progress
     return [

@@ -70,7 +70,7 @@ SIGMA = np.array([0.25, 0.25, math.radians(10.0)])
 BLOCK = 0.8
 """Metres of the drive that are compared as one."""
 
-FIRST_WAY, OWN = 1.0, 8.0
+FIRST_METRES, OWN_MAP = 1.0, 8.0
 """Metres after a jump whose readings must fit, before sonars in front see what is new, and those that they are on a map
 of their own with."""
 
@@ -85,7 +85,7 @@ LEAST_KNOWN, FEWEST_KNOWN = 0.2, 30
 SAME = 0.25
 """Metres between two places that are one."""
 
-MOST_SAID = 3
+MOST_REPORTED = 3
 """Jumps that are told of."""
 
 
@@ -115,13 +115,13 @@ def _found(odometry: Odometry) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
     elif FASTEST * apart > LONGEST_STEP:
         # a robot may drive so far from one message to the next
         fastest = FASTEST
-    found = np.flatnonzero((far > longest) | _turned(np.diff(pose[:, 2]), seconds))
+    found = np.flatnonzero((far > longest) | _turned_too_fast(np.diff(pose[:, 2]), seconds))
     gap = max(LONGEST_GAP, TIMES_GAP * apart)
     driven = (far <= fastest * seconds) & (seconds <= gap)
     return found + 1, ((far <= longest) | driven)[found]
 
 
-def _turned(turn: Any, seconds: Any) -> Any:
+def _turned_too_fast(turn: Any, seconds: Any) -> Any:
     """Return whether no robot turns so from one pose to the next: radians, and seconds."""
     turn = np.abs(wrapped(turn))
     return (turn > LONGEST_TURN) & (turn > FASTEST_TURN * np.asarray(seconds))
@@ -149,7 +149,7 @@ def without_outliers(odometry: Odometry) -> Odometry:
         around = [begin - 1, end]
         seconds = float(np.diff(odometry.stamp[around])[0]) * 1e-9
         x, y, turn = np.diff(odometry.pose[around], axis=0)[0].tolist()
-        back = math.hypot(x, y) <= LONGEST_STEP and not _turned(turn, seconds)
+        back = math.hypot(x, y) <= LONGEST_STEP and not _turned_too_fast(turn, seconds)
         if stay[begin - 1] and seconds <= LONGEST_OUTLIER and back:
             stay[begin:end] = False
     return odometry if stay.all() else Odometry.of(odometry.stamp[stay], odometry.pose[stay])
@@ -218,7 +218,7 @@ def with_doubtful(
         begin = max((k for k in out if k < at), default=0)
         end = min((k for k in out if k > at), default=len(odometry.stamp))
         begin = max(begin, int(np.searchsorted(travel, travel[at - 1] - LOOKED_BACK)))
-        end = min(end, int(np.searchsorted(travel, travel[at] + OWN)))
+        end = min(end, int(np.searchsorted(travel, travel[at] + OWN_MAP)))
         before, after = _piece(odometry, begin, at), _piece(odometry, at, end)
         part = Part(_read_along(readings, after), after, after, False)
         on_map = _read_along(readings, before)
@@ -226,9 +226,9 @@ def with_doubtful(
             continue
         # right at the step odometry has not drifted yet, so nothing is searched
         around = OnMap(part.readings, after.pose[0], on_map, parameters, stop)
-        usual = _Usual(part, parameters, stop)
-        stood, went = (usual.fits(around, pose, GOOD_AT_REST) for pose in (before.pose[-1], after.pose[0]))
-        if stood and not went:
+        check = _FitCheck(part, parameters, stop)
+        fits_before, fits_after = (check.fits(around, pose, GOOD_AT_REST) for pose in (before.pose[-1], after.pose[0]))
+        if fits_before and not fits_after:
             out.add(at)
     return np.array(sorted(out), np.int64)
 
@@ -320,26 +320,26 @@ def _begin_after(
     around = OnMap(part.readings, part.path.pose[0], others, parameters, stop)
     blocks = max(int(part.path.travel[-1] / BLOCK), 1)
     found = [around.search(guess, SIGMA, blocks) for guess in guesses]
-    usual = _Usual(part, parameters, stop)
-    stood, driven, exactly = (_said(around.predicted(pose, blocks)) for pose in (*found, guesses[1]))
+    check = _FitCheck(part, parameters, stop)
+    stood, driven, exactly = (_nan_if_new(around.predicted(pose, blocks)) for pose in (*found, guesses[1]))
     better = compared(driven, stood).sigmas
-    if usual.fits(around, found[0], GOOD_AT_REST if fast else GOOD) and (fast or better >= LEAST_SIGMAS):
+    if check.fits(around, found[0], GOOD_AT_REST if fast else GOOD) and (fast or better >= LEAST_SIGMAS):
         return Begin(found[0], STOOD)
     # both guesses may lead to one place
     same = np.hypot(*relative(found[1], found[0])[:2]) < SAME
-    if usual.fits(around, found[1], GOOD) and not fast and (-better >= LEAST_SIGMAS or same):
+    if check.fits(around, found[1], GOOD) and not fast and (-better >= LEAST_SIGMAS or same):
         return Begin(found[1] if compared(exactly, driven).sigmas >= LEAST_SIGMAS else guesses[1], DRIVEN)
     return unknown
 
 
-class _Usual:
+class _FitCheck:
     """How well the first readings of a part fit on a map, beside how well they fit on their own."""
 
     def __init__(self, part: Part, parameters: Parameters, stop: NDArray[np.uint8]) -> None:
         readings, path = part.readings, part.path
         travel = np.interp(readings.stamp - path.stamp[0], path.stamp - path.stamp[0], path.travel)
-        own = readings.select(travel <= OWN)
-        self._count = int(np.count_nonzero(travel <= FIRST_WAY))
+        own = readings.select(travel <= OWN_MAP)
+        self._count = int(np.count_nonzero(travel <= FIRST_METRES))
         begin = path.pose[0]
         self._own = OnMap(own, begin, own, parameters, stop).of_each(begin, self._count)
 
@@ -352,7 +352,7 @@ class _Usual:
         return bool(there[known].sum() >= least * self._own[known].sum() > 0.0)
 
 
-def _said(values: Floats) -> Floats:
+def _nan_if_new(values: Floats) -> Floats:
     """Return what blocks say, NaN where all they read is new."""
     out: Floats = np.where(np.abs(values) > SILENT, values, np.nan)
     return out
@@ -364,18 +364,18 @@ def compared(before: Floats, after: Floats) -> Gain:
     return gain(np.nan_to_num(before[some]), np.nan_to_num(after[some]))
 
 
-def words(begins: Sequence[Begin], parts: Sequence[Part]) -> str:
+def jump_words(begins: Sequence[Begin], parts: Sequence[Part]) -> str:
     """Return what became of each jump."""
-    said = []
+    texts = []
     for k, ((before, part), begin) in enumerate(zip(itertools.pairwise(parts), begins[1:], strict=True), 1):
         far = math.dist(before.odometry.pose[-1, :2].tolist(), part.odometry.pose[0, :2].tolist())
         driven = sum(float(each.odometry.travel[-1]) for each in parts[:k])
-        said.append(f'odometry jumps by {far:.1f} m after {driven:.0f} m of driving{BECAME[begin.how]}')
-    more = f'; and {len(said) - MOST_SAID} more' if len(said) > MOST_SAID else ''
-    return '; '.join(said[:MOST_SAID]) + more
+        texts.append(f'odometry jumps by {far:.1f} m after {driven:.0f} m of driving{OUTCOME_WORDS[begin.how]}')
+    more = f'; and {len(texts) - MOST_REPORTED} more' if len(texts) > MOST_REPORTED else ''
+    return '; '.join(texts[:MOST_REPORTED]) + more
 
 
-BECAME = {
+OUTCOME_WORDS = {
     FIRST: ', where there are hardly any readings before',
     STOOD: ': the readings fit where the robot was before it, and what follows is mapped from there',
     DRIVEN: ', and the readings after it fit where odometry has them',

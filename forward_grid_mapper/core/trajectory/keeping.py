@@ -24,7 +24,7 @@ SAME = 1e-3
 """Metres, and radians, between poses of one stamp, if they are of the same odometry."""
 
 
-def kept(
+def keep_if_not_worse(
     before: Refinement,
     correction: Correction,
     refused: Refinement,
@@ -51,10 +51,10 @@ def kept(
         If `stop` was set.
     """
     readings, odometry = refused.readings, refused.trajectory
-    if without_times(readings, odometry) or not _begins(correction, odometry):
+    if without_times(readings, odometry) or not _same_odometry(correction, odometry):
         return refused
     path = correction.along(odometry)
-    better = _odometry_better(readings, odometry, path, for_matching(parameters), stop)
+    better = _gain_of_odometry(readings, odometry, path, for_matching(parameters), stop)
     if better.sigmas >= LEAST_SIGMAS:
         return refused
     moved, turned = differences(odometry, path)
@@ -76,7 +76,7 @@ def kept(
     )
 
 
-def _begins(correction: Correction, odometry: Odometry) -> bool:
+def _same_odometry(correction: Correction, odometry: Odometry) -> bool:
     """Return whether a correction is of the begin of this odometry."""
     first, known = odometry.stamp[:1], correction.odometry
     if not known.stamp[0] <= first[0] <= known.stamp[-1]:
@@ -86,7 +86,7 @@ def _begins(correction: Correction, odometry: Odometry) -> bool:
     return bool(np.abs(off).max() < SAME)
 
 
-def _odometry_better(
+def _gain_of_odometry(
     readings: Readings, odometry: Odometry, path: Odometry, parameters: Parameters, stop: NDArray[np.uint8]
 ) -> Gain:
     """Return by how much odometry predicts the readings that are held out better than a path does."""

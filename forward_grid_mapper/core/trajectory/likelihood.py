@@ -288,8 +288,8 @@ def scores(scan: Scan, around: LocalMap, poses: Floats, stride: int = 1) -> Floa
     wide = max(-(-count // (rounds * SIDE_BY_SIDE)), 1) * SIDE_BY_SIDE
     order = np.argsort(poses[:, 2], kind='stable')
     # lanes that are left over repeat the last pose
-    asked = np.concatenate([order, np.full(rounds * wide - count, order[-1])])
-    found, out = np.empty(len(asked)), np.empty(count)
-    score_poses(scan, around, poses[asked], stride, _lanes(wide), found)
+    padded = np.concatenate([order, np.full(rounds * wide - count, order[-1])])
+    found, out = np.empty(len(padded)), np.empty(count)
+    score_poses(scan, around, poses[padded], stride, _lanes(wide), found)
     out[order] = found[:count]
     return out

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from .local_map import LocalMap
 from .matching import measure
-from .passes import FEWEST, Found, Progress
+from .passes import FEWEST, Matches, Progress
 from .poses import Floats, axes_at, compose, relative, wrapped
 from .scans import FEWEST_ON_MAP, Scans
 from .searching import search
@@ -36,7 +36,7 @@ REACH = 3.0
 AROUND = 4.0
 """Metres of travel before and after a place that its map is made of."""
 
-UNSURE = np.array([2.0, 2.0, 1.0])
+SIGMA_FACTOR = np.array([2.0, 2.0, 1.0])
 """Times that places, and yaws, are farther off than the posterior has it."""
 
 SIGMAS = 2.5
@@ -54,13 +54,13 @@ MEASURED = 150
 GOOD = 0.65
 """Part of the usual score of a reading that a loop must have."""
 
-OTHER = 0.45
+LEAST_SEPARATION = 0.45
 """Metres from the best pose from where on another is another place."""
 
-TOLD = 8.0
+LEAST_DISTANCE = 8.0
 """σ² by which another place must differ in what is measured at the best one: along a bare corridor none does."""
 
-CLEAR = 12.0
+LEAST_MARGIN = 12.0
 """Nats by which the best pose must be better than any of another place."""
 
 CLIMBS = 3
@@ -78,16 +78,16 @@ class Loop:
     ----------
     block, place : int
         Nodes in the middle of the block, and of the map.
-    found : Found
+    matches : Matches
         Matches of the block's windows.
     """
 
     block: int
     place: int
-    found: Found
+    matches: Matches
 
 
-Looked = dict[tuple[int, int], Loop | None]
+SearchResults = dict[tuple[int, int], Loop | None]
 """What came of looking for blocks at places, by the nodes in their middle: None where a block was not found."""
 
 
@@ -128,7 +128,7 @@ def candidates(
         if len(taken) >= CANDIDATES:
             break
         if all(abs(progress[node] - progress[other]) > AROUND for other in taken):
-            out.append((node, UNSURE * sigma[k]))
+            out.append((node, SIGMA_FACTOR * sigma[k]))
     return out
 
 
@@ -152,10 +152,10 @@ def find_loop(
     # directions that are not measured may not decide
     apart, axes = relative(best, found.poses), axes_at(best[2])
     curved = np.einsum('pi,ij,pj->p', apart, axes.T @ final.information @ axes, apart)
-    elsewhere = (np.hypot(apart[:, 0], apart[:, 1]) > OTHER) & (curved > TOLD)
-    if elsewhere.any() and final.score - found.values[elsewhere].max() < CLEAR:
+    elsewhere = (np.hypot(apart[:, 0], apart[:, 1]) > LEAST_SEPARATION) & (curved > LEAST_DISTANCE)
+    if elsewhere.any() and final.score - found.values[elsewhere].max() < LEAST_MARGIN:
         return None
-    matches = Found()
+    matches = Matches()
     for j, local in zip(block, shape, strict=True):
         if scans.count[j] >= FEWEST:
             matches.add(place, int(j), measure(scans.scan[j], around, compose(best, local)), int(scans.count[j]))
@@ -163,8 +163,8 @@ def find_loop(
 
 
 def find_loops(
-    scans: Scans, nodes: Floats, samples: Floats, usual: float, watch: Progress, known: Looked | None = None
-) -> Looked:
+    scans: Scans, nodes: Floats, samples: Floats, usual: float, watch: Progress, known: SearchResults | None = None
+) -> SearchResults:
     """Return what came of looking for each block of a drive where it may have been.
 
     Parameters
@@ -180,7 +180,7 @@ def find_loops(
         What is known already, and not looked for again.
     """
     known = known or {}
-    places, out, progress = Places(scans, nodes), Looked(), scans.windows.node_progress
+    places, out, progress = Places(scans, nodes), SearchResults(), scans.windows.node_progress
     for k in range(0, len(nodes) - LENGTH // 2, LENGTH):
         watch(k / len(nodes))
         block = np.arange(k, min(k + LENGTH, len(nodes)))
@@ -197,6 +197,6 @@ def find_loops(
     return out
 
 
-def loops_of(looked: Looked) -> list[Loop]:
+def loops_of(results: SearchResults) -> list[Loop]:
     """Return the loops that were found."""
-    return [loop for loop in looked.values() if loop is not None]
+    return [loop for loop in results.values() if loop is not None]

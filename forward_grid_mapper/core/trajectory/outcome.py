@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..common.readings import Readings
-from .jumps import UNKNOWN, Begin, Part, words
+from .jumps import UNKNOWN, Begin, Part, jump_words
 from .local_map import at_poses
 from .poses import compose, relative
 from .registration import moved_to
@@ -78,11 +78,11 @@ def joined_parts(
     begins: Sequence[Begin],
 ) -> Refinement:
     """Return what became of a drive whose parts were refined each by itself, and begin where `begins` says."""
-    said, unplaced = words(begins, parts), any(begin.how == UNKNOWN for begin in begins[1:])
+    jump_text, unplaced = jump_words(begins, parts), any(begin.how == UNKNOWN for begin in begins[1:])
     taken = [k for k, outcome in enumerate(outcomes) if outcome.accepted]
     best = max(taken, key=lambda k: float(parts[k].odometry.travel[-1]), default=0)
     of, span = outcomes[best], parts[best].odometry.stamp
-    reason = said
+    reason = jump_text
     if taken:
         reason += f'; in the longest part that was refined, {parts[best].odometry.travel[-1]:.0f} m, {of.reason}'
     same = all(
@@ -90,7 +90,7 @@ def joined_parts(
     )
     if not taken and same:
         lost = any(outcome.lost for outcome in outcomes)
-        return Refinement(False, reason, readings, odometry, {}, lost=lost, jumps=said, unplaced=unplaced)
+        return Refinement(False, reason, readings, odometry, {}, lost=lost, jumps=jump_text, unplaced=unplaced)
     pose = np.concatenate([moved_to(begin.pose, part.path.pose) for begin, part in zip(begins, parts, strict=True)])
     pose[:, 2] = np.unwrap(pose[:, 2])
     trajectory = Odometry(odometry.stamp, pose)
@@ -107,7 +107,7 @@ def joined_parts(
         loops,
         of.gain,
         noise=of.noise,
-        jumps=said,
+        jumps=jump_text,
         unplaced=unplaced,
         stretch=(int(span[0]), int(span[-1])),
         right_angles=all(outcome.right_angles for outcome in outcomes),

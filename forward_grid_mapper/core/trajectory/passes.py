@@ -28,7 +28,7 @@ Progress = Callable[[float], None]
 """Receives how much of a pass is done, from 0 to 1."""
 
 
-class Found:
+class Matches:
     """Matches as they are found.
 
     Attributes
@@ -54,7 +54,7 @@ class Found:
         self.readings += count
 
     @property
-    def usual(self) -> float:
+    def mean_score(self) -> float:
         """The mean log ratio of a reading, nats."""
         return self.score / max(self.readings, 1)
 
@@ -66,7 +66,7 @@ class Found:
         return Edges(np.array(place), np.array(window), np.array(pose), np.array(information))
 
 
-def bent(progress: Floats, before: Floats, after: Floats, at: NDArray[np.int64]) -> Floats:
+def deformation(progress: Floats, before: Floats, after: Floats, at: NDArray[np.int64]) -> Floats:
     """Return by how much the nodes around some have moved relative to each other, shape (len(at),), metres.
 
     It is the root mean square after the best alignment of the nodes that a map of both sides is made of: a map that
@@ -84,13 +84,13 @@ def bent(progress: Floats, before: Floats, after: Floats, at: NDArray[np.int64])
     return np.array([rms_after_alignment(before[each], after[each]) for each in near])
 
 
-def ahead(scans: Scans, nodes: Floats, watch: Progress) -> Found:
+def match_preceding(scans: Scans, nodes: Floats, watch: Progress) -> Matches:
     """Match each block with the map of what was driven just before it, where the nodes are now.
 
     What it has in common with that map lies about `BACK` behind it, so there the match is tied to. It tells the scale
     of odometry, which a map of both sides does not: it is stretched as the drive is.
     """
-    w, found = scans.windows, Found()
+    w, found = scans.windows, Matches()
     for k in range(0, len(nodes), BLOCK):
         watch(k / len(nodes))
         block = np.arange(k, min(k + BLOCK, len(nodes)))
@@ -102,9 +102,9 @@ def ahead(scans: Scans, nodes: Floats, watch: Progress) -> Found:
     return found
 
 
-def again(scans: Scans, nodes: Floats, watch: Progress) -> Found:
+def match_surrounding(scans: Scans, nodes: Floats, watch: Progress) -> Matches:
     """Match each block with the map of what was driven before and after it, where the nodes are now."""
-    w, found = scans.windows, Found()
+    w, found = scans.windows, Matches()
     for k in range(0, len(nodes), BLOCK):
         watch(k / len(nodes))
         block = np.arange(k, min(k + BLOCK, len(nodes)))
@@ -118,7 +118,7 @@ def again(scans: Scans, nodes: Floats, watch: Progress) -> Found:
 
 
 def _match(
-    scans: Scans, nodes: Floats, block: NDArray[np.int64], members: NDArray[np.int64], place: int, found: Found
+    scans: Scans, nodes: Floats, block: NDArray[np.int64], members: NDArray[np.int64], place: int, found: Matches
 ) -> None:
     """Match the windows of a block with the map of others, in the frame of a node."""
     around = scans.map(members, nodes[place], nodes)

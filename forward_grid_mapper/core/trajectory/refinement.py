@@ -23,12 +23,12 @@ from ..common.errors import InputError
 from ..common.parameters import Parameters
 from ..common.readings import Readings
 from ..runtime.cancelling import check
-from .any_angle import matched
-from .certainty import MOST, of_yaw
+from .any_angle import match_drive
+from .certainty import LARGEST_SIGMA, yaw_errors
 from .heading import NOISES, Heading, heading
-from .holding_out import LEAST_SIGMAS, Gain, came_back, held_out
-from .hypotheses import solved
-from .judging import chosen, explained_better, over_the_drive, seen_again, turned_right
+from .holding_out import LEAST_SIGMAS, Gain, has_revisits, held_out
+from .hypotheses import solve_hypotheses
+from .judging import gain_at_revisits, gain_of_objective, gain_over_drive, last_not_worse, turns_supported
 from .jumps import MOST_JUMPS, Part, begins_of, jumps, parts_at, with_doubtful, without_outliers
 from .local_map import for_matching
 from .odometry_model import CALIBRATION
@@ -50,7 +50,7 @@ LEAST_ECHOES = 0.05
 
 LEAST_SENSORS = 2
 
-LEAST_WITNESS, LEAST_SIGMAS_WITH_WALLS = 10.0, -1.0
+LEAST_VOTE_GAIN, LEAST_SIGMAS_WITH_WALLS = 10.0, -1.0
 """Nats that the votes of walls must say against odometry's yaw, beyond what sensors say by where they look, to be a
 witness of their own, and the standard errors that are then enough where the robot came to no place twice: readings must
 not be predicted worse. Little drift hardly shows in a few metres."""
@@ -143,11 +143,11 @@ class Refiner:
         """Return the trajectory of a drive whose odometry jumps: of each part by itself, each on the map of others."""
         watch, cuts, outcomes = self._watch, parts_at(readings, odometry, jumped_to), []
         for k, (own, part) in enumerate(cuts, 1):
-            self._watch = partial(_named, watch, f'part {k} of {len(cuts)}, ')
+            self._watch = partial(_report_part, watch, f'part {k} of {len(cuts)}, ')
             # to be placed, a part needs the best heading that there is, however little it moves
             outcomes.append(self._whole(own, part, 0.0))
         self._watch = watch
-        self._say('what follows jumps of odometry')
+        self._start_stage('what follows jumps of odometry')
         parts = [Part(o.readings, part, o.trajectory, o.lost) for (_, part), o in zip(cuts, outcomes, strict=True)]
         begins = begins_of(parts, self._parameters, self._stop)
         return joined_parts(readings, odometry, parts, outcomes, begins)
@@ -168,63 +168,66 @@ class Refiner:
     def _at_right_angles(self, drive: _Drive, least_moved: float) -> _Attempt:
         """Return the trajectory if walls stand at right angles to each other, or why there is none."""
         readings, odometry, windows, scans = drive
-        walls, witness = self._heading(windows, scans)
+        walls, vote_gain = self._heading(windows, scans)
         if walls is None:
             return _Attempt(Refinement(False, NO_WALLS, readings, odometry, {}), windows.node)
 
         def solver_of(heading: Heading) -> Solver:
-            return Solver(odometry, windows, scans, heading, self._say)
+            return Solver(odometry, windows, scans, heading, self._start_stage)
 
-        def left(reason: str, better: Gain) -> _Attempt:
-            refused = Refinement(False, reason, readings, odometry, named, gain=better.mean)
+        def keep_odometry(reason: str, better: Gain) -> _Attempt:
+            refused = Refinement(False, reason, readings, odometry, by_name, gain=better.mean)
             return _Attempt(refused, windows.node)
 
         solver = solver_of(walls)
         along = solver.along_walls()
         calibration = solver.calibration_of(along)
         simple = solver.simple(calibration)
-        better = over_the_drive(scans, windows.node, simple, self._say('judgement'))
-        said = _said(better)
-        named = dict(zip(CALIBRATION, calibration.tolist(), strict=True))
+        better = gain_over_drive(scans, windows.node, simple, self._start_stage('judgement'))
+        gain_words = _gain_words(better)
+        by_name = dict(zip(CALIBRATION, calibration.tolist(), strict=True))
         proven = better.sigmas >= LEAST_SIGMAS
-        witnessed = witness > LEAST_WITNESS and better.sigmas >= LEAST_SIGMAS_WITH_WALLS
+        votes_suffice = vote_gain > LEAST_VOTE_GAIN and better.sigmas >= LEAST_SIGMAS_WITH_WALLS
         # where walls stand at right angles along odometry as it is, that is the answer
-        stands = differences(odometry, refined(odometry, windows, along.nodes))[0] < LEAST_MOVED
-        unproven = left(said + NOT_ENOUGH, better)._replace(sure=stands)
-        if not proven and not witnessed:
+        agrees = differences(odometry, refined(odometry, windows, along.nodes))[0] < LEAST_MOVED
+        unproven = keep_odometry(gain_words + NOT_ENOUGH, better)._replace(sure=agrees)
+        if not proven and not votes_suffice:
             if walls.certainty < LEAST_CERTAINTY:
-                return _lost(drive, walls.certainty)
-            if witness <= LEAST_WITNESS:
+                return _heading_lost(drive, walls.certainty)
+            if vote_gain <= LEAST_VOTE_GAIN:
                 return unproven
-        found = solved(scans, walls, solver, along, solver_of)
+        found = solve_hypotheses(scans, walls, solver, along, solver_of)
         if found.certainty < LEAST_CERTAINTY:
-            return _lost(drive, found.certainty)
+            return _heading_lost(drive, found.certainty)
         if found.solver is not solver:
             solver, simple = found.solver, found.solver.simple(found.solver.calibration_of(found.along))
-        self._say('judgement')
-        nodes = chosen(scans, simple, found.along.nodes, found.solution.nodes)
+        self._start_stage('judgement')
+        nodes = last_not_worse(scans, simple, found.along.nodes, found.solution.nodes)
         if not proven:
             # places seen before tell wheels that are right over metres from those that are not, and walls that stand
             # askew from a yaw that is off; where odometry alone says that the robot came back, it need not be so
-            again = came_back(scans, nodes)
-            if not again and not witnessed:
+            revisited = has_revisits(scans, nodes)
+            if not revisited and not votes_suffice:
                 return unproven
-            better = seen_again(scans, windows.node, nodes)
-            said = f'with places seen before, {_said(better)}' if again else _said(better)
-            if better.sigmas < (LEAST_SIGMAS if again else LEAST_SIGMAS_WITH_WALLS):
-                return left(said + NOT_ENOUGH, better)._replace(sure=stands)
-            if not again:
-                said = f'that walls stand at right angles is likelier by {witness:.0f} nats than with odometry; {said}'
+            better = gain_at_revisits(scans, windows.node, nodes)
+            gain_words = f'with places seen before, {_gain_words(better)}' if revisited else _gain_words(better)
+            if better.sigmas < (LEAST_SIGMAS if revisited else LEAST_SIGMAS_WITH_WALLS):
+                return keep_odometry(gain_words + NOT_ENOUGH, better)._replace(sure=agrees)
+            if not revisited:
+                likelier = f'that walls stand at right angles is likelier by {vote_gain:.0f} nats than with odometry'
+                gain_words = f'{likelier}; {gain_words}'
         loops = found.loops if nodes is found.solution.nodes else []
         if nodes is found.solution.nodes:
-            named = dict(zip(CALIBRATION, solver.calibration_of(found.solution).tolist(), strict=True))
+            by_name = dict(zip(CALIBRATION, solver.calibration_of(found.solution).tolist(), strict=True))
         trajectory = refined(odometry, windows, nodes)
         moved, turned = differences(odometry, trajectory)
         if moved < least_moved:
-            return left(too_little_words(moved), better)._replace(sure=True)
+            return keep_odometry(too_little_words(moved), better)._replace(sure=True)
         placed, noise = replaced(readings, odometry, trajectory), walls.drifts.noise
-        outcome = Refinement(True, said, placed, trajectory, named, moved, turned, len(loops), better.mean, noise=noise)
-        sure = recognised_part(scans, nodes, loops) >= LEAST_RECOGNISED and turned_right(scans, nodes)
+        outcome = Refinement(
+            True, gain_words, placed, trajectory, by_name, moved, turned, len(loops), better.mean, noise=noise
+        )
+        sure = recognised_part(scans, nodes, loops) >= LEAST_RECOGNISED and turns_supported(scans, nodes)
         return _Attempt(outcome, nodes, sure)
 
     def _at_any_angle(self, drive: _Drive, by_walls: _Attempt, least_moved: float) -> Refinement:
@@ -233,32 +236,35 @@ class Refiner:
         known = by_walls.nodes if by_walls.refinement.accepted else None
         apart = usual_step(odometry)
         if apart > SCAN_MATCHED:
-            return _stays(by_walls.refinement, too_sparse_words(apart))
+            return _without_better(by_walls.refinement, too_sparse_words(apart))
         try:
-            found = matched(odometry, scans, self._say, self._parameters.association.odometry_noise, known)
+            found = match_drive(odometry, scans, self._start_stage, self._parameters.association.odometry_noise, known)
         except InputError:
             # its cells are of one size, so that a map of the whole drive may be too large though the maps are not
             found = None
         if found is None:
-            return _stays(by_walls.refinement)
+            return _without_better(by_walls.refinement)
         nodes = found.nodes
-        if known is not None and explained_better(scans, known, nodes).sigmas < LEAST_SIGMAS:
+        if known is not None and gain_of_objective(scans, known, nodes).sigmas < LEAST_SIGMAS:
             return by_walls.refinement
-        better = seen_again(scans, windows.node, nodes)
+        better = gain_at_revisits(scans, windows.node, nodes)
         trajectory = refined(odometry, windows, nodes)
         moved, turned = differences(odometry, trajectory)
         if better.sigmas < LEAST_SIGMAS or moved < least_moved:
-            return _stays(by_walls.refinement)
-        again = 'with places seen before, ' if came_back(scans, nodes) else ''
-        named = dict.fromkeys(CALIBRATION, 0.0) | {
-            name: told.value for name, told in of_yaw(odometry, trajectory).items() if told.sigma <= MOST[name]
+            return _without_better(by_walls.refinement)
+        at_revisits = 'with places seen before, ' if has_revisits(scans, nodes) else ''
+        by_name = dict.fromkeys(CALIBRATION, 0.0) | {
+            name: estimate.value
+            for name, estimate in yaw_errors(odometry, trajectory).items()
+            if estimate.sigma <= LARGEST_SIGMA[name]
         }
         return Refinement(
             True,
-            f'walls are not taken to stand at right angles; {again}{_said(better)}{_doubt(found.part)}',
+            f'walls are not taken to stand at right angles; {at_revisits}{_gain_words(better)}'
+            f'{_recognition_words(found.part)}',
             replaced(readings, odometry, trajectory),
             trajectory,
-            named,
+            by_name,
             moved,
             turned,
             len(found.loops),
@@ -266,7 +272,7 @@ class Refiner:
             right_angles=False,
         )
 
-    def _say(self, stage: str) -> Callable[[float], None]:
+    def _start_stage(self, stage: str) -> Callable[[float], None]:
         def progress(part: float) -> None:
             check(self._stop)
             self._watch(stage, part)
@@ -276,9 +282,9 @@ class Refiner:
 
     def _heading(self, windows: Windows, scans: Scans) -> tuple[Heading | None, float]:
         """Return what walls say about the yaw, and the nats by which they say that odometry's is wrong."""
-        self._say('directions of walls')
-        told = self._parameters.association.odometry_noise
-        noises = (told,) if told else NOISES
+        self._start_stage('directions of walls')
+        given_noise = self._parameters.association.odometry_noise
+        noises = (given_noise,) if given_noise else NOISES
         found = heading(windows, *wall_votes(windows, scans.held_out), noises)
         if found is None:
             return None, 0.0
@@ -286,10 +292,10 @@ class Refiner:
         # two axes seems to know of walls
         readings, rng = windows.readings, np.random.default_rng(0)
         drawn = np.where(readings.echo, rng.random(len(readings)) * readings.z_max, readings.z)
-        by_chance = replace(windows, readings=replace(readings, z=drawn))
-        chance = heading(by_chance, *wall_votes(by_chance, scans.held_out), noises)
-        looks = 0.0 if chance is None else max(chance.over_odometry, 0.0)
-        return found, found.over_odometry - looks
+        randomised = replace(windows, readings=replace(readings, z=drawn))
+        chance = heading(randomised, *wall_votes(randomised, scans.held_out), noises)
+        gain_by_chance = 0.0 if chance is None else max(chance.over_odometry, 0.0)
+        return found, found.over_odometry - gain_by_chance
 
 
 def without_times(readings: Readings, odometry: Odometry) -> str:
@@ -353,17 +359,17 @@ def refined(odometry: Odometry, windows: Windows, nodes: Floats) -> Odometry:
     return Odometry(odometry.stamp, pose)
 
 
-def _stays(found: Refinement, why: str = NOR_MATCHES) -> Refinement:
+def _without_better(found: Refinement, why: str = NOR_MATCHES) -> Refinement:
     """Return what walls said, where matches alone told nothing better, or were not tried."""
     return found if found.accepted else replace(found, reason=found.reason + why)
 
 
-def _lost(drive: _Drive, certainty: float) -> _Attempt:
+def _heading_lost(drive: _Drive, certainty: float) -> _Attempt:
     refused = Refinement(False, lost_words(certainty), drive.readings, drive.odometry, {}, lost=True)
     return _Attempt(refused, drive.windows.node)
 
 
-def _said(better: Gain) -> str:
+def _gain_words(better: Gain) -> str:
     if not np.isfinite(better.error):
         return (
             'there are too few readings on maps of others to tell whether they are predicted better than with odometry'
@@ -371,12 +377,12 @@ def _said(better: Gain) -> str:
     return f'readings are predicted {better.mean:+.3f} ± {better.error:.3f} nats a reading better than with odometry'
 
 
-def _doubt(part: float) -> str:
+def _recognition_words(part: float) -> str:
     """Return what is to be said where this part of the blocks at places seen before is recognised."""
     if part >= LEAST_RECOGNISED:
         return ''
     return f'; {part:.0%} of the way through places seen before is recognised: the drive may be bent as a whole'
 
 
-def _named(watch: Watch, name: str, stage: str, part: float) -> None:
+def _report_part(watch: Watch, name: str, stage: str, part: float) -> None:
     watch(name + stage, part)

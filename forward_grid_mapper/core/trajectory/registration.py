@@ -32,7 +32,7 @@ SIGMAS = 2.5
 STEP, FINER, LEVELS = 0.15, 1 / 3, 3
 """Metres between two places of the first search, what the next is finer by, and how many there are."""
 
-ASKED = (150, 600, 2000)
+EVALUATED = (150, 600, 2000)
 """Readings that each search asks."""
 
 ON_MAP = 20_000
@@ -106,26 +106,26 @@ class OnMap:
         readings = readings.select(np.argsort(readings.stamp, kind='stable'))
         sensors = relative(begin, np.stack([readings.x, readings.y, readings.yaw], axis=1))
         self._scan = make_scan(readings, sensors, model, resolution, UNKNOWN * hit_probability(model, resolution))
-        self._far = _far(sensors[:, :2])
+        self._extent = _extent(sensors[:, :2])
 
     def search(self, begin: Floats, sigma: Floats, blocks: int = 0) -> Floats:
         """Return the best begin near one, shape (3,), with these σ a priori: metres, metres, radians.
 
         With `blocks`, readings are asked only of those blocks that lie on the map.
         """
-        scan, far = self._scan, self._far
+        scan, extent = self._scan, self._extent
         if blocks:
             parts = np.array_split(scan.readings, blocks)
-            told = [p for p, value in zip(parts, self.predicted(begin, blocks), strict=True) if abs(value) > SILENT]
-            if not told:
+            on_map = [p for p, value in zip(parts, self.predicted(begin, blocks), strict=True) if abs(value) > SILENT]
+            if not on_map:
                 return begin
-            scan = Scan(np.concatenate(told), scan.weight)
-            far = _far(np.stack([scan.readings['x'], scan.readings['y']], axis=1))
-        found, reach, steps = begin, SIGMAS * sigma, np.array([STEP, STEP, STEP / far])
+            scan = Scan(np.concatenate(on_map), scan.weight)
+            extent = _extent(np.stack([scan.readings['x'], scan.readings['y']], axis=1))
+        found, reach, steps = begin, SIGMAS * sigma, np.array([STEP, STEP, STEP / extent])
         information = np.diag(sigma**-2.0)
-        for asked in ASKED[:LEVELS]:
+        for count in EVALUATED[:LEVELS]:
             poses = grid_around(found, reach, (steps[0], steps[1], steps[2]))
-            found = _best(scan, self._around, poses, begin, information, asked)
+            found = _best(scan, self._around, poses, begin, information, count)
             reach, steps = steps, FINER * steps
         return found
 
@@ -147,15 +147,15 @@ class OnMap:
         return out
 
 
-def _far(xy: Floats) -> float:
+def _extent(xy: Floats) -> float:
     """Return how far readings are from the begin of the drive, metres."""
     return max(float(np.sqrt((xy**2).sum(1).mean())), 1.0)
 
 
-def _best(scan: Scan, around: LocalMap, poses: Floats, begin: Floats, information: Floats, asked: int) -> Floats:
+def _best(scan: Scan, around: LocalMap, poses: Floats, begin: Floats, information: Floats, count: int) -> Floats:
     """Return the best of `poses`, given where the drive begins a priori, by about so many readings."""
     off = relative(begin, poses)
-    value = scores(scan, around, poses, max(len(scan.readings) // asked, 1))
+    value = scores(scan, around, poses, max(len(scan.readings) // count, 1))
     value -= 0.5 * np.einsum('pi,ij,pj->p', off, information, off)
     best: Floats = poses[int(value.argmax())]
     return best

@@ -42,7 +42,7 @@ ON_MAP = 6000
 
 REACH = np.array([5.0, 5.0, math.radians(10.0)])
 STEPS = (0.2, 0.2, math.radians(2.5))
-ASKED, FOLLOWED = (60, 600), 600
+EVALUATED, FOLLOWED = (60, 600), 600
 """Readings that are asked at all poses of the search and at the best of them, and how many these are."""
 
 FINER = ((0.1, 0.1, math.radians(1.2)), (0.05, 0.05, math.radians(0.6)))
@@ -56,7 +56,7 @@ SIGMA = np.array([0.1, 0.1, math.radians(1.5)])
 LEAST_RECOGNISED = 0.85
 """Part of the blocks that lie where the robot was before that are recognised where nothing is bent."""
 
-MORE = 2
+MORE_RECOGNISED = 2
 """Blocks more that must be recognised in another place."""
 
 
@@ -113,8 +113,8 @@ def confirmed(scans: Scans, nodes: Floats, loops: Sequence[Loop], node: int) -> 
     """Return whether places seen before a node were recognised after it: then the way past it is known."""
     across = [loop for loop in loops if max(loop.block, loop.place) >= node > min(loop.block, loop.place)]
     blocks = revisits(scans, nodes, node).tolist()
-    did = len(recognised(across).intersection(blocks))
-    return did >= CONFIRMING and 2 * did > len(blocks)
+    crossed = len(recognised(across).intersection(blocks))
+    return crossed >= CONFIRMING and 2 * crossed > len(blocks)
 
 
 def windows_of(blocks: NDArray[np.int64], count: int) -> NDArray[np.int64]:
@@ -135,7 +135,7 @@ def displaced(scans: Scans, nodes: Floats, stretch: NDArray[np.int64]) -> Floats
     if around is None:
         return None
     shape = relative(nodes[middle], nodes[stretch])
-    best = _searched(scans.joint(stretch, shape), around)
+    best = _best_pose(scans.joint(stretch, shape), around)
     if np.hypot(best[0], best[1]) < MOVED:
         return None
     out = nodes.copy()
@@ -143,10 +143,10 @@ def displaced(scans: Scans, nodes: Floats, stretch: NDArray[np.int64]) -> Floats
     return out
 
 
-def _searched(joint: Scan, around: LocalMap) -> Floats:
+def _best_pose(joint: Scan, around: LocalMap) -> Floats:
     """Return the best pose of a stretch around where it is."""
     mixed = joint.readings[np.random.default_rng(0).permutation(len(joint.readings))]
-    few, more = (Scan(mixed[:asked], joint.weight) for asked in ASKED)
+    few, more = (Scan(mixed[:count], joint.weight) for count in EVALUATED)
     poses = grid_around(np.zeros(3), REACH, STEPS)
     poses = poses[np.argsort(-scores(few, around, poses), kind='stable')[:FOLLOWED]]
     best: Floats = poses[int(scores(more, around, poses).argmax())]

@@ -41,7 +41,7 @@ STEPS = (0.1, 0.1, math.radians(2.0))
 REACH, SIGMAS, FARTHEST = 0.1, 3.0, 0.5
 """How far poses are asked: metres either way, σ of the yaw, and radians at the most."""
 
-ASKED = 60
+EVALUATED = 60
 """Readings that are asked at each pose."""
 
 
@@ -97,7 +97,7 @@ def _off(scans: Scans, nodes: Floats, block: NDArray[np.int64], motion: Floats, 
     reach = np.array([REACH, REACH, min(SIGMAS * sigma[2], FARTHEST)])
     poses = grid_around(np.zeros(3), reach, STEPS)
     joint = scans.joint(block, motion)
-    fits = trust.counts * scores(joint, around, poses, max(len(joint.readings) // ASKED, 1))
+    fits = trust.counts * scores(joint, around, poses, max(len(joint.readings) // EVALUATED, 1))
     value = fits - np.minimum(0.5 * (poses / sigma) ** 2, MOST_OFF).sum(1)
     weight = np.exp(value - value.max())
     out: Floats = weight @ poses / weight.sum()

@@ -33,7 +33,7 @@ class Scans:
     count : int64, shape (K,)
         How many of them may be used; none of windows that are held out.
     held_out : bool, shape (K,)
-    judged : dict
+    predictions : dict
         What `holding_out.predicted` found, since the same is asked several times.
     """
 
@@ -44,7 +44,7 @@ class Scans:
         first, resolution = windows.first, parameters.grid.resolution
         self.resolution = resolution
         self.held_out = held_out
-        self.judged: dict[tuple[bytes, bytes, float], float] = {}
+        self.predictions: dict[tuple[bytes, bytes, float], float] = {}
         sensors = compose(windows.robot, windows.mount)
         local = relative(np.repeat(windows.node, np.diff(first), axis=0), sensors)
         unknown = UNKNOWN * hit_probability(parameters.model, resolution)

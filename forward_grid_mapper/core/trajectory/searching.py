@@ -34,7 +34,7 @@ FOLLOWED = (40, 25)
 NEAR = 0.65
 """Metres from the best pose within which poses are near it."""
 
-ASKED = 60
+EVALUATED = 60
 """Readings that are asked at each pose."""
 
 LARGE = 300
@@ -79,22 +79,22 @@ def search(scan: Scan, around: LocalMap, guess: Floats, sigma: Floats, reach: Fl
         By how much it may be off, and how far is searched, either way: metres ahead and aside, radians.
     """
 
-    def asked(poses: Floats, times: int) -> Searched:
+    def evaluate(poses: Floats, times: int) -> Searched:
         coarse = blurred(scan, BLUR * times * STEPS[0], around) if times > 1 else scan
         prior = 0.5 * ((relative(guess, poses) / sigma) ** 2).sum(1)
-        return Searched(poses, scores(coarse, around, poses, max(len(scan.readings) // ASKED, 1)), prior)
+        return Searched(poses, scores(coarse, around, poses, max(len(scan.readings) // EVALUATED, 1)), prior)
 
     most = np.floor(reach / STEPS + 1e-9).astype(np.int64)
     if np.prod(2 * most + 1) <= LARGE:
-        return asked(grid_around(guess, reach, STEPS), 1)
+        return evaluate(grid_around(guess, reach, STEPS), 1)
     axes = [np.arange(-(n // COARSER[0]) * COARSER[0], n + 1, COARSER[0]) for n in most.tolist()]
     steps = np.stack([axis.ravel() for axis in np.meshgrid(*axes, indexing='ij')], axis=1)
     for times, finer, count in zip(COARSER, (*COARSER[1:], 1), FOLLOWED, strict=True):
-        found = asked(compose(guess, steps * STEPS), times)
+        found = evaluate(compose(guess, steps * STEPS), times)
         order = np.argsort(found.prior - found.values, kind='stable')
         apart = relative(found.best, found.poses[order])
         near = np.hypot(apart[:, 0], apart[:, 1]) <= NEAR
         kept = np.concatenate([order[near][:count], order[~near][:count]])
         steps = np.unique((steps[kept][:, None] + finer * _AROUND).reshape(-1, 3), axis=0)
         steps = steps[(np.abs(steps) <= most).all(1)]
-    return asked(compose(guess, steps * STEPS), 1)
+    return evaluate(compose(guess, steps * STEPS), 1)

@@ -115,16 +115,16 @@ class Distances:
         for direction in range(4):
             angle = direction * math.pi / 2 + self._askew[middle]
             off = wrapped(sensor[:, 2] - angle)
-            asked, slant, sides = np.abs(off) <= half + MARGIN, np.zeros(len(off)), 0
-            if (asked & usable).sum() < FEWEST:
+            in_cone, slant, sides = np.abs(off) <= half + MARGIN, np.zeros(len(off)), 0
+            if (in_cone & usable).sum() < FEWEST:
                 # the edge of the cone is the first to meet a wall whose normal lies beside it
                 ahead = self._looks_past and abs(wrapped(at[2] - angle)) < AHEAD
                 beside_it = np.where(off > 0.0, right, left)
                 far = np.maximum(beside_it, BESIDE if ahead else 0.0)
                 if far.any():
-                    asked, slant = np.abs(off) <= half + far, off - np.clip(off, -half, half)
-                    sides = _sides(slant[asked & (beside_it > 0.0)])
-            heard = asked & usable
+                    in_cone, slant = np.abs(off) <= half + far, off - np.clip(off, -half, half)
+                    sides = _sides(slant[in_cone & (beside_it > 0.0)])
+            heard = in_cone & usable
             arm, slant, ranges = sensor[heard, :2] - at[:2], slant[heard], z[heard]
             c, s = math.cos(angle), math.sin(angle)
             distance, lever = arm @ (c, s) + ranges * np.cos(slant), arm @ (s, -c) - ranges * np.sin(slant)
@@ -186,15 +186,15 @@ def normals_of(direction: NDArray[np.int64], askew: Floats) -> Floats:
 
 def agreeing(distance: Floats, progress: Floats) -> list[NDArray[np.int64]]:
     """Return the echoes, by number, of each distance on which enough of them agree, the most first."""
-    left, out = np.arange(len(distance)), []
+    remaining, out = np.arange(len(distance)), []
     for _ in range(PEAKS):
-        ordered = np.sort(distance[left])
-        together = np.searchsorted(ordered, ordered + WIDTH, side='right') - np.arange(len(ordered))
-        if together.max(initial=0) < FEWEST:
+        ordered = np.sort(distance[remaining])
+        counts = np.searchsorted(ordered, ordered + WIDTH, side='right') - np.arange(len(ordered))
+        if counts.max(initial=0) < FEWEST:
             break
-        begin = ordered[together.argmax()]
-        same = left[(distance[left] >= begin) & (distance[left] <= begin + WIDTH)]
-        left = left[np.abs(distance[left] - distance[same].mean()) >= WIDTH]
+        begin = ordered[counts.argmax()]
+        same = remaining[(distance[remaining] >= begin) & (distance[remaining] <= begin + WIDTH)]
+        remaining = remaining[np.abs(distance[remaining] - distance[same].mean()) >= WIDTH]
         if np.ptp(progress[same]) >= LEAST_TRAVEL:
             out.append(same)
     return out
