@@ -1,8 +1,7 @@
-"""The trajectory that matches alone say, whatever the directions of walls: scan matching, then blocks and places.
+"""The trajectory from matching alone, for walls at any angle: scan matching, then matches of blocks and loop closures.
 
-Where it is bent, maps of places are bent as well, and few are recognised. So the pose graph is made anew from what was
-found, and blocks are matched and places looked for again, as long as the map of the whole drive explains its readings
-better than before.
+A bent trajectory has bent local maps, and few places are recognised on them. So blocks are matched and loops are closed
+again with the result in place of odometry, as long as J of the map of the whole drive grows.
 """
 
 from __future__ import annotations
@@ -24,28 +23,29 @@ from .solving import SETTLED, MatchSolver
 from .windows import Odometry
 
 REMAINING_YAW_NOISE = math.radians(3.0)
-"""By how much the yaw strays after scan matching, and after each round, radians a √metre."""
+"""σ of the yaw error after scan matching, and after each round, radians a √metre."""
 
 WORTH_A_TRIAL = 1.5
-"""Standard errors by which scan matching must predict readings near by better than nodes that are known, for more to be
-tried. In 3 drives where corners were wrongly taken for square ones it was 3.5 to 7, in 4 others 0 to 0.6."""
+"""Standard errors by which scan matching must predict nearby readings better than the trajectory from walls; otherwise
+nothing more is tried. It was 3.5 to 7 in 3 drives where corners were wrongly taken for right angles, and 0 to 0.6 in 4
+others."""
 
 ROUNDS = 4
-"""Times that the pose graph is made from what was found before, at the most."""
+"""Most rounds of matching and loop closing."""
 
 
 class MatchedDrive(NamedTuple):
-    """Where a drive is by matches alone.
+    """The trajectory of a drive from matching alone.
 
     Attributes
     ----------
     nodes : float64, shape (K, 3)
     loops : list of Loop
-        Places seen before that it rests on.
+        Loop closures that it uses.
     value : float
-        `Scans.objective` of the nodes.
+        `Scans.objective` of the nodes, nats.
     part : float
-        Of the blocks that lie where the robot was before, those that are recognised.
+        Fraction of the blocks on an earlier visit that are recognised.
     """
 
     nodes: Floats
@@ -61,20 +61,21 @@ def match_drive(
     noise: float = 0.0,
     known: Floats | None = None,
 ) -> MatchedDrive | None:
-    """Return where a drive is by matches alone; None if the map along it explains its readings no better.
+    """Return the trajectory of a drive from matching alone; None if its J is not larger than that of odometry.
 
-    It has to explain them better than the map along odometry, and than the one along the nodes that are `known`. More
-    than scan matching is tried only if that predicts readings better than these.
+    If the trajectory from walls is `known`, J must be larger than that of it as well, and scan matching must predict
+    readings better than it before more is tried.
 
     Parameters
     ----------
     odometry : Odometry
     scans : Scans
     start_stage : callable
-        Receives a stage, and returns what receives how much of it is done.
+        Receives the name of a stage, and returns the callable that receives its progress.
     noise : float
-        By how much the yaw of odometry strays, radians a √metre; 0 if nobody knows.
+        σ of the yaw error of odometry, radians a √metre; 0 if it is not known.
     known : float64, shape (K, 3), optional
+        Nodes of the trajectory from walls.
     """
     best, value = None, scans.objective(scans.windows.node)
     if known is not None:
@@ -88,7 +89,7 @@ def match_drive(
         )
         if found is not None:
             best, value = found, found.value
-        # a drive that fits together hardly gains from another trial, nor does one that is better explained already
+        # if most places are recognised another trial hardly helps, nor if J of the first is no larger
         if best is None or best.part >= LEAST_RECOGNISED:
             break
     return best
@@ -97,7 +98,7 @@ def match_drive(
 def _match_repeatedly(
     odometry: Odometry, scans: Scans, start_stage: Callable[[str], Progress], start: Floats, noise: float, least: float
 ) -> MatchedDrive | None:
-    """Return the best of what is found by matching again and again from what was found; None if it is not better."""
+    """Return the best result of repeated matching, each round from the result before; None if J is at most `least`."""
     change, nodes = sensitivity(odometry, scans.windows), start
     best = None
     for _ in range(ROUNDS):

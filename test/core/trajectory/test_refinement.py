@@ -27,7 +27,7 @@ from forward_grid_mapper.core.trajectory.holding_out import (
 from forward_grid_mapper.core.trajectory.hypotheses import Solved
 from forward_grid_mapper.core.trajectory.outcome import Refinement
 from forward_grid_mapper.core.trajectory.poses import compose, relative, rms_after_alignment
-from forward_grid_mapper.core.trajectory.refinement import Refiner, _said, unfit
+from forward_grid_mapper.core.trajectory.refinement import Refiner, _gain_words, unfit
 from forward_grid_mapper.core.trajectory.scans import Scans
 from forward_grid_mapper.core.trajectory.windows import Odometry, cut
 from forward_grid_mapper.simulation.drift import LEVELS, odometry_of, with_drift
@@ -64,9 +64,9 @@ def outcome(bent, stages) -> Refinement:
 def test_an_error_that_is_not_known_is_no_number() -> None:
     """As with a sweep each metre, where no block has readings enough to be compared."""
     nothing = np.full(20, np.nan)
-    assert 'too few readings' in _said(gain(nothing, nothing))
+    assert 'too few readings' in _gain_words(gain(nothing, nothing))
     rng = np.random.default_rng(0)
-    assert '± 0.' in _said(gain(rng.random(20), rng.random(20)))
+    assert '± 0.' in _gain_words(gain(rng.random(20), rng.random(20)))
 
 
 def test_drift_is_taken_out(tour, bent, outcome, stages) -> None:
