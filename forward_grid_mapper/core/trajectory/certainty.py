@@ -1,20 +1,18 @@
-"""How certain a calibration is that a drive tells of its odometry.
+"""The calibration of the odometry from a drive, with standard deviations.
 
-Yaw is known all along a trajectory whose yaw walls measure. So what odometry errs by in a metre and in a radian
-is a regression over pieces of the drive,
+Walls measure the yaw all along a trajectory. So the errors of the yaw of odometry follow from a linear regression over
+pieces of the drive, and their standard deviations from its residuals:
 
     Δyaw of the trajectory − Δyaw of odometry  =  bias · ahead + turn_scale · turn + noise
 
-whose residuals say how certain it is.
-
-Scale and heading are not measured that way: where readings say nothing of how far the robot drove, as along a bare
-corridor, the trajectory follows the odometry and would agree with itself. They are asked from readings directly: f(c)
-is the mean log ratio of a block of readings, predicted by the map of what lies around it, where all motions have the
-calibration c. Over blocks b with slopes g_b and curvatures h_b at c,
+Scale and heading cannot be found by regression: where readings do not tell the distance, as along a bare corridor, the
+trajectory follows the odometry and would agree with it. They are found from the likelihood of readings: f(c) is the
+mean log-likelihood ratio of a block of readings on the map of what lies around it, if all motions have the calibration
+c. From the slopes g_b and curvatures h_b of blocks b at c,
 
     top − c  =  −Σ g_b / Σ h_b        σ²  =  Σ (g_b + h_b (top − c))² / (Σ h_b)²
 
-Loops say nothing of scale: a map that is larger everywhere closes as well.
+Loop closures do not give the scale, since a map that is larger everywhere closes as well.
 """
 
 from __future__ import annotations
@@ -36,37 +34,37 @@ from .scans import Scans
 from .windows import Odometry, cut
 
 PIECE = 2.0
-"""Metres of progress of a piece of the regression."""
+"""Metres of progress of each piece in the regression."""
 
 FEWEST_PIECES = 8
 
 STEPS = {'scale': 0.02, 'heading': math.radians(1.0)}
-"""By how much scale and heading are changed: parts, and radians."""
+"""Steps of the finite differences: fraction, and radians."""
 
 MOST_BLOCKS, LENGTH, SPAN = 40, 3, 5.0
-"""Blocks that are asked, the windows of each, and metres of progress around it that its map is made of."""
+"""Most blocks, windows of each, and metres of progress before and after a block within which windows make its map."""
 
 DENSITY = 80.0
-"""Readings a metre that are asked, of drives that have more: it takes time."""
+"""Readings a metre to which drives are thinned, to save time."""
 
 FEWEST_BLOCKS = 8
 
 FARTHEST = 2.0
-"""Steps that the top may lie away."""
+"""Largest distance of the top of the parabola from the middle, steps."""
 
 LEAST_SIGMA = {'scale': 0.004, 'heading': math.radians(0.3), 'bias': math.radians(0.05), 'turn_scale': 0.003}
-"""σ that is stated at the least."""
+"""Added to σ in quadrature."""
 
 LARGEST_SIGMA = {'scale': 0.012, 'heading': math.radians(0.6), 'bias': math.radians(0.5), 'turn_scale': 0.015}
-"""σ from which on nothing is told."""
+"""Values with a larger σ are not determined by the drive, and are left out."""
 
 
 YAW_ERRORS = ('bias', 'turn_scale')
-"""What `yaw_errors` tells."""
+"""The values that `yaw_errors` returns."""
 
 
 class Estimate(NamedTuple):
-    """A figure of the calibration, and its standard deviation."""
+    """A value of the calibration, and its standard deviation."""
 
     value: float
     sigma: float
@@ -80,7 +78,7 @@ def determined_calibration(
     parameters: Parameters,
     stop: NDArray[np.uint8],
 ) -> dict[str, Estimate]:
-    """Return what a drive tells of its odometry with certainty, by the names of `CALIBRATION`.
+    """Return those values of the calibration that a drive determines, by the names of `CALIBRATION`.
 
     Parameters
     ----------
@@ -89,7 +87,7 @@ def determined_calibration(
     odometry, trajectory : Odometry
         Poses at the same stamps.
     calibration : dict
-        What was found together with the trajectory.
+        The values that were estimated together with the trajectory.
     parameters : Parameters
     stop : uint8, shape (1,)
         Not 0 to end the work.
@@ -106,7 +104,7 @@ def determined_calibration(
 
 
 def combined_calibration(first: Mapping[str, float], told: Mapping[str, Estimate]) -> dict[str, Estimate]:
-    """Return what a drive tells of its odometry, where `told` is of odometry that `first` was applied to."""
+    """Return the calibration of raw odometry, if `told` is the one of odometry to which `first` was applied."""
     one = {name: first.get(name, 0.0) for name in CALIBRATION}
     found = {}
     for name, (value, sigma) in told.items():
@@ -122,7 +120,7 @@ def combined_calibration(first: Mapping[str, float], told: Mapping[str, Estimate
 
 
 def yaw_errors(odometry: Odometry, trajectory: Odometry) -> dict[str, Estimate]:
-    """Return bias and scale of turns from the yaw of a trajectory; empty if the drive is too short."""
+    """Return `bias` and `turn_scale` by regression of the yaw of a trajectory; empty if the drive is too short."""
     ends = np.arange(0.0, odometry.progress[-1], PIECE)
     if len(ends) <= FEWEST_PIECES:
         return {}
@@ -140,7 +138,7 @@ def yaw_errors(odometry: Odometry, trajectory: Odometry) -> dict[str, Estimate]:
     inverse = np.linalg.inv(gram)
     values = inverse @ (regressors.T @ difference)
     residual = difference - regressors @ values
-    # each residual by itself: wheels slip now and then
+    # standard errors robust to heteroscedasticity, since wheels slip now and then
     spread = regressors * (residual * math.sqrt(len(residual) / (len(residual) - 2)))[:, None]
     sigma = np.sqrt(np.diag(inverse @ (spread.T @ spread) @ inverse))
     return {name: Estimate(float(v), float(s)) for name, v, s in zip(YAW_ERRORS, values, sigma, strict=True)}
@@ -154,7 +152,7 @@ def translation_errors(
     parameters: Parameters,
     stop: NDArray[np.uint8],
 ) -> dict[str, Estimate]:
-    """Return scale and heading as readings tell them; what they do not tell is left out."""
+    """Return `scale` and `heading` from the likelihood of readings; what they do not determine is left out."""
     parameters = for_matching(parameters)
     every = max(int(len(readings) / max(DENSITY * odometry.travel[-1], 1.0)), 1)
     windows = cut(thinned(readings, every), odometry)
@@ -178,7 +176,7 @@ def translation_errors(
 
 
 def thinned(readings: Readings, every: int) -> Readings:
-    """Return every n-th reading of each sensor, each sensor beginning with another one."""
+    """Return every n-th reading of each sensor, with another offset for each sensor."""
     readings = readings.select(np.argsort(readings.stamp, kind='stable'))
     stay = np.zeros(len(readings), np.bool_)
     for number in np.unique(readings.sensor):
@@ -188,12 +186,14 @@ def thinned(readings: Readings, every: int) -> Readings:
 
 
 def parabola_top(low: Floats, middle: Floats, high: Floats) -> Estimate | None:
-    """Return where the sum of blocks' values is highest, in steps from the middle; None if they do not say.
+    """Return the top of the parabola through the sums of blocks' values, in steps from the middle.
+
+    None if there is no maximum, or if it is farther than `FARTHEST`.
 
     Parameters
     ----------
     low, middle, high : float64, shape (B,)
-        Of each block one step before, at, and one step behind the middle; NaN where nothing is known.
+        Value of each block one step below the middle, at it, and one step above it; NaN if unknown.
     """
     known = np.isfinite(low) & np.isfinite(middle) & np.isfinite(high)
     if known.sum() < FEWEST_BLOCKS:

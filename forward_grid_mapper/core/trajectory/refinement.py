@@ -1,12 +1,12 @@
-"""From readings and drifting odometry to the trajectory that explains both: the steps, one after the other.
+"""SLAM of a whole drive: from readings and drifting odometry to a refined trajectory, in these steps.
 
-windows         the drive in pieces of 0.4 m, each a node of the pose graph
-heading         yaw from walls at right angles, followed over the whole drive
-straight walls  distances of walls along the drive, which hold it straight and tell scale and heading of the wheels
-matching        each block matched with what was driven before it, and then with what lies around it
-places          blocks matched with what was mapped there at another time
-scan matching   where walls tell no heading, or a doubtful one: windows matched one by one, then blocks and places
-judgement       what was held out and where walls stand must speak for the trajectory, or odometry stays
+windows         the drive is cut into pieces of 0.4 m, each with a node of the pose graph
+heading         yaw from the directions of walls at right angles, by a hidden Markov model over the whole drive
+straight walls  distances to walls, which keep the trajectory straight and give scale and heading of the wheels
+matching        each block is matched with a local map of what was driven before it, then of what lies around it
+loop closures   blocks are matched with local maps of other visits
+scan matching   if walls give no heading or a doubtful one: matching alone, then loop closures
+judgement       the trajectory is accepted if held-out readings or walls support it; otherwise odometry is kept
 """
 
 from __future__ import annotations
@@ -41,25 +41,25 @@ from .walls import wall_votes
 from .windows import TRAVEL, Odometry, Windows, corrected, cut
 
 SHORTEST = 8.0
-"""Metres of a drive below which nothing is refined: its drift is small, and there is little to judge it by."""
+"""Shortest drive that is refined, metres: shorter ones drift little, and have few readings for the judgement."""
 
 FEWEST_READINGS = 200
 
 LEAST_ECHOES = 0.05
-"""Part of the readings that must have an echo."""
+"""Fraction of the readings that must have an echo."""
 
 LEAST_SENSORS = 2
 
 LEAST_VOTE_GAIN, LEAST_SIGMAS_WITH_WALLS = 10.0, -1.0
-"""Nats that the votes of walls must say against odometry's yaw, beyond what sensors say by where they look, to be a
-witness of their own, and the standard errors that are then enough where the robot came to no place twice: readings must
-not be predicted worse. Little drift hardly shows in a few metres."""
+"""If votes of walls are likelier by so many nats than with the yaw of odometry, beyond what random ranges give, and the
+robot came back to no place, the gain in predicting readings need only be so many standard errors: readings must not be
+predicted worse. Small drift hardly shows within a few metres."""
 
 LEAST_CERTAINTY = 0.9
-"""Probability that the heading did not get lost by a right angle."""
+"""Least probability that no right angle of the heading was lost."""
 
 LEAST_MOVED = 0.15
-"""Metres that odometry must be off, in the root mean square: about the error of what takes its place."""
+"""Least difference from odometry of an accepted trajectory, metres (rms): about the error of the trajectory itself."""
 
 NOT_ENOUGH = ': not enough to tell that odometry is off'
 
@@ -71,15 +71,15 @@ NO_WALLS = (
 NOR_MATCHES = '; matches alone tell no better trajectory'
 
 SCAN_MATCHED = 2 * TRAVEL
-"""Metres between poses, for half of the way, up to which matching alone is tried. Scan matching takes the shape of two
-windows from odometry, and readings between poses are on a straight line: turns are lost."""
+"""Largest median distance between poses of odometry for matching alone, metres. Scan matching takes the shape of two
+windows from odometry, and between poses readings are interpolated on a straight line, so turns are lost."""
 
 Watch = Callable[[str, float], None]
-"""Receives what is going on, and how much of it is done, from 0 to 1."""
+"""Receives the name of the stage, and the fraction of it that is done, from 0 to 1."""
 
 
 class _Drive(NamedTuple):
-    """A drive, in windows."""
+    """A drive, its windows and their scans."""
 
     readings: Readings
     odometry: Odometry
@@ -88,7 +88,7 @@ class _Drive(NamedTuple):
 
 
 class _Attempt(NamedTuple):
-    """What became of a drive in one way: its nodes, and whether no other way needs to be tried."""
+    """The result by one method, its nodes, and whether it is so sure that no other method needs to be tried."""
 
     refinement: Refinement
     nodes: Floats
@@ -96,10 +96,10 @@ class _Attempt(NamedTuple):
 
 
 class Refiner:
-    """Runs from a drive to its trajectory; can be cancelled from another thread, once and for all."""
+    """Estimates the trajectories of drives; can be cancelled from another thread, for good."""
 
     def __init__(self, parameters: Parameters) -> None:
-        """Prepare runs with these parameters; the search and σ are those of the maps."""
+        """Set the parameters; cell size and sensor model are replaced (`for_matching`)."""
         self._parameters = for_matching(parameters)
         self._stop = np.zeros(1, np.uint8)
         self._watch: Watch = lambda stage, part: None
@@ -117,7 +117,7 @@ class Refiner:
             Placed by `odometry`.
         odometry : Odometry
         watch : callable
-            Called from this thread as the work goes on.
+            Called from this thread during the work.
 
         Raises
         ------
@@ -140,11 +140,11 @@ class Refiner:
         return self._in_parts(readings, odometry, jumped_to)
 
     def _in_parts(self, readings: Readings, odometry: Odometry, jumped_to: NDArray[np.int64]) -> Refinement:
-        """Return the trajectory of a drive whose odometry jumps: of each part by itself, each on the map of others."""
+        """Return the trajectory of a drive with jumps: each part is refined alone, then placed on the map before it."""
         watch, cuts, outcomes = self._watch, parts_at(readings, odometry, jumped_to), []
         for k, (own, part) in enumerate(cuts, 1):
             self._watch = partial(_report_part, watch, f'part {k} of {len(cuts)}, ')
-            # to be placed, a part needs the best heading that there is, however little it moves
+            # the placement needs the best heading, so refined parts are accepted however little they move
             outcomes.append(self._whole(own, part, 0.0))
         self._watch = watch
         self._start_stage('what follows jumps of odometry')
@@ -153,7 +153,7 @@ class Refiner:
         return joined_parts(readings, odometry, parts, outcomes, begins)
 
     def _whole(self, readings: Readings, odometry: Odometry, least_moved: float = LEAST_MOVED) -> Refinement:
-        """Return the trajectory of a drive whose odometry does not jump; one that moves it by less is not taken."""
+        """Return the trajectory of a drive without jumps; it must differ from odometry by `least_moved` metres."""
         reason = unfit(readings, odometry)
         if reason:
             return Refinement(False, reason, readings, odometry, {})
@@ -166,7 +166,7 @@ class Refiner:
         return self._at_any_angle(drive, by_walls, least_moved)
 
     def _at_right_angles(self, drive: _Drive, least_moved: float) -> _Attempt:
-        """Return the trajectory if walls stand at right angles to each other, or why there is none."""
+        """Return the trajectory with walls at right angles to each other, or why there is none."""
         readings, odometry, windows, scans = drive
         walls, vote_gain = self._heading(windows, scans)
         if walls is None:
@@ -188,7 +188,7 @@ class Refiner:
         by_name = dict(zip(CALIBRATION, calibration.tolist(), strict=True))
         proven = better.sigmas >= LEAST_SIGMAS
         votes_suffice = vote_gain > LEAST_VOTE_GAIN and better.sigmas >= LEAST_SIGMAS_WITH_WALLS
-        # where walls stand at right angles along odometry as it is, that is the answer
+        # if walls agree with odometry, other methods need not be tried
         agrees = differences(odometry, refined(odometry, windows, along.nodes))[0] < LEAST_MOVED
         unproven = keep_odometry(gain_words + NOT_ENOUGH, better)._replace(sure=agrees)
         if not proven and not votes_suffice:
@@ -204,8 +204,8 @@ class Refiner:
         self._start_stage('judgement')
         nodes = last_not_worse(scans, simple, found.along.nodes, found.solution.nodes)
         if not proven:
-            # places seen before tell wheels that are right over metres from those that are not, and walls that stand
-            # askew from a yaw that is off; where odometry alone says that the robot came back, it need not be so
+            # revisits show drift over the whole drive, and walls that are not parallel; whether the robot came back is
+            # decided along the refined nodes, since by odometry it may be wrong
             revisited = has_revisits(scans, nodes)
             if not revisited and not votes_suffice:
                 return unproven
@@ -231,7 +231,7 @@ class Refiner:
         return _Attempt(outcome, nodes, sure)
 
     def _at_any_angle(self, drive: _Drive, by_walls: _Attempt, least_moved: float) -> Refinement:
-        """Return the trajectory that matches alone say, if it is better than what walls at right angles say."""
+        """Return the trajectory by matching alone, if it is better than that by walls at right angles."""
         readings, odometry, windows, scans = drive
         known = by_walls.nodes if by_walls.refinement.accepted else None
         apart = usual_step(odometry)
@@ -240,7 +240,7 @@ class Refiner:
         try:
             found = match_drive(odometry, scans, self._start_stage, self._parameters.association.odometry_noise, known)
         except InputError:
-            # its cells are of one size, so that a map of the whole drive may be too large though the maps are not
+            # at the cell size of matching, the map of the whole drive may be too large although the final maps are not
             found = None
         if found is None:
             return _without_better(by_walls.refinement)
@@ -281,15 +281,17 @@ class Refiner:
         return progress
 
     def _heading(self, windows: Windows, scans: Scans) -> tuple[Heading | None, float]:
-        """Return what walls say about the yaw, and the nats by which they say that odometry's is wrong."""
+        """Return the heading from walls, and by how many nats votes are likelier than with the yaw of odometry.
+
+        The same gain of random ranges is subtracted.
+        """
         self._start_stage('directions of walls')
         given_noise = self._parameters.association.odometry_noise
         noises = (given_noise,) if given_noise else NOISES
         found = heading(windows, *wall_votes(windows, scans.held_out), noises)
         if found is None:
             return None, 0.0
-        # sensors have directions of their own, which vote with whatever ranges: a robot that drives and looks along
-        # two axes seems to know of walls
+        # a robot that drives and looks along two axes gets votes for these even with random ranges
         readings, rng = windows.readings, np.random.default_rng(0)
         drawn = np.where(readings.echo, rng.random(len(readings)) * readings.z_max, readings.z)
         randomised = replace(windows, readings=replace(readings, z=drawn))
@@ -299,7 +301,7 @@ class Refiner:
 
 
 def without_times(readings: Readings, odometry: Odometry) -> str:
-    """Return why odometry does not tell where each reading was taken; empty if it does."""
+    """Return why the odometry does not cover all readings; empty if it does."""
     if not len(odometry.stamp):
         return 'the poses of odometry are not at hand, as in a journal'
     early, late = readings.stamp.min(initial=odometry.stamp[0]), readings.stamp.max(initial=odometry.stamp[-1])
@@ -326,18 +328,18 @@ def unfit(readings: Readings, odometry: Odometry) -> str:
 
 
 def too_little_words(moved: float) -> str:
-    """Return why a drive stays that is off by so little, metres."""
+    """Return the reason for keeping an odometry whose error, metres, is so small."""
     return f'odometry is off by {moved:.2f} m, which is no more than sonar can tell'
 
 
 def usual_step(odometry: Odometry) -> float:
-    """Return the median distance between two poses over the way of the robot, metres."""
+    """Return the step between poses that half of the distance was driven with or less, metres (weighted median)."""
     steps = np.sort(np.diff(odometry.travel))
     return float(steps[np.searchsorted(np.cumsum(steps), steps.sum() / 2)])
 
 
 def too_sparse_words(apart: float) -> str:
-    """Return why matches alone are not tried where poses are so far apart, metres."""
+    """Return why matching alone is not tried if poses are so far apart, metres."""
     return (
         f'; poses of odometry are usually {apart:.1f} m apart, and matches alone need one every {SCAN_MATCHED:g} m: '
         f'record odometry at a higher rate'
@@ -345,12 +347,12 @@ def too_sparse_words(apart: float) -> str:
 
 
 def lost_words(certainty: float) -> str:
-    """Return why a drive stays whose heading is this certain."""
+    """Return the reason for keeping odometry if the heading is only this certain."""
     return f'the heading was lost somewhere: that it is not off by a right angle is only {certainty:.0%} certain'
 
 
 def refined(odometry: Odometry, windows: Windows, nodes: Floats) -> Odometry:
-    """Return the corrected odometry, which begins where odometry does."""
+    """Return the trajectory: odometry corrected by nodes, moved so that its first pose is that of odometry."""
     w = windows
     pose = corrected(odometry.progress, odometry.pose, w.node_progress, w.node, nodes)
     home = compose(odometry.pose[0], inverse(pose[0]))
@@ -360,7 +362,7 @@ def refined(odometry: Odometry, windows: Windows, nodes: Floats) -> Odometry:
 
 
 def _without_better(found: Refinement, why: str = NOR_MATCHES) -> Refinement:
-    """Return what walls said, where matches alone told nothing better, or were not tried."""
+    """Return the result by walls, with the reason why matching alone gave no better one if it is not accepted."""
     return found if found.accepted else replace(found, reason=found.reason + why)
 
 
@@ -378,7 +380,7 @@ def _gain_words(better: Gain) -> str:
 
 
 def _recognition_words(part: float) -> str:
-    """Return what is to be said where this part of the blocks at places seen before is recognised."""
+    """Return the warning about the fraction of blocks on earlier visits that are recognised; empty if it is large."""
     if part >= LEAST_RECOGNISED:
         return ''
     return f'; {part:.0%} of the way through places seen before is recognised: the drive may be bent as a whole'
