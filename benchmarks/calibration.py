@@ -71,7 +71,7 @@ def cells_of(case: Case) -> Cells:
     kinds = told.KINDS[patterns(occupied.ravel(), maps.grid.shape)].reshape(maps.grid.shape)
     layers = [(kinds == getattr(told, name)).astype(float) for name in NAMES[:6]]
     layers += [occupied.astype(float), *(np.log1p(part) for part in told.around(passed))]
-    said = told.repeated(evidence.of_occupancy().reshape(maps.grid.shape))
+    said = told.discounted(evidence.of_occupancy().reshape(maps.grid.shape))
     known = np.isfinite(on_truth(maps.uncertainty, maps.grid, case, tool)) & np.isfinite(case.truth)
     columns = [on_truth(layer, maps.grid, case, tool)[known] for layer in (said, *layers)]
     return Cells(columns[0], np.stack(columns[1:], axis=1), case.truth[known] > 0.5)

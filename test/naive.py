@@ -12,14 +12,14 @@ from forward_grid_mapper.core.common.constants import (
     CONTRAST,
     FEW_ECHOES,
     FEW_READINGS,
+    FREE_GROWTH,
     GAIN,
     IMAGE_AROUND,
-    LEAST_FREE_WAY,
+    LEAST_IN_SIGHT,
     LEAST_RATE,
     LEAST_STRENGTH,
-    LED_ON,
     MOST_AGAINST_EXTENSION,
-    STANDS_OFF,
+    SAME_WALL,
     STRAIGHT_RUN,
 )
 from forward_grid_mapper.core.common.grid import Grid
@@ -411,7 +411,7 @@ def incidence_limit(echoes: np.ndarray, passes: np.ndarray) -> int:
     return zone
 
 
-def on_free_way(grid: Grid, occupied: np.ndarray, apex: tuple[float, float], c: int, before: float) -> bool:
+def in_line_of_sight(grid: Grid, occupied: np.ndarray, apex: tuple[float, float], c: int, before: float) -> bool:
     """Whether no occupied cell lies on the way from a sensor to `before` metres before cell c."""
     xs, ys = grid.centers()
     dx, dy = xs[c % grid.width] - apex[0], ys[c // grid.width] - apex[1]
@@ -434,7 +434,7 @@ def explained_echoes(readings: Readings, grid: Grid, occupied: np.ndarray, model
             error = (d - readings.z[t]) / sigma
             if occupied.ravel()[c] and abs(error) < THROUGH:
                 out[1, c] += math.exp(-0.5 * error**2)
-                if on_free_way(grid, occupied, (readings.x[t], readings.y[t]), c, STANDS_OFF):
+                if in_line_of_sight(grid, occupied, (readings.x[t], readings.y[t]), c, SAME_WALL):
                     out[0, c] += math.exp(-0.5 * error**2)
     return out
 
@@ -447,7 +447,7 @@ def mirror_images(
     out, n = np.zeros(grid.shape, bool), round(IMAGE_AROUND / grid.resolution)
     for row, column in np.argwhere(cells):
         part = slice(max(row - n, 0), row + n + 1), slice(max(column - n, 0), column + n + 1)
-        out[row, column] = free[part].sum() < LEAST_FREE_WAY * total[part].sum()
+        out[row, column] = free[part].sum() < LEAST_IN_SIGHT * total[part].sum()
     return out
 
 
@@ -460,7 +460,7 @@ def never_passed(
         sigma = sigma_of(readings, t, grid, model)
         for c, d in cells_of(readings, t, grid, model).items():
             here = d <= readings.z[t] - THROUGH * sigma and strength(readings, t, grid, c) >= LEAST_STRENGTH
-            if here and on_free_way(grid, occupied, (readings.x[t], readings.y[t]), c, grid.resolution):
+            if here and in_line_of_sight(grid, occupied, (readings.x[t], readings.y[t]), c, grid.resolution):
                 out.ravel()[c] = False
     return out
 
@@ -610,7 +610,7 @@ def handed_out(
     through = (ml == 0) & (traversed | (passes.sum(axis=0).reshape(grid.shape) >= least[0]))
     noticed = noticing(passes, model.p_hit, model.max_incidence_angle).reshape(grid.shape) >= least[1]
     known = (ml == 0) & (traversed | (noticed & through))
-    for _ in range(round(LED_ON / 0.1)):
+    for _ in range(round(FREE_GROWTH / 0.1)):
         known = through & (box_sum(known.astype(int)) > 0)
     told = evidence(readings, grid, occupied, model, normals).reshape(grid.shape)
     told = np.where(occupied.reshape(grid.shape) == 1, -told, told)

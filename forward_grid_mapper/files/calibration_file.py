@@ -9,7 +9,7 @@ from pathlib import Path
 import yaml
 
 from ..core.common.errors import ParameterError
-from ..core.trajectory.certainty import Told
+from ..core.trajectory.certainty import Estimate
 from .small_text import read_text
 
 NAMES = {
@@ -33,7 +33,7 @@ HOW = {
 }
 
 
-def calibration_text(told: Mapping[str, Told], drive: str) -> str:
+def calibration_text(told: Mapping[str, Estimate], drive: str) -> str:
     """Return the file of a calibration, by the names of `core.trajectory.odometry_model`; empty if nothing is told."""
     if not told:
         return ''

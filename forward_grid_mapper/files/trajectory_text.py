@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-from ..core.trajectory.certainty import Told
+from ..core.trajectory.certainty import Estimate
 from ..core.trajectory.odometry_model import CALIBRATION
 from ..core.trajectory.outcome import Refinement
 from ..core.trajectory.windows import Odometry
@@ -48,7 +48,7 @@ def _tum_name(kind: str, number: int | None) -> str:
 
 
 def trajectory_data(
-    outcome: Refinement, number: int | None = None, fitted: str = '', told: Mapping[str, Told] | None = None
+    outcome: Refinement, number: int | None = None, fitted: str = '', told: Mapping[str, Estimate] | None = None
 ) -> dict[str, Any]:
     """Return what became of the trajectory, for the report: metres, degrees, nats, parts and radians.
 
@@ -73,7 +73,7 @@ def trajectory_data(
     return data
 
 
-def told_words(told: Mapping[str, Told]) -> str:
+def told_words(told: Mapping[str, Estimate]) -> str:
     """Return what the wheels do as far as the drive tells it, each figure with its standard deviation."""
     words = []
     for name, (value, sigma) in told.items():

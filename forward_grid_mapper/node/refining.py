@@ -19,7 +19,7 @@ from ..core.maps.log_odds_map import LogOddsMap
 from ..core.maps.map_set import MapSet
 from ..core.trajectory.correction import Correction
 from ..core.trajectory.following import Follower
-from ..core.trajectory.keeping import kept
+from ..core.trajectory.keeping import keep_if_not_worse
 from ..core.trajectory.outcome import Refinement
 from ..core.trajectory.refinement import Refiner
 from ..core.trajectory.windows import Odometry
@@ -163,7 +163,7 @@ class RefiningMapper:
         if found.accepted or before is None or before.refinement is None or before.correction is None:
             return found
         say('that of the run before', 0.0)
-        outcome = kept(before.refinement, before.correction, found, self._parameters, self._stop)
+        outcome = keep_if_not_worse(before.refinement, before.correction, found, self._parameters, self._stop)
         if outcome.accepted:
             self._kept = found.reason
             return outcome

@@ -15,7 +15,7 @@ from ..core.common.parameters import Parameters
 from ..core.common.readings import Readings, of_drives
 from ..core.maps.map_set import MapSet
 from ..core.messages.reading_buffer import bounded
-from ..core.trajectory.certainty import OF_YAW, Told, after, certain
+from ..core.trajectory.certainty import YAW_ERRORS, Estimate, combined_calibration, determined_calibration
 from ..core.trajectory.odometry_model import CALIBRATION, calibrated
 from ..core.trajectory.outcome import Refinement, replaced
 from ..core.trajectory.poses import relative
@@ -56,7 +56,7 @@ class RefinedDrives:
     drives: Drives
     odometry: tuple[Odometry, ...]
     outcomes: tuple[Refinement, ...]
-    told: tuple[dict[str, Told], ...]
+    told: tuple[dict[str, Estimate], ...]
 
     @property
     def moved(self) -> bool:
@@ -173,7 +173,7 @@ def _told(
     parameters: Parameters,
     watch: Watch,
     given: Given | None,
-) -> dict[str, Told]:
+) -> dict[str, Estimate]:
     if not outcome.accepted or not outcome.calibration:
         return {}
     watch('what the drive tells of its odometry', 0.0)
@@ -186,11 +186,11 @@ def _told(
     applied = odometry if given is None else _calibrated(odometry, given)
     if given is not None:
         readings = replaced(readings, odometry, applied)
-    told = certain(readings, applied, trajectory, outcome.calibration, parameters, stop)
+    told = determined_calibration(readings, applied, trajectory, outcome.calibration, parameters, stop)
     if not outcome.right_angles:
         # without walls the yaw follows odometry where readings say little, and would agree with it
-        told = {name: each for name, each in told.items() if name not in OF_YAW}
-    return told if given is None else after(given.calibration, told)
+        told = {name: each for name, each in told.items() if name not in YAW_ERRORS}
+    return told if given is None else combined_calibration(given.calibration, told)
 
 
 def _fitted(outcomes: list[Refinement], parameters: Parameters) -> tuple[list[Refinement], list[str]]:

@@ -9,14 +9,14 @@ import pytest
 import yaml
 
 from forward_grid_mapper.core.common.errors import ParameterError
-from forward_grid_mapper.core.trajectory.certainty import Told
+from forward_grid_mapper.core.trajectory.certainty import Estimate
 from forward_grid_mapper.files.calibration_file import calibration_text, load_calibration
 
 TOLD = {
-    'scale': Told(0.012, 0.004),
-    'heading': Told(-0.01, 0.003),
-    'bias': Told(math.radians(0.5), math.radians(0.1)),
-    'turn_scale': Told(-0.02, 0.005),
+    'scale': Estimate(0.012, 0.004),
+    'heading': Estimate(-0.01, 0.003),
+    'bias': Estimate(math.radians(0.5), math.radians(0.1)),
+    'turn_scale': Estimate(-0.02, 0.005),
 }
 
 

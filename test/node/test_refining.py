@@ -97,7 +97,7 @@ def test_it_goes_back_to_odometry_where_this_is_better(
 ) -> None:
     robot, _ = refined(inside(refine_poses=True).start())
     quick.accepts = False
-    monkeypatch.setattr(keeping, '_odometry_better', lambda *arguments: Gain(0.1, 0.04))
+    monkeypatch.setattr(keeping, '_gain_of_odometry', lambda *arguments: Gain(0.1, 0.04))
     robot.drive(200, 20)
     answer = robot.call(robot.node.em.run_em)
     assert robot.node.trajectory.correction is None

@@ -40,7 +40,7 @@ def test_what_wheels_do_is_asked_of_a_stretch_without_jumps(
         asked.append([len(readings), len(odometry.stamp), len(trajectory.stamp)])
         return {}
 
-    monkeypatch.setattr(refined, 'certain', certain)
+    monkeypatch.setattr(refined, 'determined_calibration', certain)
     drive = drive_of('a')
     outcome = outcome_of(drive, stretch=stretch)
     odometry = Odometry.of(*drive.associator.odometry)

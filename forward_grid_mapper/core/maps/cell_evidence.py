@@ -1,4 +1,4 @@
-"""Why a cell is what it is: what every reading says for and against an obstacle there, the rest of the map as it is."""
+"""Why a cell is occupied or free: the evidence of each reading for an obstacle there, given the rest of the map."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..common.constants import STANDS_OFF
+from ..common.constants import SAME_WALL
 from ..common.grid import Grid
 from ..common.parameters import Parameters
 from ..common.readings import Floats, Readings
@@ -16,46 +16,48 @@ from ..search.prior import odds_given_neighbours, wall_prior
 from ..sensor.cone_table import cone_table
 from ..sensor.forward_model import ForwardModel
 from ..sensor.surface_normals import SurfaceNormals
-from .free_ways import on_free_way
+from .free_ways import in_line_of_sight
 from .traversed import traversed_cells
 
 NOTHING = 1e-9
-"""Nats, either way, that are rounding: a reading that says no more says nothing."""
+"""Log-likelihood ratios up to this, nats, are rounding errors."""
 
 MARGIN = 3.0
-"""Cells around the cell within which a cone is looked at: its neighbours, and rounding."""
+"""Cells around the cell within which cones are examined: its neighbours, and rounding."""
 
 HERE = 2.0
-"""σ between the range of a reading and a cell for the reading to end there."""
+"""Largest distance between the range of a reading and the cell in which it ends, σ."""
 
 
 @dataclass(frozen=True)
 class CellEvidence:
-    """What the readings and the prior say of one cell.
+    """The evidence of readings and prior about one cell.
 
     Attributes
     ----------
     row, column : int
         Of the cell in its grid.
     traversed : bool
-        Whether a sensor was moved over it, which no obstacle survives.
+        Whether the robot traversed it, so that no obstacle can be there.
     readings : int64, shape (N,)
-        Which readings say something of it, those first that say most.
+        Indices of the readings that have evidence about it, in decreasing order of |nats|.
     nats : float64, shape (N,)
         γ [log p(z | obstacle in the cell, rest of the map) − log p(z | none, rest of the map)] of each.
     distance : float64, shape (N,)
         From the sensor to the surface that an obstacle in the cell would have, metres.
     ends_here : bool, shape (N,)
-        Whether the range lies within `HERE` σ of that; other readings reach farther, or end before it.
+        Whether the range is within `HERE` σ of that; other readings reach farther, or end before it.
     silent : bool, shape (N,)
         Max-range readings.
     through_wall : bool, shape (N,)
-        Whether an occupied cell stands on the way to the cell: behind walls, what sound seems to tell does not count.
+        Whether an occupied cell is on the line of sight to the cell: free space and echoes behind walls are not
+        trusted.
     prior : float
         Log prior odds of an obstacle given the neighbours of the cell, nats.
     wall : float
-        What all readings say for obstacles in the cell and in those of its eight neighbours that are occupied, against
-        none in any of them, nats. A reading that one cell of a wall explains needs no other one.
+        Log-likelihood ratio of all readings for obstacles in the cell and in its occupied neighbours to no obstacle in
+        any of these nine cells, nats. It matters because a reading that one cell of a wall explains does not need
+        another one.
     """
 
     row: int
@@ -72,7 +74,7 @@ class CellEvidence:
 
     @property
     def data(self) -> float:
-        """What all readings together say for an obstacle, nats."""
+        """Sum of `nats` over all readings."""
         return float(self.nats.sum())
 
 
@@ -90,18 +92,18 @@ def cell_evidence(
     normals: SurfaceNormals,
     place: tuple[float, float],
 ) -> CellEvidence:
-    """Return what is known of the cell at a place.
+    """Return the evidence about the cell at a place.
 
     Parameters
     ----------
     readings : Readings
-        Those that the map was made from.
+        The readings that the map was made from.
     grid : Grid
     ml : int8, shape `grid.shape`
-        1 where occupied; anything else counts as free.
+        1 if occupied; anything else counts as free.
     parameters : Parameters
     normals : SurfaceNormals
-        That the map was made with.
+        Those that the map was made with.
     place : tuple of float
         x and y in the map frame, metres, on the grid.
     """
@@ -111,7 +113,7 @@ def cell_evidence(
     u, v = column + 0.5 - cones['x'], row + 0.5 - cones['y']
     distance = np.hypot(u, v)
     along, across = u * cones['axis_x'] + v * cones['axis_y'], u * cones['axis_y'] - v * cones['axis_x']
-    # whose cones may hold the cell or a neighbour; the cells that the axis passes belong to a cone, however narrow
+    # cones that may contain the cell or a neighbour; a cone contains the cells on its axis, however narrow it is
     near = (along >= cones['cosine'] * distance) | (np.abs(across) <= MARGIN) | (distance <= MARGIN)
     outside = np.maximum(cones['cosine'] * np.abs(across) - cones['sine'] * along, 0.0)
     which = np.flatnonzero((near | (outside <= MARGIN)) & (distance <= cones['reach'] + MARGIN))
@@ -128,8 +130,8 @@ def cell_evidence(
     which, nats = which[order], nats[order]
     traversed = traversed_cells(readings, grid)
     lattice, walls = Lattice(grid.height, grid.width, grid.resolution), (ml == 1).ravel()
-    until = distance - STANDS_OFF / grid.resolution
-    blocked = [not on_free_way(cones[i], u[i], v[i], until[i], walls, lattice) for i in which]
+    until = distance - SAME_WALL / grid.resolution
+    blocked = [not in_line_of_sight(cones[i], u[i], v[i], until[i], walls, lattice) for i in which]
     error = np.abs(cones['z'][which] - distance[which])
     return CellEvidence(
         row=int(row),

@@ -1,7 +1,7 @@
-"""What was taken out of the map: echoes of people and other things that moved on, where other readings went through.
+"""Dynamic objects: echoes of people and other objects that moved away, in space that is free by other readings.
 
-An echo that the map takes for a random measurement has left no mark in it. Where such echoes end in space that is free,
-they are counted cell by cell: a person who stood about shows as a patch of counts, a stray echo as a thin arc of ones.
+The maximum likelihood map explains such echoes as random measurements. They are counted in the free cells in which they
+end: a person who stood for a while appears as a patch of counts, a stray echo as a thin arc of ones.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from ..sensor.forward_model import ForwardModel
 
 @allocating_kernel
 def _count(cones: Cones, unexplained: Any, out: Any) -> None:
-    """Add 1 to the cells that are at most σ from the range of each unexplained echo."""
+    """Add 1 to the cells within σ of the range of each unexplained echo."""
     flat = out.ravel()
     cells, distances = np.empty(1024, np.int32), np.empty(1024, np.float64)
     for t in range(len(cones)):
@@ -32,13 +32,13 @@ def _count(cones: Cones, unexplained: Any, out: Any) -> None:
 
 
 def dynamic_echoes(forward: ForwardModel, unexplained: NDArray[np.bool_], ml: NDArray[np.int8]) -> NDArray[np.float32]:
-    """Return how many echoes that the map does not explain end in each of its free cells, shape `ml.shape`.
+    """Return the number of unexplained echoes that end in each free cell of a map, shape `ml.shape`.
 
     Parameters
     ----------
     forward : ForwardModel
     unexplained : bool, shape (N,)
-        Readings that the map takes for random measurements.
+        Readings that are random measurements by the map.
     ml : int8, shape `forward.grid.shape`
         0 where free.
     """

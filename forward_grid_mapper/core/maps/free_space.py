@@ -1,14 +1,14 @@
-"""Free space: through which cells readings passed on their way to what explains them, and in which directions.
+"""Free space: the expected number of readings that passed each cell on the way to their cause, by direction.
 
-A surface returns sound within `max_incidence_angle` of its normal alone. A reading that passed a cell says nothing of a
-surface there that it would have met at more of a slant, and which way a surface in an empty cell would face is not
-known. So passes are summed apart for `DIRECTIONS` of looking. Be P_j the number of those within that angle of the j-th
-of as many normals, each as likely as the others. Then a surface of unknown normal makes what passed less likely by
+A surface returns sound only within `max_incidence_angle` of its normal. A reading that passed a cell does not tell of a
+surface there that it would have met at a larger angle, and the normal of a surface in an empty cell is unknown. So
+passes are counted separately for `DIRECTIONS`. Let P_j be the number of passes within this angle of the j-th of J
+normals, which are equally likely. A surface of unknown normal changes the likelihood of these passes by the factor
 
     (1 − p_hit)^n = 1/J Σ_j (1 − p_hit)^P_j
 
-and as much so as n readings that any surface would have noticed. Readings that all look the same way, however many,
-make n less than one; without a limit of the incidence n is their number.
+which is that of n readings that would detect a surface of any normal. If all readings have the same direction, n is
+less than one, however many they are. Without a limit of the incidence angle, n is their number.
 """
 
 from __future__ import annotations
@@ -28,19 +28,19 @@ from ..sensor.cone_table import cone_of
 from ..sensor.density import density
 
 DIRECTIONS = 4
-"""Directions of looking, apart by 45°: along the rows, the columns and both diagonals, either way. Of eight, figures
-are the same."""
+"""Directions, 45° apart: along the rows, the columns and both diagonals; opposite directions are the same. With eight,
+the results are the same."""
 
 EIGHTH = math.tan(math.pi / 8)
-"""Of the angle up to which a direction is that of the nearer axis of the lattice."""
+"""Tangent of the largest angle between a direction and the axis of the lattice that it is assigned to."""
 
 UNIT = 2.0**-20
-"""Readings in a unit of the sums of passed readings; sums of whole numbers do not depend on their order."""
+"""Unit of the integer sums of passes, in readings; integer sums do not depend on their order."""
 
 
 @kernel
 def direction_of(u: float, v: float) -> int:
-    """Return which of the directions of looking (u, v) is in; mirrored and turned ones are so on the lattice."""
+    """Return which of the directions the vector (u, v) has; symmetric under the symmetries of the lattice."""
     if abs(v) < EIGHTH * abs(u):
         return 0
     if abs(u) < EIGHTH * abs(v):
@@ -49,14 +49,14 @@ def direction_of(u: float, v: float) -> int:
 
 
 def noticed_by(max_incidence_angle: float) -> Floats:
-    """Return the part of each direction of looking that is within an angle of each of as many normals.
+    """Return the fraction of each direction, 45° wide, that is within an angle, radians, of each normal.
 
-    Shape (DIRECTIONS, DIRECTIONS); row j is of the normal along direction j. Angles are in radians.
+    Shape (DIRECTIONS, DIRECTIONS); row j is for the normal along direction j.
     """
     wide = math.pi / DIRECTIONS
     off = np.abs(np.subtract.outer(np.arange(DIRECTIONS), np.arange(DIRECTIONS))) * wide
     out = np.zeros(off.shape)
-    # either way round
+    # directions are modulo a half turn
     for middle in (off, off - math.pi):
         low, high = (
             np.maximum(middle - wide / 2, -max_incidence_angle),
@@ -67,11 +67,12 @@ def noticed_by(max_incidence_angle: float) -> Floats:
 
 
 @kernel
-def _obstacles(s: State, t: int, occupied: Any, squares: Any, left: Any) -> tuple[int, int, float]:
-    """List the occupied cells in the band of a cone, also those at which the reading exceeds the incidence angle.
+def _obstacles(s: State, t: int, occupied: Any, squares: Any, remaining: Any) -> tuple[int, int, float]:
+    """List the occupied cells in the band of a cone, including those beyond the limit of the incidence angle.
 
-    Writes the squares of their distances, near to far, and into `left` (longer by one) what of T is left in front of
-    each and behind the last. Returns how many there are, how many are in the free zone, and the least square of these.
+    Writes their squared distances in increasing order, and into `remaining` (one longer) the part of T that remains in
+    front of each and behind the last. Returns their number, the number of occupied cells in the free zone, and the
+    smallest squared distance of these.
     """
     reading, reading_state = s.cones[t], s.reading_states[t]
     cone = cone_of(reading)
@@ -99,34 +100,33 @@ def _obstacles(s: State, t: int, occupied: Any, squares: Any, left: Any) -> tupl
     weight = s.model.mixture_weight * (1.0 - p) ** blocking
     for k in range(n):
         error = (reading.z - math.sqrt(squares[k])) / reading.sigma
-        left[k] = weight * p * density(error, reading.sigma * s.lattice.resolution)
+        remaining[k] = weight * p * density(error, reading.sigma * s.lattice.resolution)
         weight *= 1.0 - p
-    left[n] = weight * reading_state.max_range
+    remaining[n] = weight * reading_state.max_range
     for k in range(n - 1, -1, -1):
-        left[k] += left[k + 1]
+        remaining[k] += remaining[k + 1]
     return n, blocking, near
 
 
 @allocating_kernel
 def add_passes(s: State, begin: int, end: int, random: Floats, lost: Floats, occupied: Any, passed: Any) -> None:
-    """Add to `passed` how likely the readings `begin` to `end` passed each of their cells in which direction.
+    """Add the probabilities that the readings `begin` to `end` passed the cells of their cones to `passed`.
 
-    It is int64, in units of UNIT, shape (DIRECTIONS, cells).
-
-    All cells of a cone count, also those at which the reading exceeds the incidence angle. `random` and `lost` are the
-    densities p_rand / z_max and p_lost · N(z; z_max, σ) of all readings in 1/m.
+    `passed` is int64, in units of UNIT, shape (DIRECTIONS, cells). All cells of a cone are included, also those beyond
+    the limit of the incidence angle. `random` and `lost` are the densities p_rand / z_max and p_lost · N(z; z_max, σ)
+    of all readings, 1/m.
     """
-    # no band has more cells than the largest cone
-    squares, left = s.workspace.key, np.empty(len(s.workspace.key) + 1)
+    # the band of a cone has no more cells than the largest cone
+    squares, remaining = s.workspace.key, np.empty(len(s.workspace.key) + 1)
     for t in range(begin, end):
         if s.stop[0]:
             break
         reading, reading_state = s.cones[t], s.reading_states[t]
-        n, blocking, near = _obstacles(s, t, occupied, squares, left)
-        scale = reading_state.multiplicity / ((random[t] + lost[t] + left[0]) * UNIT)
+        n, blocking, near = _obstacles(s, t, occupied, squares, remaining)
+        scale = reading_state.multiplicity / ((random[t] + lost[t] + remaining[0]) * UNIT)
         stray = random[t] * scale if reading.z < reading.z_max else 0.0
-        in_front = left[0] * scale + stray
-        hidden = left[0] * scale + stray * (1.0 - s.model.p_hit) ** blocking
+        in_front = remaining[0] * scale + stray
+        hidden = remaining[0] * scale + stray * (1.0 - s.model.p_hit) ** blocking
         cone = cone_of(reading)
         axis_x, axis_y, sine2 = reading.axis_x, reading.axis_y, reading.sine**2
         for row in range(*rows_of(cone, s.lattice.height)):
@@ -138,32 +138,32 @@ def add_passes(s: State, begin: int, end: int, random: Floats, lost: Floats, occ
                     u = column + 0.5 - cone.x
                     square = u * u + v * v
                     weight = strength(axis_x, axis_y, sine2, u, v)
-                    way = direction_of(u, v)
+                    direction = direction_of(u, v)
                     if runs.inner <= column <= runs.outer:
-                        passed[way, start + column] += int(
+                        passed[direction, start + column] += int(
                             weight * (hidden if blocking and square > near else in_front)
                         )
                     else:
                         k = 0
                         while k < n and squares[k] <= square:
                             k += 1
-                        passed[way, start + column] += int(weight * left[k] * scale)
+                        passed[direction, start + column] += int(weight * remaining[k] * scale)
 
 
 @allocating_kernel
-def count(passed: Any, noticed: Any, p_hit: float, whole: Any, out: Any) -> None:
-    """Write how many readings passed each cell, and how many that any surface would have noticed say as much.
+def count_passes(passed: Any, noticed: Any, p_hit: float, whole: Any, out: Any) -> None:
+    """Write the number of readings that passed each cell, and the equivalent number n of the module docstring.
 
     Parameters
     ----------
     passed : int64, shape (DIRECTIONS, cells)
-        As of `add_passes`.
+        From `add_passes`.
     noticed : float64, shape (DIRECTIONS, DIRECTIONS)
-        As of `noticed_by`.
+        From `noticed_by`.
     p_hit : float
         Of the surface.
     whole, out : float64, shape (cells,)
-        Both.
+        Output: both numbers.
     """
     each, miss = np.empty(len(noticed)), math.log(1.0 - p_hit)
     for c in range(len(out)):
@@ -182,13 +182,10 @@ def count(passed: Any, noticed: Any, p_hit: float, whole: Any, out: Any) -> None
 
 
 def passes_by_direction(evidence: Evidence, occupied: NDArray[np.uint8]) -> NDArray[np.int64]:
-    """Return how many readings are expected to have passed each cell of a map in which direction, in units of UNIT.
-
-    Shape (DIRECTIONS, cells).
-    """
+    """Return the expected number of passes by direction and cell, in units of UNIT, shape (DIRECTIONS, cells)."""
     model = evidence.model
     random = model.p_rand / evidence.z_max
-    # of an echo from almost as far as z_max too, so that it frees little more than a reading without any
+    # also for echoes, so that one from nearly z_max frees little more than a reading without echo
     lost = model.p_lost * evidence.state.reading_states['max_range'][: len(evidence)]
     passed = np.zeros((DIRECTIONS, evidence.grid.size), np.int64)
 
@@ -200,14 +197,14 @@ def passes_by_direction(evidence: Evidence, occupied: NDArray[np.uint8]) -> NDAr
 
 
 class Passes(NamedTuple):
-    """How many readings are expected to have passed each cell, float64, shape (cells,).
+    """Expected number of readings that passed each cell, float64, shape (cells,).
 
     Attributes
     ----------
     all : float64
-        Whatever they would have noticed there.
+        All of them.
     noticing : float64
-        As many that any surface would have noticed say as much, as above.
+        The equivalent number n of readings that would detect a surface of any normal.
     """
 
     all: Floats
@@ -215,8 +212,8 @@ class Passes(NamedTuple):
 
 
 def expected_passes(evidence: Evidence, occupied: NDArray[np.uint8]) -> Passes:
-    """Return how many readings passed each cell of a map, which is uint8, shape (cells,)."""
+    """Return the expected passes of each cell of a map; `occupied` has the shape (cells,)."""
     model, passed = evidence.model, passes_by_direction(evidence, occupied)
     out = Passes(np.empty(evidence.grid.size), np.empty(evidence.grid.size))
-    count(passed, noticed_by(model.max_incidence_angle), model.p_hit, *out)
+    count_passes(passed, noticed_by(model.max_incidence_angle), model.p_hit, *out)
     return out

@@ -1,15 +1,16 @@
-"""What sound came to on a free way: sound does not go through walls.
+"""Lines of sight: mirror images and free space behind walls are removed, since sound does not pass walls.
 
-**Mirror images.** Where a beam meets a smooth wall at a slant it goes on mirrored, and what it hears then is mapped in
-line with the sensor, behind that wall. So of the echoes that an occupied cell explains, those count that came on a free
-way: no occupied cell stands between the sensor and `STANDS_OFF` before the cell. Echoes are weighted by how well their
-range agrees. Where less than `LEAST_FREE_WAY` of those around a cell came on a free way, it is a mirror image. What is
-really there is unknown.
+**Mirror images.** A smooth wall reflects a beam that meets it at a slant (specular reflection), and an object met after
+that is mapped in the direction of the sensor, behind the wall. So for each occupied cell, echoes that it explains are
+counted if they came in line of sight: no occupied cell is between the sensor and `SAME_WALL` before the cell. Echoes
+are weighted by how well their range agrees. If less than `LEAST_IN_SIGHT` of the echoes around a cell came in line of
+sight, it is a mirror image, and becomes unknown.
 
-**Free space.** A free cell must have been passed by a beam, at `LEAST_STRENGTH` of it or more, on a free way: behind
-walls nothing is known, whatever went past them at a slant.
+**Free space.** A free cell must have been passed by a beam in line of sight, with at least `LEAST_STRENGTH` of the
+strength on its axis: behind walls nothing is known, even if sound passed them at a slant.
 
-All that counts lies within `IMAGE_AROUND` of a cell, but for the readings' own ways: tiles give the same maps.
+Everything that matters to a cell lies within `IMAGE_AROUND` of it or on the way of its readings, so tiles give the same
+maps.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..common.constants import IMAGE_AROUND, LEAST_FREE_WAY, LEAST_STRENGTH, STANDS_OFF, THROUGH
+from ..common.constants import IMAGE_AROUND, LEAST_IN_SIGHT, LEAST_STRENGTH, SAME_WALL, THROUGH
 from ..evidence.evidence import Evidence
 from ..evidence.state import State
 from ..runtime.cancelling import check
@@ -29,15 +30,15 @@ from ..sensor.cone import rows_of, runs_of, strength
 from ..sensor.cone_table import cone_of
 
 UNIT = 2.0**-20
-"""Unit of the counts, which as whole numbers do not depend on their order."""
+"""Unit of the integer counts; integer sums do not depend on their order."""
 
 STEP = 0.5
-"""Cells between the points at which the way to a cell is looked at."""
+"""Cells between the points of a line of sight at which the map is tested."""
 
 
 @kernel
-def on_free_way(reading: Any, u: float, v: float, until: float, occupied: Any, lattice: Any) -> bool:
-    """Return whether no occupied cell stands on the way to (u, v) from the apex of a reading, `until` so many cells."""
+def in_line_of_sight(reading: Any, u: float, v: float, until: float, occupied: Any, lattice: Any) -> bool:
+    """Return whether the first `until` cells from the apex of a reading towards (u, v) are without occupied cells."""
     distance = math.sqrt(u * u + v * v)
     at = STEP
     while at < until:
@@ -50,10 +51,10 @@ def on_free_way(reading: Any, u: float, v: float, until: float, occupied: Any, l
 
 
 @kernel
-def add_echoes(s: State, begin: int, end: int, occupied: Any, stands_off: float, echoes: Any) -> None:
-    """Add the echoes of the readings `begin` to `end` that occupied cells explain to `echoes`, int64, shape (2, cells).
+def add_echoes(s: State, begin: int, end: int, occupied: Any, same_wall: float, echoes: Any) -> None:
+    """Add the echoes of the readings `begin` to `end` to the occupied cells that explain them.
 
-    In units of UNIT: those on a free way, and all. `stands_off` is in cells.
+    `echoes` is int64, in units of UNIT, shape (2, cells): those in line of sight, and all. `same_wall` is in cells.
     """
     width = s.lattice.width
     for t in range(begin, end):
@@ -79,13 +80,13 @@ def add_echoes(s: State, begin: int, end: int, occupied: Any, stands_off: float,
                         continue
                     share = int(unit * math.exp(-0.5 * error * error))
                     echoes[1, c] += share
-                    if on_free_way(reading, u, v, distance - stands_off, occupied, s.lattice):
+                    if in_line_of_sight(reading, u, v, distance - same_wall, occupied, s.lattice):
                         echoes[0, c] += share
 
 
 @kernel
-def take_out_passed(s: State, end: int, occupied: Any, cells: Any) -> None:
-    """Unset those `cells` (bool, shape (cells,)) that one of the first `end` readings passed on a free way."""
+def remove_passed(s: State, end: int, occupied: Any, cells: Any) -> None:
+    """Unset those `cells` (bool, shape (cells,)) that one of the first `end` readings passed in line of sight."""
     width = s.lattice.width
     for t in range(end):
         if s.stop[0]:
@@ -106,14 +107,14 @@ def take_out_passed(s: State, end: int, occupied: Any, cells: Any) -> None:
                     distance = math.sqrt(u * u + v * v)
                     if distance > through or strength(reading.axis_x, reading.axis_y, sine2, u, v) < LEAST_STRENGTH:
                         continue
-                    cells[c] = not on_free_way(reading, u, v, distance - 1.0, occupied, s.lattice)
+                    cells[c] = not in_line_of_sight(reading, u, v, distance - 1.0, occupied, s.lattice)
 
 
 @kernel
 def keep_images(echoes: Any, cells: Any, around: int) -> None:
     """Unset those `cells` (bool, shape (height, width)) that are no mirror images.
 
-    `echoes` are those of `add_echoes`, shape (2, height, width), `around` how many cells on each side count.
+    `echoes` are those of `add_echoes`, shape (2, height, width); those within `around` cells on each side are summed.
     """
     height, width = cells.shape
     for row in range(height):
@@ -125,16 +126,16 @@ def keep_images(echoes: Any, cells: Any, around: int) -> None:
                 for j in range(max(column - around, 0), min(column + around + 1, width)):
                     free += echoes[0, i, j]
                     total += echoes[1, i, j]
-            cells[row, column] = free < LEAST_FREE_WAY * total
+            cells[row, column] = free < LEAST_IN_SIGHT * total
 
 
 def mirror_images(evidence: Evidence, cells: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return those of some cells, shape `grid.shape`, that are mirror images, by the map that the search found."""
+    """Return which of some cells are mirror images by the map that the search found, shape `grid.shape`."""
     occupied, grid = evidence.state.maps.occupied, evidence.grid
     echoes = np.zeros((2, grid.size), np.int64)
 
     def work(s: State, begin: int, end: int, own: NDArray[np.int64]) -> None:
-        add_echoes(s, begin, end, occupied, STANDS_OFF / grid.resolution, own)
+        add_echoes(s, begin, end, occupied, SAME_WALL / grid.resolution, own)
 
     evidence.summed(0, len(evidence), work, echoes)
     images = cells.copy()
@@ -143,9 +144,9 @@ def mirror_images(evidence: Evidence, cells: NDArray[np.bool_]) -> NDArray[np.bo
 
 
 def not_passed(evidence: Evidence, cells: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return those of some cells, shape `grid.shape`, that no reading passed on a free way."""
-    left = cells.ravel().copy()
-    # on one thread, since where one reading passed the others are not asked
-    take_out_passed(evidence.state, len(evidence), evidence.state.maps.occupied, left)
+    """Return which of some cells no reading passed in line of sight, shape `grid.shape`."""
+    remaining = cells.ravel().copy()
+    # single-threaded: once a reading passed a cell, the others are skipped
+    remove_passed(evidence.state, len(evidence), evidence.state.maps.occupied, remaining)
     check(evidence.state.stop)
-    return left.reshape(evidence.grid.shape)
+    return remaining.reshape(evidence.grid.shape)

@@ -1,4 +1,4 @@
-"""The maps that are handed out, once the search is done: the same for the offline tool, the node and tiles."""
+"""The final maps, made after the search in the same way by the offline tool, the node and tiles."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class HandedOut(NamedTuple):
 
 
 def hand_out(evidence: Evidence, search: SearchParameters, traversed: NDArray[np.bool_]) -> HandedOut:
-    """Return the maps that go with the map that the search found, shape `grid.shape`.
+    """Return the final maps from the map that the search found, shape `grid.shape`.
 
     Parameters
     ----------
@@ -34,7 +34,7 @@ def hand_out(evidence: Evidence, search: SearchParameters, traversed: NDArray[np
         After the search.
     search : SearchParameters
     traversed : bool, shape `grid.shape`
-        Cells that are known to be free, though no reading may see them.
+        Cells that the robot traversed, which are free even if in no cone.
     """
     walls = has_walls(search)
     passes = expected_passes(evidence, evidence.state.maps.occupied) if walls or search.least_passed > 0 else None

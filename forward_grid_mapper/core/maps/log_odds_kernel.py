@@ -1,10 +1,10 @@
-"""The kernel of the live map: adds what readings say to the cells of their cones, apart for each direction of looking.
+"""The kernel of the live map: adds log-odds to the cells in the cones of readings, separately for each direction.
 
-A plane holds the log-odds from the readings of one direction. Planes of directions nearer to the y axis are stored with
-x and y exchanged, so that the cells of a cone lie in few long rows whatever its direction.
+A plane has the log-odds from the readings of one direction. Planes of directions closer to the y axis are stored with x
+and y exchanged, so that the cells of a cone lie in few long rows for any direction.
 
-A cell that no reading touched holds `UNTOUCHED`. It is −0, to which adding anything, and +0 too, gives what was added;
-so the kernel need not ask. Increments are rounded to `QUANTUM`, so that float64 sums of them are exact.
+A cell in no cone has the value `UNTOUCHED`, −0. Adding anything to it, even +0, gives what was added, so the kernel
+needs no test for it. Increments are rounded to `QUANTUM`, so that float64 sums of them are exact.
 """
 
 from __future__ import annotations
@@ -21,17 +21,17 @@ from ..sensor.cone_table import UNIT
 
 QUANTUM = 2.0**-20
 _ROUNDER = 1.5 * 2.0**52 * QUANTUM
-"""Added and taken off again, it rounds to `QUANTUM`: so large that float64 has no smaller steps there."""
+"""Adding and subtracting it rounds to `QUANTUM`, because float64 has no smaller steps at this size."""
 
 UNTOUCHED = -0.0
 
 PADDING = 3
-"""Cells behind the last one of a plane, since the kernel works on four at a time; they stay untouched."""
+"""Cells behind the last one of a plane, since the kernel processes four at a time; they stay untouched."""
 
 _HALF_DIAGONAL = math.sqrt(0.5)
 
 _LEVEL = 1e-300
-"""Instead of the height of an edge along a row, which has none."""
+"""Replaces the height 0 of an edge that is parallel to the rows."""
 
 
 class Beams(NamedTuple):
@@ -46,9 +46,9 @@ class Beams(NamedTuple):
 
 
 class InverseModel(NamedTuple):
-    """What a reading says, in nats, of a cell on its axis; lengths in cells.
+    """Increments of the log-odds of a cell on the axis of a reading, nats; lengths are in cells.
 
-    `occupied` is of the arc of an echo, `before` its range to `behind` it, where the arc is no longer than `width`.
+    `occupied` is for the arc of an echo, from `before` its range to `behind` it, if the arc is no longer than `width`.
     """
 
     occupied: float
@@ -70,7 +70,7 @@ class StoredGrid(NamedTuple):
 
 
 class _Ends(NamedTuple):
-    """What a reading says by the distance of a cell: squares of radii in cells, nats."""
+    """Increments of one reading by the distance of a cell: squared radii in cells, increments in nats."""
 
     free2: float
     reach2: float
@@ -80,21 +80,21 @@ class _Ends(NamedTuple):
 
 @kernel
 def direction_of_yaw(yaw: float, directions: int) -> int:
-    """Return which of so many directions, even over half a turn, is nearest to looking along `yaw` or against it."""
+    """Return which of `directions`, evenly spaced over half a turn, is closest to `yaw`, or to `yaw` + π."""
     return int(math.floor(yaw * directions / math.pi + 0.5)) % directions
 
 
 @kernel
 def is_steep(direction: int, directions: int) -> bool:
-    """Return whether the plane of a direction has x and y exchanged."""
+    """Return whether the plane of a direction is stored with x and y exchanged."""
     return directions < 4 * direction < 3 * directions
 
 
 @kernel
 def _lattice_place(metres: float, resolution: float) -> tuple[int, float]:
-    """Return the lattice index of the cell of a coordinate, and how far into it that is, cells.
+    """Return the lattice index of the cell of a coordinate, and the offset within it, cells.
 
-    Cones are walked from their own cell on, so that no rounding depends on where the grid has its corner.
+    Coordinates are relative to the cell of the sensor, so that rounding does not depend on the corner of the grid.
     """
     cells = np.rint(metres * (1.0 / resolution) / UNIT) * UNIT
     cell = math.floor(cells)
@@ -124,7 +124,7 @@ def _add_run(
     axis_x, axis_y, sine2 = beam
     free2, reach2, free, occupied = ends
     n = end - first
-    # whole fours, which the compiler makes vector instructions of: rows are too short for the loops that it would make
+    # groups of four, which the compiler vectorises; rows are too short for its usual vector loops
     for k in range((n + 3) & ~3):
         u = u0 + k
         d2 = u * u + v * v
@@ -136,7 +136,7 @@ def _add_run(
 
 
 class _Edge(NamedTuple):
-    """An edge of a cone: in a row v above the apex, cells lie from v * slope + low to v * slope + high beside it."""
+    """An edge of a cone: in a row v above the apex, the cone is at u from v * slope + low to v * slope + high."""
 
     slope: float
     low: float
@@ -145,14 +145,14 @@ class _Edge(NamedTuple):
 
 @kernel
 def _edge(x: float, y: float) -> _Edge:
-    """Return the edge along the unit vector (x, y) of a cone on its left."""
+    """Return the edge along the unit vector (x, y) of a cone that lies to the left of it."""
     slope = x / (y if y != 0.0 else -math.copysign(_LEVEL, x))
     return _Edge(slope, -math.inf, 0.0) if y > 0.0 or (y == 0.0 and x < 0.0) else _Edge(slope, 0.0, math.inf)
 
 
 @kernel
 def _wedge_run(edges: tuple[_Edge, _Edge], reach2: float, x: float, v: float) -> tuple[int, int]:
-    """Return the first and last column of a row whose centres lie in the sector, as `cone.wedge_run` does."""
+    """Return the first and last column of a row whose centres lie in the sector, like `cone.wedge_run`."""
     right, left = edges
     half = math.sqrt(max(reach2 - v * v, 0.0))
     a, b = v * right.slope, v * left.slope
@@ -165,12 +165,12 @@ def _wedge_run(edges: tuple[_Edge, _Edge], reach2: float, x: float, v: float) ->
 
 @kernel
 def add_readings(beams: Beams, model: InverseModel, lattice: StoredGrid, planes: Any) -> None:
-    """Add what every reading says.
+    """Add the log-odds of readings.
 
     Parameters
     ----------
     beams : Beams
-        Of readings all of whose cells lie on the lattice.
+        Readings, all of whose cells lie on the lattice.
     model : InverseModel
     lattice : StoredGrid
     planes : float64, shape (directions, width * height + `PADDING`)
@@ -200,7 +200,7 @@ def add_readings(beams: Beams, model: InverseModel, lattice: StoredGrid, planes:
             ends = _Ends(math.inf, reach * reach, model.free_no_echo, 0.0)
         axis, half = (axis_x, axis_y), (sine, cosine)
         cone = make_cone(x, y, axis, half, (reach, 0.0))
-        # farther off, the centres of all cells that the axis crosses are within the half angle
+        # beyond this distance, the centres of all cells that the axis crosses are within the half angle
         thin = (_HALF_DIAGONAL * cosine + _HALF_DIAGONAL * sine) / sine + 0.1
         near = make_cone(x, y, axis, half, (min(reach, thin), 0.0))
         edges = _edge(cone.right_x, cone.right_y), _edge(-cone.left_x, -cone.left_y)

@@ -1,21 +1,22 @@
 """The standard map: log odds ((3), (4) and (14)-(16) of the paper), updated reading by reading.
 
-Inverse sensor model. A reading adds to the cells of its cone, weighted by the strength of the beam there
-(`cone.strength`), so that the edge of the cone says little. With d the distance of a cell, b and a the depths of the
-arc of an echo before and behind its range z, and w the length of that arc from edge to edge of the cone:
+Inverse sensor model. A reading adds the following to the cells of its cone, times the strength of the beam at the cell
+(`cone.strength`), so that cells at the edge get little. With d the distance of a cell, b and a the depths of the arc of
+an echo before and behind its range z, and w the length of that arc from edge to edge of the cone:
 
     d < z − b             logit(live_p_free), or logit(live_p_free_no_echo) for a reading without echo
     z − b ≤ d ≤ z + a     logit(live_p_occupied) · min(1, live_echo_width / w); nothing for a reading without echo
 
-One place of the arc returned the echo, so the longer it is the less is said of each of its cells.
+Only one point of the arc returned the echo, so each of its cells gets less if it is longer.
 
-Directions of looking. A smooth wall returns only what meets it head-on, and readings that look along it or meet it at a
-slant go through, however many there are. So readings are summed apart for each of `live_directions` directions, even
-over half a turn. A cell is as occupied as any one direction says, with a little of what the two beside it say; where
-none speaks for occupied, all readings together decide. With one direction this is the paper's map, (14).
+Directions. A smooth wall returns only sound that meets it nearly at right angles; at a slant, readings appear to pass
+through it, however many there are. So readings are summed separately for each of `live_directions`, evenly spaced over
+half a turn. The log-odds of a cell are the largest of any direction, with a fraction of those of the two neighbouring
+directions; if none is positive, they are the sum of all readings. With one direction this is the map of the paper,
+(14).
 
-Increments are rounded to 2⁻²⁰, so that float64 sums of them are exact: the map does not depend on the order of the
-readings, and the node's is the offline tool's cell for cell.
+Increments are rounded to 2⁻²⁰, so that float64 sums of them are exact. So the map does not depend on the order of the
+readings, and that of the node equals that of the offline tool in each cell.
 """
 
 from __future__ import annotations
@@ -33,16 +34,16 @@ from ..sensor.cone_table import Floats, check_size, grid_of
 from .log_odds_kernel import PADDING, UNTOUCHED, Beams, InverseModel, StoredGrid, add_readings, is_steep
 
 MARGIN = 64
-"""Cells by which the array outgrows what is needed, so that a driving robot rarely makes it grow again."""
+"""Cells by which the array is larger than needed on each side, so that it seldom grows while the robot drives."""
 
 BESIDE = 1 / 16
-"""Part of what the two directions beside one say that counts for it: walls lie between directions, too."""
+"""Fraction of the log-odds of the two neighbouring directions that is added: walls may lie between directions."""
 
 
 def map_grid(
     readings: Readings, parameters: Parameters, within: Grid | None = None, arc: tuple[float, float] = ARC
 ) -> Grid:
-    """Return the grid on which all maps of `readings` lie: every cell that a reading touches, and all of `within`.
+    """Return the grid of all maps of `readings`: it contains the cells of all cones, and `within`.
 
     `arc` is that of `LogOddsMap`.
 
@@ -56,27 +57,27 @@ def map_grid(
 
 
 class LogOddsMap:
-    """The log-odds of every cell, NaN where not observed, on a grid that grows as readings come.
+    """The log-odds of every cell, NaN if not observed, on a grid that grows with the readings.
 
-    It takes 8 bytes a cell and direction.
+    It needs 8 bytes for each cell and direction.
     """
 
     def __init__(self, parameters: Parameters, arc: tuple[float, float] = ARC) -> None:
-        """Start empty; `arc` is how deep an echo marks before and behind its range, metres, if half a cell is less."""
+        """Start empty; `arc` has the depths of the arc before and behind the range, metres, at least half a cell."""
         self._parameters, self._arc = parameters, arc
         self.clear()
 
     def change(self, parameters: Parameters) -> None:
-        """Use other parameters for the readings that come, of the same resolution and number of directions."""
+        """Use other parameters for later readings; resolution and number of directions must be the same."""
         self._parameters = parameters
 
     def clear(self) -> None:
-        """Forget everything."""
+        """Remove all readings."""
         self.grid = self._stored = Grid(self._parameters.grid.resolution, 0, 0, 0, 0)
         self._planes: Floats = np.zeros((self._parameters.live.live_directions, 0))
 
     def add(self, readings: Readings) -> None:
-        """Add readings; `grid` grows to hold every cell that they touch.
+        """Add readings; `grid` grows to contain their cones.
 
         Raises
         ------
@@ -95,7 +96,7 @@ class LogOddsMap:
         add_readings(beams, self._model(), lattice, self._planes)
 
     def add_map(self, other: LogOddsMap) -> None:
-        """Add all that another map of the same parameters says; it comes to the same as adding its readings.
+        """Add another map with the same parameters; the result is the same as if its readings were added.
 
         Raises
         ------
@@ -112,7 +113,7 @@ class LogOddsMap:
             mine += other._plane(other._planes, k, other._stored)[other._stored.window(other.grid)]
 
     def log_odds(self, grid: Grid | None = None) -> Floats:
-        """Return the log-odds on `grid` (by default the map's own); NaN is not observed.
+        """Return the log-odds on `grid` (by default that of the map); NaN if not observed.
 
         `grid` may be larger than the map; it must be of the same resolution.
         """
@@ -124,7 +125,7 @@ class LogOddsMap:
         return np.array(out[whole.window(grid)])
 
     def probability(self, grid: Grid | None = None) -> NDArray[np.float32]:
-        """Return the occupancy probabilities, p = 1 − 1 / (1 + e^l), NaN where not observed."""
+        """Return the occupancy probabilities, p = 1 − 1 / (1 + e^l), NaN if not observed."""
         log_odds = self.log_odds(grid)
         with np.errstate(over='ignore'):
             return (1.0 - 1.0 / (1.0 + np.exp(log_odds))).astype(np.float32)
@@ -144,7 +145,7 @@ class LogOddsMap:
         return planes[k, : grid.size].reshape(grid.shape)
 
     def _summed(self) -> Floats:
-        """Return the log-odds from those of the directions, NaN where no reading touched, shape of the stored grid."""
+        """Return the log-odds of all directions combined, NaN if untouched, shape of the stored grid."""
         count = len(self._planes)
         apart = [self._plane(self._planes, k, self._stored) for k in range(count)]
         together = apart[0].copy()
@@ -154,22 +155,22 @@ class LogOddsMap:
         if count > 1:
             most = np.zeros_like(together)
             for k in range(count):
-                said = apart[k - 1] + apart[(k + 1) % count]
-                said *= BESIDE
-                said += apart[k]
-                np.maximum(most, said, out=most)
+                log_odds = apart[k - 1] + apart[(k + 1) % count]
+                log_odds *= BESIDE
+                log_odds += apart[k]
+                np.maximum(most, log_odds, out=most)
             np.maximum(most, together, out=together, where=most > 0.0)
         together[untouched] = np.nan
         return together
 
     def _grow(self, g: Grid) -> None:
-        """Make room for a grid; without memory for it nothing changes."""
+        """Make the array large enough for a grid; if there is no memory, nothing changes."""
         if self._stored.union(g) == self._stored:
             self.grid = g
             return
         stored = g
         if self._stored.size:
-            # a robot that drives on; what is offered at once is often all there is
+            # only on later calls, with a robot that drives on: the readings of a single call are often all there are
             wide, high = g.width + 2 * MARGIN, g.height + 2 * MARGIN
             stored = Grid(g.resolution, g.column - MARGIN, g.row - MARGIN, wide, high).union(self._stored)
         grown = np.full((len(self._planes), stored.size + PADDING), UNTOUCHED)

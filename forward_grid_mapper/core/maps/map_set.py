@@ -1,4 +1,4 @@
-"""What mapping returns: three maps on one grid, and how they came about."""
+"""The result of mapping: three maps on one grid, and how they were made."""
 
 from __future__ import annotations
 
@@ -23,30 +23,32 @@ class MapSet:
     ----------
     grid : Grid
     live : float32
-        Occupancy probability of the standard map, NaN where no reading says anything.
+        Occupancy probability of the standard map, NaN for cells in no cone.
     ml : int8
         Maximum likelihood map: 0 free, 1 occupied, -1 not observed.
     uncertainty : float32
-        The α-mixed marginals, (45) of the paper; NaN where `ml` is unknown and the readings say next to nothing.
+        Calibrated leave-one-cell-out marginals (module `uncertainty`); NaN where `ml` is unknown and the evidence is
+        negligible.
     readings : Readings
         The readings that the maps were made from.
     unexplained : bool, shape (N,)
         Readings whose most likely cause, given `ml`, is a random measurement (e_* above one half).
     log_likelihood : float
-        log p(Z | ml) in nats: of the map that is handed out, by `forward_model`.
+        log p(Z | ml) of the final map, by `forward_model`, nats.
     objective : float
         The log-likelihood of `ml` plus its log prior, up to a constant.
     parameters : Parameters
     searched : int8
-        The map that the search found, with the values of `ml`: what another search may start from. `ml` is made of it,
-        with walls drawn out and with free cells where readings passed.
+        The map that the search found, with the values of `ml`; another search may start from it. Post-processing makes
+        `ml` of it.
     dynamic : float32
-        Echoes from nothing on `ml` that end in free space: people, say (`dynamic`).
+        Number of echoes that `ml` does not explain, by the free cells in which they end: people, for example (module
+        `dynamic`).
     normals : SurfaceNormals
         The surface normals that the maps were made with.
     statistics : dict
-        Plain numbers about the run: pairs, flips, shifts, iterations, converged, seconds by stage. `searched_objective`
-        and `searched_log_likelihood` are of the map that the search ended with, before post-processing.
+        Numbers about the run: pairs, flips, shifts, iterations, converged, seconds of each stage. `searched_objective`
+        and `searched_log_likelihood` are those of `searched`.
     """
 
     grid: Grid
@@ -64,11 +66,11 @@ class MapSet:
     statistics: dict[str, Any] = field(default_factory=dict)
 
     def forward_model(self) -> ForwardModel:
-        """Return the readings with the model and the normals, which give the likelihood of `ml` or of another map."""
+        """Return the forward model of the readings, which gives the likelihood of `ml` or of another map."""
         return ForwardModel(self.readings, self.grid, self.parameters.model, self.normals)
 
     def with_live(self, grid: Grid, live: NDArray[np.float32]) -> MapSet:
-        """Return the same maps beside another live map, all on the smallest grid that holds both.
+        """Return the maps with another live map, all on the smallest grid that contains both.
 
         Parameters
         ----------

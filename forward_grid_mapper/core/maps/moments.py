@@ -1,4 +1,4 @@
-"""The standard map as it was during the drive: what is shown of the time between the first reading and the last."""
+"""The standard map at several times during the drive."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class Moment(NamedTuple):
     stamp : int
         Of the last of these readings, nanoseconds.
     live : float32
-        Occupancy probability, NaN where no reading said anything yet, on the grid of the whole drive's maps.
+        Occupancy probability, NaN for cells in no cone so far, on the grid of the maps of the whole drive.
     """
 
     stamp: int
@@ -28,10 +28,10 @@ class Moment(NamedTuple):
 
 
 def moments(maps: MapSet, count: int) -> Iterator[Moment]:
-    """Yield the standard map after each of `count` equal parts of the readings; the last one is `maps.live`.
+    """Yield the standard map after each of `count` parts of the readings; the last one is `maps.live`.
 
-    Parts are equal in readings, not in seconds, so that a robot that stands, or a night between two drives, takes none.
-    There are fewer where there are fewer readings. One map is held at a time.
+    Parts have equal numbers of readings, not equal times, so that pauses and nights between drives take none. There are
+    fewer parts if there are fewer readings. Only one map is in memory at a time.
     """
     readings = maps.readings
     order = np.argsort(readings.stamp, kind='stable')

@@ -1,25 +1,26 @@
-"""From the map that the search found to the one that is handed out: walls are extended, and unknown cells marked.
+"""Post-processing of the map that the search found: walls are extended, and cells that no reading passed are unknown.
 
-The search says of a cell that it is free where nothing makes it occupied. Whether anything went through it is another
-question. Given the map, each reading says how likely it passed a cell on its way to its cause. For a cell at distance
-d, with A the part of T from occupied cells up to d,
+For the search, a cell is free if nothing makes it occupied, whether or not any sound went through it. Given the map,
+each reading has a probability that it passed a cell on its way to its cause. For a cell at distance d, with A the part
+of T from occupied cells up to d,
 
     p(passed) = (T − A) / (c + T)
 
-In the free zone it is T / (c + T). For an echo the probability of a random measurement is added, since something that
-the map lacks may have been there; it counts (1 − p_hit) for each obstacle that it had to pass in the free zone. Here c
-holds p_lost · N(z; z_max, σ) of every reading, so that an echo from nearly z_max frees little more than no echo. A
-reading counts by the strength of its beam at the cell, since what stands at the edge of a cone is easily missed. A cell
-through which less than about one reading passed is not known to be free.
+In the free zone it is T / (c + T). For an echo, the probability of a random measurement is added, since an object that
+is not on the map may have been there, times (1 − p_hit) for each obstacle in the free zone that the sound had to pass.
+Here c includes p_lost · N(z; z_max, σ) of every reading, so that an echo from nearly z_max frees little more than no
+echo. Each reading is weighted by the strength of its beam at the cell, since objects at the edge of a cone are easily
+missed. A cell that less than about one reading passed is not known to be free.
 
-Nor is it if all that passed it would have passed a surface there as well, at a slant (`free_space`): it is free where
-readings passed that any surface would have noticed, and within `LED_ON` of there as far as readings passed at all. So
-what is seen at a slant alone through a hole in a wall is not free, while a door is that was looked through once.
+Neither is a cell that readings passed only at a slant at which a surface there would have returned no echo
+(`free_space`). It is free if readings passed that would have detected any surface, and within `FREE_GROWTH` of such
+cells if readings passed at all. So what is seen only at a slant through a hole in a wall is not free, but a door
+through which a sensor looked once is.
 
-Passing is a count of readings, not of nats, so the likelihood exponent has no part in it. It depends on p_rand and
-p_lost: of readings without echo, (1 − p_rand − p_lost) / (1 − p_rand) count where nothing stood in the way.
+Passes are numbers of readings, not nats, so the likelihood exponent does not matter. They depend on p_rand and p_lost:
+a reading without echo counts as (1 − p_rand − p_lost) / (1 − p_rand) if no obstacle was in the way.
 
-Straight walls go on where they leave the view (`wall_extension`).
+Straight walls are extended where they leave the field of view (`wall_extension`).
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ..common.constants import FREE_MARGIN, LED_ON
+from ..common.constants import FREE_GROWTH, FREE_MARGIN
 from ..evidence.evidence import Evidence
 from .free_space import Passes, expected_passes
 from .wall_extension import extend
@@ -45,14 +46,14 @@ def _cells(length: float, evidence: Evidence) -> int:
 
 
 def grown(cells: NDArray[np.bool_], length: float, evidence: Evidence) -> NDArray[np.bool_]:
-    """Return cells and what lies within a length of them, metres."""
+    """Return cells dilated by a length, metres."""
     for _ in range(_cells(length, evidence)):
         cells = _grown(cells)
     return cells
 
 
-def led_on(known: NDArray[np.bool_], passed: NDArray[np.bool_], steps: int) -> NDArray[np.bool_]:
-    """Return the cells known to be free, and so many steps on through cells that readings passed."""
+def grown_through(known: NDArray[np.bool_], passed: NDArray[np.bool_], steps: int) -> NDArray[np.bool_]:
+    """Return the cells known to be free, grown by so many steps through cells that readings passed."""
     for _ in range(steps):
         known = known | (_grown(known) & passed)
     return known
@@ -66,35 +67,34 @@ def post_process(
     traversed: NDArray[np.bool_],
     passes: Passes | None = None,
 ) -> NDArray[np.int8]:
-    """Return the maximum likelihood map that is handed out, shape `grid.shape`: 1 occupied, 0 free, -1 not observed.
+    """Return the final maximum likelihood map, shape `grid.shape`: 1 occupied, 0 free, -1 not observed.
 
     Parameters
     ----------
     evidence : Evidence
         After the search.
     extension : float
-        Metres by which walls go on at most where they leave the view.
+        Largest extension of walls where they leave the field of view, metres.
     least_passed : float
-        Readings that must have passed a cell, or one within `FREE_MARGIN`, for it to be free; 0 takes all cells that
-        were seen.
+        Fewest readings that passed a free cell, or one within `FREE_MARGIN`; with 0, all observed cells may be free.
     least_noticed : float
-        Readings that any surface would have noticed of which as much must be said about the cell, or about one that
-        leads there within `LED_ON`; 0 asks for no such.
+        Fewest readings among them that would have detected any surface (`Passes.noticing`), at the cell or at one
+        from which free space grows to it within `FREE_GROWTH`; with 0, none are needed.
     traversed : bool, shape `grid.shape`
-        Cells that are known to be free, though no reading may see them.
+        Cells that the robot traversed, which are free even if in no cone.
     passes : Passes, optional
-        `expected_passes`, where they are known already.
+        `expected_passes`, if already computed.
     """
     ml = evidence.observed()
-    # no cone holds the middle of the robot
+    # the middle of the robot is in no cone
     ml[traversed & (ml < 0)] = 0
     barred = known = traversed & (ml == 0)
     if least_passed > 0:
         passes = passes or expected_passes(evidence, evidence.state.maps.occupied)
         passed = known | ((passes.all >= least_passed).reshape(ml.shape) & (ml == 0))
         noticed = (passes.noticing >= least_noticed).reshape(ml.shape)
-        # walls are not drawn out over what may be free
-        barred, known = passed, led_on(known | (passed & noticed), passed, _cells(LED_ON, evidence))
+        # walls are not extended over cells that may be free
+        barred, known = passed, grown_through(known | (passed & noticed), passed, _cells(FREE_GROWTH, evidence))
     if steps := round(extension / evidence.grid.resolution):
         ahead = np.zeros(ml.shape, np.uint8)
         extend(evidence.state, steps, barred.astype(np.uint8).ravel(), ahead.ravel())

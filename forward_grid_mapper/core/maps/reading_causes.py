@@ -1,4 +1,4 @@
-"""What the maximum likelihood map takes each reading for."""
+"""The likeliest cause of each reading, given the maximum likelihood map."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from .map_set import MapSet
 
 CAUSES = ('hit', 'random', 'lost', 'no_echo')
-"""Causes of a reading as `Expectations` has them."""
+"""Causes of a reading, by the names of the fields of `Expectations`."""
 
 RANDOM = CAUSES.index('random')
 
@@ -16,7 +16,7 @@ RANDOM = CAUSES.index('random')
 def likeliest_causes(maps: MapSet) -> NDArray[np.uint8]:
     """Return the likeliest cause of each reading, an index into `CAUSES`, shape (N,).
 
-    A reading is random only where that is likelier than all other causes together, as the report counts it.
+    A reading is random only if that is likelier than all other causes together, as in the report.
     """
     expected = maps.forward_model().expectations(maps.ml)
     likely = np.stack([getattr(expected, name) for name in CAUSES])

@@ -1,6 +1,6 @@
-"""Cells that a robot traversed: where its sensors were, and between, nothing stands.
+"""Cells that the robot traversed: where its sensors were, and between them, is no obstacle.
 
-Lines between sensors across the robot fill its middle, also before it has moved.
+Lines between sensors across the robot cover its middle, even before it has moved.
 """
 
 from __future__ import annotations
@@ -17,34 +17,35 @@ from ..runtime.jit import kernel
 from ..sensor.cone_table import Floats
 
 LONGEST_PAUSE = 500_000_000
-"""Nanoseconds between two readings, beyond which nobody knows what the robot did."""
+"""Longest time between two readings that a line joins, nanoseconds; after a longer one the path is unknown."""
 
 LONGEST_STEP = 0.8
-"""Metres between the places of two readings that a line joins: a robot at 1.6 m/s drives so far in `LONGEST_PAUSE`. A
-longer way is a jump of the odometry, unless it is from one sensor to another of a large robot."""
+"""Longest line between the sensors of two readings, metres: a robot at 1.6 m/s drives so far in `LONGEST_PAUSE`. More
+is a jump of the odometry, unless the sensors are far apart on a large robot."""
 
 LARGEST_ROBOT = 5.0
-"""Metres between two sensors of one robot, at most: those in the bumpers of a car. It bounds the lines that are drawn
-whatever the readings say of the size of the robot."""
+"""Largest distance between two sensors of one robot, metres: those in the bumpers of a car. It limits the lines even if
+the readings suggest a larger robot."""
 
 LEAST_MEETINGS = 3
-"""Times that two sensors must have been read one shortly after the other for their distance to be known: the median of
-three is right though the robot jumped once meanwhile."""
+"""Fewest times that two sensors were read shortly after each other for their distance to be known: the median of three
+is right even if odometry jumped once in between."""
 
 MEANWHILE = 0.1
-"""Metres that a robot drives between readings of two of its sensors (at 1 m/s in 0.1 s), by which the distance of the
-sensors may seem shorter than it is."""
+"""Metres that a robot drives between readings of two sensors (at 1 m/s in 0.1 s); their distance may appear shorter by
+this."""
 
 STRIDES = (0, 1, 2, 4, 8, 16)
-"""How many readings later the sensor is to which a line is drawn: itself, the next one, and others across the robot."""
+"""A line is drawn from the sensor of each reading to that of the reading so many later: itself, the next one, and
+others across the robot."""
 
 
 @kernel
 def _mark(x: Any, y: Any, stamp: Any, longest: float, corner: Any, out: Any) -> None:
     """Set the cells of each point, and those on the lines from it to the points `STRIDES` later that are near enough.
 
-    `x`, `y` and `longest` are in cells of the lattice, `stamp` is in order, and `corner` is the row and the column of
-    the lattice with which `out` begins: so what is marked does not depend on it.
+    `x`, `y` and `longest` are in cells of the lattice, and `stamp` increases. `corner` is the row and the column of the
+    lattice at which `out` begins, so that the result does not depend on the grid.
     """
     height, width = out.shape
     bottom, left = corner
@@ -66,10 +67,10 @@ def _mark(x: Any, y: Any, stamp: Any, longest: float, corner: Any, out: Any) -> 
 
 
 def longest_step(readings: Readings) -> float:
-    """Return how many metres may lie between the places of two readings that a line joins.
+    """Return the longest line between the sensors of two readings, metres.
 
-    `LONGEST_STEP`, or the distance of the two sensors of the robot that are the farthest apart, where this is more: the
-    largest of the medians, over pairs of sensors, of how far apart they were when one was read shortly after the other.
+    It is `LONGEST_STEP`, or the distance of the two sensors that are farthest apart on the robot, if that is more: for
+    each pair of sensors, the median distance when one was read shortly after the other, and the largest of these.
     """
     count = len(readings.sensor_names) or int(readings.sensor.max(initial=0)) + 1
     order = np.argsort(readings.stamp, kind='stable')
@@ -83,7 +84,7 @@ def longest_step(readings: Readings) -> float:
         pairs.append((np.minimum(one, other) * count + np.maximum(one, other))[near])
         apart.append(distance[near])
     if max(float(each.max(initial=0.0)) for each in apart) + MEANWHILE <= LONGEST_STEP:
-        # so is every median; of most robots it is so
+        # then no median can be larger; this is so for most robots
         return LONGEST_STEP
     pair, distance = np.concatenate(pairs), np.concatenate(apart)
     by_pair = np.lexsort((distance, pair))
@@ -101,18 +102,18 @@ def mark_traversed(
     traversed: NDArray[np.bool_],
     longest: float = LONGEST_STEP,
 ) -> None:
-    """Set in `traversed` the cells where sensors were, and those between where they were at about the same time.
+    """Set in `traversed` the cells where sensors were, and those between sensors at about the same time.
 
     Parameters
     ----------
     x, y : float64, shape (N,)
-        Of the sensors, in the map frame, metres.
+        Positions of the sensors in the map frame, metres.
     stamp : int64, shape (N,)
         Nanoseconds.
     grid : Grid
     traversed : bool, shape `grid.shape`
     longest : float
-        That of `longest_step`, metres.
+        From `longest_step`, metres.
     """
     order = np.argsort(stamp, kind='stable')
     u, v = x[order] / grid.resolution, y[order] / grid.resolution
@@ -121,9 +122,9 @@ def mark_traversed(
 
 
 def traversed_cells(readings: Readings, grid: Grid) -> NDArray[np.bool_]:
-    """Return which cells lie where sensors were, or between where they were about then, shape `grid.shape`."""
+    """Return which cells sensors were in, or between sensors at about the same time, shape `grid.shape`."""
     out = np.zeros(grid.shape, np.bool_)
-    # no line leads from one robot to another, nor from one day to the next
+    # drive by drive: no line may join different robots or days
     for drive in drives_of(readings):
         mark_traversed(drive.x, drive.y, drive.stamp, grid, out, longest_step(drive))
     return out

@@ -1,26 +1,26 @@
-"""The uncertainty map: leave-one-cell-out marginals of the map found ((41)-(45) of the paper), calibrated.
+"""The uncertainty map: calibrated leave-one-cell-out marginals of the map that was found ((41)-(45) of the paper).
 
 With Δ = log p(Z | cell occupied, rest of m) − log p(Z | cell free, rest of m), (43) is logit q = Δ + h_p, and (45)
-mixes it with the prior: logit q = α (Δ + h_p) + (1 − α) h_p = α Δ + h_p. This is `marginals`. It takes readings for
-independent and the rest of the map for certain, and says too much. With a prior of walls `calibrated` has
+mixes it with the prior: logit q = α (Δ + h_p) + (1 − α) h_p = α Δ + h_p. This is `marginals`. It assumes that readings
+are independent and the rest of the map is certain, and is overconfident. With the prior for walls, `calibrated` has
 
-    logit q = α T(Δ) + neighbours + [occupied] + what passed around
+    logit q = α T(Δ) + neighbours + [occupied] + passes around
 
-**T(Δ) = ± log (1 + |Δ|).** Readings repeat each other, nobody knows how much. So together they count as a share γ of
-their number, which is drawn from an exponential distribution of mean one: the expectation of exp(−γ |Δ|) is
-1 / (1 + |Δ|), and that is the odds that are left for what the readings speak against.
+**T(Δ) = ± log (1 + |Δ|).** Readings are correlated, by an unknown amount. So their log-likelihood ratio is multiplied
+by a factor γ with an exponential distribution of mean one. The expectation of exp(−γ |Δ|) is 1 / (1 + |Δ|), the odds of
+the less likely state.
 
-**Neighbours.** How walls go on: odds of a cell given which of its neighbours the map has occupied, by six kinds of
-patterns; and whether it is occupied itself.
+**Neighbours.** Log odds of a cell given which of its neighbours are occupied, by six kinds of patterns, since walls
+continue; and whether it is occupied itself.
 
-**What passed around.** Walls stand where free space ends: a cell with much that passed on one side and nothing on the
-other is likelier a wall than a cell in the open, though readings passed both.
+**Passes around.** Walls are where free space ends: a cell that many readings passed on one side and none on the other
+is likelier a wall than a cell in the open.
 
-The weights are those of a logistic regression on simulated worlds.
+The weights were fitted by logistic regression on simulated worlds.
 
-Of a cell that the map does not know nothing is said at all where the readings say less than a tenth of a nat: the prior
-alone is no observation, and it would pass for rather free. Nor is it where they speak against an obstacle, but hardly
-any of them would have noticed a surface whatever way it faces (`free_space`).
+A cell that is unknown on the map stays unknown if the readings give less than a tenth of a nat: the prior alone is no
+observation, and would look rather free. It stays unknown as well if readings are against an obstacle, but hardly any of
+them would have detected a surface of any normal (`free_space`).
 """
 
 from __future__ import annotations
@@ -30,23 +30,23 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from ..common.constants import LEAST_EVIDENCE, LEAST_LOOK
+from ..common.constants import LEAST_EVIDENCE, LEAST_NOTICING
 from ..common.parameters import SearchParameters
 from ..evidence.neighbourhood import patterns
 from ..sensor.cone_table import Floats
 from .free_space import Passes
 
 HOLE, INSIDE, STEP, END, BESIDE, ALONE = 1.10, 0.20, -0.20, -1.23, -2.56, -1.95
-"""Log odds by the occupied neighbours of a cell, nats: on opposite sides, 135° or more apart, with three of the four
-that share an edge or with fewer; two at a right angle that share an edge, as at a corner or at a step of a wall that
-runs askew; others; three in a row, as beside a wall; none."""
+"""Log odds by the occupied neighbours of a cell, nats. `HOLE`, `INSIDE`: on opposite sides, 135° or more apart, with at
+least three of the four that share an edge, or with fewer. `STEP`: two at a right angle that share an edge, as at a
+corner, or at a step of a slanted wall. `BESIDE`: three in a row, as beside a wall. `ALONE`: none. `END`: others."""
 
 OCCUPIED = 1.31
 """Log odds in addition for a cell that is occupied, nats."""
 
 LEAST_AROUND, MEAN_AROUND = -1.30, 0.29
-"""Nats for each e-fold of one and the readings that passed, where fewest did of a cell and its neighbours, and in the
-mean of them."""
+"""Coefficients of log(1 + passes), nats: of the smallest number of passes among a cell and its neighbours, and of their
+mean."""
 
 
 def kind_of(pattern: int) -> float:
@@ -63,20 +63,20 @@ def kind_of(pattern: int) -> float:
 
 
 BLOCK = 50_000
-"""Cells that are calibrated at once, so that memory for them is bounded."""
+"""Cells that are calibrated at once, to bound the memory."""
 
 KINDS = np.array([kind_of(pattern) for pattern in range(256)])
 
 
 def marginals(evidence: Floats, parameters: SearchParameters) -> Floats:
-    """Return the occupancy probability of cells from their evidence, as (45) has it.
+    """Return the occupancy probability of cells from their evidence by (45).
 
     Parameters
     ----------
     evidence : float64
         Δ in nats, any shape.
     parameters : SearchParameters
-        Of which `alpha` and `prior` count.
+        `alpha` and `prior` are used.
     """
     base = math.log(parameters.prior / (1 - parameters.prior))
     return _probability(parameters.alpha * evidence + base)
@@ -87,14 +87,14 @@ def _probability(logit: Floats) -> Floats:
     return out
 
 
-def repeated(evidence: Floats) -> Floats:
-    """Return what readings say that repeat each other nobody knows how much, nats: T as above."""
+def discounted(evidence: Floats) -> Floats:
+    """Return T(Δ) of the module docstring: evidence discounted for unknown correlations of readings, nats."""
     out: Floats = np.copysign(np.log1p(np.abs(evidence)), evidence)
     return out
 
 
 def around(passed: Floats) -> tuple[Floats, Floats]:
-    """Return the least and the mean of each cell and its eight neighbours, shape (height, width); 0 off the grid."""
+    """Return minimum and mean over each cell and its eight neighbours, shape (height, width); 0 outside of the grid."""
     wide = np.pad(passed, 1)
     below, here, above = wide[:-2], wide[1:-1], wide[2:]
     least, total = np.minimum(np.minimum(below, here), above), below + here + above
@@ -116,7 +116,7 @@ def calibrated(
     ml : int8, shape (height, width)
         The map: 1 where occupied.
     parameters : SearchParameters
-        Of which `alpha` counts.
+        `alpha` is used.
     """
     occupied = (ml == 1).astype(np.uint8)
     kinds = patterns(occupied.ravel(), ml.shape).reshape(ml.shape)
@@ -125,9 +125,9 @@ def calibrated(
     step = max(BLOCK // max(width, 1), 1)
     for begin in range(0, height, step):
         rows, first = slice(begin, begin + step), max(begin - 1, 0)
-        # with the rows beside them, whose own neighbours do not count
+        # with one more row on each side, whose own results are dropped
         least, mean = (of[begin - first :][:step] for of in around(passed[first : begin + step + 1]))
-        logit = parameters.alpha * repeated(evidence[rows]) + KINDS[kinds[rows]] + OCCUPIED * occupied[rows]
+        logit = parameters.alpha * discounted(evidence[rows]) + KINDS[kinds[rows]] + OCCUPIED * occupied[rows]
         out[rows] = _probability(logit + LEAST_AROUND * np.log1p(least) + MEAN_AROUND * np.log1p(mean))
     return out
 
@@ -139,28 +139,27 @@ def uncertainty_map(
     traversed: NDArray[np.bool_],
     parameters: SearchParameters,
 ) -> NDArray[np.float32]:
-    """Return the occupancy probability of the cells of a map, NaN where it is not observed, shape `ml.shape`.
+    """Return the occupancy probability of the cells of a map, NaN if not observed, shape `ml.shape`.
 
     Parameters
     ----------
     evidence : float64, shape (cells,)
         Δ in nats.
     passes : Passes, optional
-        Through each cell. Without them the marginals are those of (45), and a cell is observed by what all readings
-        say.
+        Of each cell. Without them, the result is that of (45), and only the evidence decides which cells are observed.
     ml : int8, shape (height, width)
         The maximum likelihood map: 1 occupied, 0 free, -1 not observed.
     traversed : bool, shape `ml.shape`
-        Where sensors were, and nothing stands.
+        Cells that the robot traversed, in which no obstacle can be.
     parameters : SearchParameters
     """
-    told = evidence.reshape(ml.shape)
-    silent = np.abs(told) < LEAST_EVIDENCE
+    evidence_of_cells = evidence.reshape(ml.shape)
+    silent = np.abs(evidence_of_cells) < LEAST_EVIDENCE
     if passes is None:
-        probability = marginals(told, parameters).astype(np.float32)
+        probability = marginals(evidence_of_cells, parameters).astype(np.float32)
     else:
-        probability = calibrated(told, passes.all.reshape(ml.shape), ml, parameters)
-        silent |= (told < 0) & (passes.noticing.reshape(ml.shape) < LEAST_LOOK)
+        probability = calibrated(evidence_of_cells, passes.all.reshape(ml.shape), ml, parameters)
+        silent |= (evidence_of_cells < 0) & (passes.noticing.reshape(ml.shape) < LEAST_NOTICING)
         probability[traversed] = 0.0
     probability[(ml < 0) & silent] = np.nan
     return probability

@@ -1,7 +1,7 @@
-"""Wall extension: straight walls go on where they leave the view.
+"""Wall extension: straight walls are extended where they leave the field of view.
 
-Where a straight wall ends in the open, no reading speaks against the cells ahead, and these are not known to be free,
-the wall goes on for up to `EXTENSION`: a wall is more likely to leave the view than to end there.
+If a straight wall ends without a neighbour, no reading contradicts the cells ahead, and these are not known to be free,
+the wall is extended by up to `EXTENSION`: it more likely leaves the field of view than ends there.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from ..runtime.jit import kernel
 
 @kernel
 def _ahead(c: int, k: int, height: int, width: int, n: int) -> int:
-    """Return the cell that is n steps from c in the direction of neighbour k; -1 if it is off the grid."""
+    """Return the cell n steps from c in the direction of neighbour k; -1 outside of the grid."""
     for _ in range(n):
         c = neighbour(c, k, height, width) if c >= 0 else -1
     return c
@@ -25,7 +25,7 @@ def _ahead(c: int, k: int, height: int, width: int, n: int) -> int:
 
 @kernel
 def extend(s: State, steps: int, barred: Any, out: Any) -> None:
-    """Set in `out` (uint8) the cells by which straight walls go on at their ends, up to what is `barred` (uint8)."""
+    """Set in `out` (uint8) the cells by which straight walls are extended; they end before `barred` cells (uint8)."""
     height, width, resolution = s.lattice.height, s.lattice.width, s.lattice.resolution
     run = max(int(math.floor(STRAIGHT_RUN / resolution + 0.5)), 2)
     most = MOST_AGAINST_EXTENSION * resolution
@@ -38,7 +38,7 @@ def extend(s: State, steps: int, barred: Any, out: Any) -> None:
             for n in range(1, run):
                 o = _ahead(c, opposite(k), height, width, n)
                 straight = straight and o >= 0 and occupied[o] == 1
-            # a true end has no neighbour ahead, nor abreast of what is ahead
+            # an end of a wall has no neighbour ahead, nor diagonally ahead
             for turn in (k, (k + 1) & 7, (k + 7) & 7):
                 o = neighbour(c, turn, height, width)
                 straight = straight and (o < 0 or occupied[o] == 0)

@@ -1,8 +1,7 @@
-"""The trajectory that matches alone say, whatever the directions of walls: scan matching, then blocks and places.
+"""The trajectory from matching alone, for walls at any angle: scan matching, then matches of blocks and loop closures.
 
-Where it is bent, maps of places are bent as well, and few are recognised. So the pose graph is made anew from what was
-found, and blocks are matched and places looked for again, as long as the map of the whole drive explains its readings
-better than before.
+A bent trajectory has bent local maps, and few places are recognised on them. So blocks are matched and loops are closed
+again with the result in place of odometry, as long as J of the map of the whole drive grows.
 """
 
 from __future__ import annotations
@@ -11,7 +10,7 @@ import math
 from collections.abc import Callable
 from typing import NamedTuple
 
-from .judging import over_the_drive
+from .judging import gain_over_drive
 from .loops import Loop
 from .odometry_model import CALIBRATION, sensitivity
 from .passes import Progress
@@ -23,29 +22,30 @@ from .scans import Scans
 from .solving import SETTLED, MatchSolver
 from .windows import Odometry
 
-LEFT = math.radians(3.0)
-"""By how much the yaw strays after scan matching, and after each round, radians a √metre."""
+REMAINING_YAW_NOISE = math.radians(3.0)
+"""σ of the yaw error after scan matching, and after each round, radians a √metre."""
 
 WORTH_A_TRIAL = 1.5
-"""Standard errors by which scan matching must predict readings near by better than nodes that are known, for more to be
-tried. In 3 drives where corners were wrongly taken for square ones it was 3.5 to 7, in 4 others 0 to 0.6."""
+"""Standard errors by which scan matching must predict nearby readings better than the trajectory from walls; otherwise
+nothing more is tried. It was 3.5 to 7 in 3 drives where corners were wrongly taken for right angles, and 0 to 0.6 in 4
+others."""
 
 ROUNDS = 4
-"""Times that the pose graph is made from what was found before, at the most."""
+"""Most rounds of matching and loop closing."""
 
 
-class Matched(NamedTuple):
-    """Where a drive is by matches alone.
+class MatchedDrive(NamedTuple):
+    """The trajectory of a drive from matching alone.
 
     Attributes
     ----------
     nodes : float64, shape (K, 3)
     loops : list of Loop
-        Places seen before that it rests on.
+        Loop closures that it uses.
     value : float
-        `Scans.objective` of the nodes.
+        `Scans.objective` of the nodes, nats.
     part : float
-        Of the blocks that lie where the robot was before, those that are recognised.
+        Fraction of the blocks on an earlier visit that are recognised.
     """
 
     nodes: Floats
@@ -54,55 +54,58 @@ class Matched(NamedTuple):
     part: float
 
 
-def matched(
+def match_drive(
     odometry: Odometry,
     scans: Scans,
-    say: Callable[[str], Progress],
+    start_stage: Callable[[str], Progress],
     noise: float = 0.0,
     known: Floats | None = None,
-) -> Matched | None:
-    """Return where a drive is by matches alone; None if the map along it explains its readings no better.
+) -> MatchedDrive | None:
+    """Return the trajectory of a drive from matching alone; None if its J is not larger than that of odometry.
 
-    It has to explain them better than the map along odometry, and than the one along the nodes that are `known`. More
-    than scan matching is tried only if that predicts readings better than these.
+    If the trajectory from walls is `known`, J must be larger than that of it as well, and scan matching must predict
+    readings better than it before more is tried.
 
     Parameters
     ----------
     odometry : Odometry
     scans : Scans
-    say : callable
-        Receives a stage, and returns what receives how much of it is done.
+    start_stage : callable
+        Receives the name of a stage, and returns the callable that receives its progress.
     noise : float
-        By how much the yaw of odometry strays, radians a √metre; 0 if nobody knows.
+        σ of the yaw error of odometry, radians a √metre; 0 if it is not known.
     known : float64, shape (K, 3), optional
+        Nodes of the trajectory from walls.
     """
     best, value = None, scans.objective(scans.windows.node)
     if known is not None:
         value = max(value, scans.objective(known))
     for trust in TRUSTS:
-        start = scan_matched(scans, trust._replace(yaw=noise or trust.yaw), say('scan matching'))
-        if known is not None and over_the_drive(scans, known, start, say('judgement')).sigmas < WORTH_A_TRIAL:
+        start = scan_matched(scans, trust._replace(yaw=noise or trust.yaw), start_stage('scan matching'))
+        if known is not None and gain_over_drive(scans, known, start, start_stage('judgement')).sigmas < WORTH_A_TRIAL:
             break
-        found = _in_rounds(odometry, scans, say, start, min(LEFT, noise or LEFT), value)
+        found = _match_repeatedly(
+            odometry, scans, start_stage, start, min(REMAINING_YAW_NOISE, noise or REMAINING_YAW_NOISE), value
+        )
         if found is not None:
             best, value = found, found.value
-        # a drive that fits together hardly gains from another trial, nor does one that is better explained already
+        # if most places are recognised another trial hardly helps, nor if J of the first is no larger
         if best is None or best.part >= LEAST_RECOGNISED:
             break
     return best
 
 
-def _in_rounds(
-    odometry: Odometry, scans: Scans, say: Callable[[str], Progress], start: Floats, noise: float, least: float
-) -> Matched | None:
-    """Return the best of what is found by matching again and again from what was found; None if it is not better."""
+def _match_repeatedly(
+    odometry: Odometry, scans: Scans, start_stage: Callable[[str], Progress], start: Floats, noise: float, least: float
+) -> MatchedDrive | None:
+    """Return the best result of repeated matching, each round from the result before; None if J is at most `least`."""
     change, nodes = sensitivity(odometry, scans.windows), start
     best = None
     for _ in range(ROUNDS):
-        solver = MatchSolver(scans.windows, scans, say, relative(nodes[:-1], nodes[1:]), noise, change)
+        solver = MatchSolver(scans.windows, scans, start_stage, relative(nodes[:-1], nodes[1:]), noise, change)
         solution, loops = solver.with_matches(solution_at(nodes, len(CALIBRATION)))
         before, nodes = nodes, solution.nodes
-        found = Matched(nodes, loops, scans.objective(nodes), recognised_part(scans, nodes, loops))
+        found = MatchedDrive(nodes, loops, scans.objective(nodes), recognised_part(scans, nodes, loops))
         if found.value <= least:
             break
         best, least = found, found.value

@@ -1,12 +1,12 @@
-"""Sparse symmetric equations with a few full rows: those of a pose graph, whose calibration has to do with every node.
+"""Sparse symmetric equations with a few dense rows: those of a pose graph whose calibration is linked to all nodes.
 
     ⎡ A   B ⎤ ⎡ x ⎤   ⎡ f ⎤        S = D − Bᵀ A⁻¹ B        y = S⁻¹ (g − Bᵀ A⁻¹ f)
     ⎣ Bᵀ  D ⎦ ⎣ y ⎦ = ⎣ g ⎦        x = A⁻¹ f − A⁻¹ B y
 
-A full row beside the others would spoil the order in which they are eliminated: SuperLU's orders look at the pattern of
-A + Aᵀ or AᵀA, and the latter is full. So the sparse part is factorised by itself, by minimum degree of A + Aᵀ and with
-the diagonal as pivots, which is stable since it is positive definite. The factors of a drive that comes by places a
-few times are then as long as the drive.
+Dense rows spoil the elimination order: SuperLU orders by the pattern of A + Aᵀ or AᵀA, and the latter would be dense.
+So the sparse part is factorised by itself, in minimum degree order of A + Aᵀ with pivots on the diagonal, which is
+stable because it is positive definite. The size of the factors grows linearly with the drive, if places are visited
+a few times.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ class Bordered:
     ----------
     matrix : scipy.sparse matrix in CSC, shape (n, n)
     full : slice
-        Its full rows and columns.
+        Its dense rows and columns.
     """
 
     def __init__(self, matrix: Any, full: slice) -> None:
@@ -44,7 +44,7 @@ class Bordered:
         self._schur = columns[self._full] - self._border.T @ self._solved
 
     def solve(self, right: Floats) -> Floats:
-        """Return the solution for one right side, shape (n,), or several, shape (n, S)."""
+        """Return the solution for one right-hand side, shape (n,), or several, shape (n, S)."""
         out = np.empty_like(right)
         rest = self._factors.solve(np.ascontiguousarray(right[self._rest]))
         out[self._full] = np.linalg.solve(self._schur, right[self._full] - self._border.T @ rest)
@@ -53,5 +53,5 @@ class Bordered:
 
     @property
     def filled(self) -> int:
-        """Values in the factors of the sparse part."""
+        """Number of nonzeros in the factors of the sparse part."""
         return int(self._factors.L.nnz + self._factors.U.nnz)

@@ -1,20 +1,18 @@
-"""How certain a calibration is that a drive tells of its odometry.
+"""The calibration of the odometry from a drive, with standard deviations.
 
-Yaw is known all along a trajectory whose yaw walls measure. So what odometry errs by in a metre and in a radian
-is a regression over pieces of the drive,
+Walls measure the yaw all along a trajectory. So the errors of the yaw of odometry follow from a linear regression over
+pieces of the drive, and their standard deviations from its residuals:
 
     Δyaw of the trajectory − Δyaw of odometry  =  bias · ahead + turn_scale · turn + noise
 
-whose residuals say how certain it is.
-
-Scale and heading are not measured that way: where readings say nothing of how far the robot drove, as along a bare
-corridor, the trajectory follows the odometry and would agree with itself. They are asked from readings directly: f(c)
-is the mean log ratio of a block of readings, predicted by the map of what lies around it, where all motions have the
-calibration c. Over blocks b with slopes g_b and curvatures h_b at c,
+Scale and heading cannot be found by regression: where readings do not tell the distance, as along a bare corridor, the
+trajectory follows the odometry and would agree with it. They are found from the likelihood of readings: f(c) is the
+mean log-likelihood ratio of a block of readings on the map of what lies around it, if all motions have the calibration
+c. From the slopes g_b and curvatures h_b of blocks b at c,
 
     top − c  =  −Σ g_b / Σ h_b        σ²  =  Σ (g_b + h_b (top − c))² / (Σ h_b)²
 
-Loops say nothing of scale: a map that is larger everywhere closes as well.
+Loop closures do not give the scale, since a map that is larger everywhere closes as well.
 """
 
 from __future__ import annotations
@@ -36,51 +34,51 @@ from .scans import Scans
 from .windows import Odometry, cut
 
 PIECE = 2.0
-"""Metres of progress of a piece of the regression."""
+"""Metres of progress of each piece in the regression."""
 
 FEWEST_PIECES = 8
 
 STEPS = {'scale': 0.02, 'heading': math.radians(1.0)}
-"""By how much scale and heading are changed: parts, and radians."""
+"""Steps of the finite differences: fraction, and radians."""
 
-ASKED, LENGTH, SPAN = 40, 3, 5.0
-"""Blocks that are asked, the windows of each, and metres of progress around it that its map is made of."""
+MOST_BLOCKS, LENGTH, SPAN = 40, 3, 5.0
+"""Most blocks, windows of each, and metres of progress before and after a block within which windows make its map."""
 
 DENSITY = 80.0
-"""Readings a metre that are asked, of drives that have more: it takes time."""
+"""Readings a metre to which drives are thinned, to save time."""
 
 FEWEST_BLOCKS = 8
 
 FARTHEST = 2.0
-"""Steps that the top may lie away."""
+"""Largest distance of the top of the parabola from the middle, steps."""
 
-LEAST = {'scale': 0.004, 'heading': math.radians(0.3), 'bias': math.radians(0.05), 'turn_scale': 0.003}
-"""σ that is stated at the least."""
+LEAST_SIGMA = {'scale': 0.004, 'heading': math.radians(0.3), 'bias': math.radians(0.05), 'turn_scale': 0.003}
+"""Added to σ in quadrature."""
 
-MOST = {'scale': 0.012, 'heading': math.radians(0.6), 'bias': math.radians(0.5), 'turn_scale': 0.015}
-"""σ from which on nothing is told."""
-
-
-OF_YAW = ('bias', 'turn_scale')
-"""What `of_yaw` tells."""
+LARGEST_SIGMA = {'scale': 0.012, 'heading': math.radians(0.6), 'bias': math.radians(0.5), 'turn_scale': 0.015}
+"""Values with a larger σ are not determined by the drive, and are left out."""
 
 
-class Told(NamedTuple):
-    """A figure of the calibration, and its standard deviation."""
+YAW_ERRORS = ('bias', 'turn_scale')
+"""The values that `yaw_errors` returns."""
+
+
+class Estimate(NamedTuple):
+    """A value of the calibration, and its standard deviation."""
 
     value: float
     sigma: float
 
 
-def certain(
+def determined_calibration(
     readings: Readings,
     odometry: Odometry,
     trajectory: Odometry,
     calibration: dict[str, float],
     parameters: Parameters,
     stop: NDArray[np.uint8],
-) -> dict[str, Told]:
-    """Return what a drive tells of its odometry with certainty, by the names of `CALIBRATION`.
+) -> dict[str, Estimate]:
+    """Return those values of the calibration that a drive determines, by the names of `CALIBRATION`.
 
     Parameters
     ----------
@@ -89,7 +87,7 @@ def certain(
     odometry, trajectory : Odometry
         Poses at the same stamps.
     calibration : dict
-        What was found together with the trajectory.
+        The values that were estimated together with the trajectory.
     parameters : Parameters
     stop : uint8, shape (1,)
         Not 0 to end the work.
@@ -99,14 +97,14 @@ def certain(
     Cancelled
         If `stop` was set.
     """
-    found = of_yaw(odometry, trajectory)
-    found |= of_ways(readings, odometry, trajectory, calibration, parameters, stop)
-    stated = {name: Told(value, math.hypot(sigma, LEAST[name])) for name, (value, sigma) in found.items()}
-    return {name: stated[name] for name in CALIBRATION if name in stated and stated[name].sigma <= MOST[name]}
+    found = yaw_errors(odometry, trajectory)
+    found |= translation_errors(readings, odometry, trajectory, calibration, parameters, stop)
+    stated = {name: Estimate(value, math.hypot(sigma, LEAST_SIGMA[name])) for name, (value, sigma) in found.items()}
+    return {name: stated[name] for name in CALIBRATION if name in stated and stated[name].sigma <= LARGEST_SIGMA[name]}
 
 
-def after(first: Mapping[str, float], told: Mapping[str, Told]) -> dict[str, Told]:
-    """Return what a drive tells of its odometry, where `told` is of odometry that `first` was applied to."""
+def combined_calibration(first: Mapping[str, float], told: Mapping[str, Estimate]) -> dict[str, Estimate]:
+    """Return the calibration of raw odometry, if `told` is the one of odometry to which `first` was applied."""
     one = {name: first.get(name, 0.0) for name in CALIBRATION}
     found = {}
     for name, (value, sigma) in told.items():
@@ -117,12 +115,12 @@ def after(first: Mapping[str, float], told: Mapping[str, Told]) -> dict[str, Tol
             both = (1 + turns) * one[name] + value * (1 + one['scale'])
         else:
             both = (1 + one[name]) * (1 + value) - 1
-        found[name] = Told(both, sigma)
+        found[name] = Estimate(both, sigma)
     return found
 
 
-def of_yaw(odometry: Odometry, trajectory: Odometry) -> dict[str, Told]:
-    """Return bias and scale of turns from the yaw of a trajectory; empty if the drive is too short."""
+def yaw_errors(odometry: Odometry, trajectory: Odometry) -> dict[str, Estimate]:
+    """Return `bias` and `turn_scale` by regression of the yaw of a trajectory; empty if the drive is too short."""
     ends = np.arange(0.0, odometry.progress[-1], PIECE)
     if len(ends) <= FEWEST_PIECES:
         return {}
@@ -132,53 +130,53 @@ def of_yaw(odometry: Odometry, trajectory: Odometry) -> dict[str, Told]:
     steps = np.diff(pose[:, :2], axis=0)
     ahead = np.concatenate([[0.0], np.cumsum(np.cos(middle) * steps[:, 0] + np.sin(middle) * steps[:, 1])])
     columns = [np.diff(np.interp(ends, knots, column)) for column in (ahead, pose[:, 2])]
-    more = np.diff(np.interp(ends, knots, np.unwrap(wrapped(trajectory.pose[:, 2] - pose[:, 2]))))
-    given = np.stack(columns, axis=1)
-    gram = given.T @ given
+    difference = np.diff(np.interp(ends, knots, np.unwrap(wrapped(trajectory.pose[:, 2] - pose[:, 2]))))
+    regressors = np.stack(columns, axis=1)
+    gram = regressors.T @ regressors
     if np.linalg.matrix_rank(gram) < 2:
         return {}
     inverse = np.linalg.inv(gram)
-    values = inverse @ (given.T @ more)
-    left = more - given @ values
-    # each residual by itself: wheels slip now and then
-    spread = given * (left * math.sqrt(len(left) / (len(left) - 2)))[:, None]
+    values = inverse @ (regressors.T @ difference)
+    residual = difference - regressors @ values
+    # standard errors robust to heteroscedasticity, since wheels slip now and then
+    spread = regressors * (residual * math.sqrt(len(residual) / (len(residual) - 2)))[:, None]
     sigma = np.sqrt(np.diag(inverse @ (spread.T @ spread) @ inverse))
-    return {name: Told(float(v), float(s)) for name, v, s in zip(OF_YAW, values, sigma, strict=True)}
+    return {name: Estimate(float(v), float(s)) for name, v, s in zip(YAW_ERRORS, values, sigma, strict=True)}
 
 
-def of_ways(
+def translation_errors(
     readings: Readings,
     odometry: Odometry,
     trajectory: Odometry,
     calibration: dict[str, float],
     parameters: Parameters,
     stop: NDArray[np.uint8],
-) -> dict[str, Told]:
-    """Return scale and heading as readings tell them; what they do not tell is left out."""
+) -> dict[str, Estimate]:
+    """Return `scale` and `heading` from the likelihood of readings; what they do not determine is left out."""
     parameters = for_matching(parameters)
     every = max(int(len(readings) / max(DENSITY * odometry.travel[-1], 1.0)), 1)
     windows = cut(thinned(readings, every), odometry)
     scans = Scans(windows, parameters, stop, np.zeros_like(held_out(len(windows))))
     turned = with_yaw(odometry, odometry.progress, np.unwrap(wrapped(trajectory.pose[:, 2] - odometry.pose[:, 2])))
-    blocks = blocks_of(len(windows), LENGTH, ASKED)
+    blocks = blocks_of(len(windows), LENGTH, MOST_BLOCKS)
 
     def value_at(trial: dict[str, float]) -> Floats:
-        ways = np.array([trial['scale'], trial['heading'], 0.0, 0.0])
-        return predicted(scans, calibrated(turned, ways).at(windows.node_stamp), blocks, SPAN)
+        translation = np.array([trial['scale'], trial['heading'], 0.0, 0.0])
+        return predicted(scans, calibrated(turned, translation).at(windows.node_stamp), blocks, SPAN)
 
     start = {name: calibration.get(name, 0.0) for name in STEPS}
     middle = value_at(start)
     found = {}
     for name, step in STEPS.items():
         low, high = (value_at({**start, name: start[name] + sign * step}) for sign in (-1, 1))
-        told = top_of(low, middle, high)
-        if told is not None:
-            found[name] = Told(start[name] + step * told.value, step * told.sigma)
+        estimate = parabola_top(low, middle, high)
+        if estimate is not None:
+            found[name] = Estimate(start[name] + step * estimate.value, step * estimate.sigma)
     return found
 
 
 def thinned(readings: Readings, every: int) -> Readings:
-    """Return every n-th reading of each sensor, each sensor beginning with another one."""
+    """Return every n-th reading of each sensor, with another offset for each sensor."""
     readings = readings.select(np.argsort(readings.stamp, kind='stable'))
     stay = np.zeros(len(readings), np.bool_)
     for number in np.unique(readings.sensor):
@@ -187,13 +185,15 @@ def thinned(readings: Readings, every: int) -> Readings:
     return readings.select(stay)
 
 
-def top_of(low: Floats, middle: Floats, high: Floats) -> Told | None:
-    """Return where the sum of blocks' values is highest, in steps from the middle; None if they do not say.
+def parabola_top(low: Floats, middle: Floats, high: Floats) -> Estimate | None:
+    """Return the top of the parabola through the sums of blocks' values, in steps from the middle.
+
+    None if there is no maximum, or if it is farther than `FARTHEST`.
 
     Parameters
     ----------
     low, middle, high : float64, shape (B,)
-        Of each block one step before, at, and one step behind the middle; NaN where nothing is known.
+        Value of each block one step below the middle, at it, and one step above it; NaN if unknown.
     """
     known = np.isfinite(low) & np.isfinite(middle) & np.isfinite(high)
     if known.sum() < FEWEST_BLOCKS:
@@ -207,4 +207,4 @@ def top_of(low: Floats, middle: Floats, high: Floats) -> Told | None:
     if abs(top) > FARTHEST:
         return None
     off = slope + curvature * top
-    return Told(top, float(np.sqrt((off**2).sum())) / -total)
+    return Estimate(top, float(np.sqrt((off**2).sum())) / -total)

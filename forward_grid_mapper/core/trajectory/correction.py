@@ -1,10 +1,10 @@
-"""What a refined trajectory makes of poses that odometry gives, those that come after its end included.
+"""The correction of odometry: from the odometry frame to the map frame, during a refined trajectory and after its end.
 
-The pose of odometry's frame in the map frame, T, is what `map` → `odom` says on TF:
+The pose of the odometry frame in the map frame, T, is the transform `map` → `odom` (REP 105):
 
     T(t) = trajectory(t) · odometry(t)⁻¹
 
-After the end of the trajectory it stays as it was there, until another one is found.
+After the end of the trajectory, T keeps its last value.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ from .windows import Odometry
 
 
 class Correction:
-    """From the frame of odometry to that of the map.
+    """The transform from the odometry frame to the map frame, over time.
 
     Parameters
     ----------
     odometry, trajectory : Odometry
-        Poses of the robot in both, at the same stamps.
+        Poses of the robot in the odometry frame and in the map frame, at the same stamps.
     """
 
     def __init__(self, odometry: Odometry, trajectory: Odometry) -> None:
@@ -39,7 +39,7 @@ class Correction:
 
     @cached_property
     def last(self) -> Floats:
-        """T at the end and after it, shape (3,): metres, radians."""
+        """T at the end of the trajectory and after it, shape (3,): metres, radians."""
         pose = compose(self.trajectory.pose[-1], inverse(self.odometry.pose[-1]))
         pose[2] = np.remainder(pose[2] + np.pi, 2 * np.pi) - np.pi
         return pose
@@ -50,12 +50,15 @@ class Correction:
         return float(np.hypot(*(self.trajectory.pose[-1, :2] - self.odometry.pose[-1, :2])))
 
     def continued(self, odometry: Odometry, trajectory: Odometry) -> Correction:
-        """Return the correction with what two paths of the same stamps have after its end."""
+        """Return the correction, continued with those poses of two paths that are after its end.
+
+        The paths have the same stamps.
+        """
         after = int(np.searchsorted(odometry.stamp, self.end, side='right'))
         return Correction(_joined(self.odometry, odometry, after), _joined(self.trajectory, trajectory, after))
 
     def until(self, stamp: int) -> Correction:
-        """Return the correction of poses up to a stamp, nanoseconds."""
+        """Return the correction that ends at a stamp, nanoseconds; it keeps at least one pose."""
         end = max(int(np.searchsorted(self.trajectory.stamp, stamp, side='right')), 1)
         before, after = self.odometry, self.trajectory
         return Correction(
@@ -63,7 +66,7 @@ class Correction:
         )
 
     def along(self, odometry: Odometry) -> Odometry:
-        """Return poses of odometry as they are on the map, at the same stamps, which need not be those known."""
+        """Return a path in the odometry frame, transformed to the map frame; its stamps may be any."""
         pose, early = compose(self.last, odometry.pose), odometry.stamp <= self.end
         stamp = odometry.stamp[early]
         off = relative(self.odometry.at(stamp), odometry.pose[early])
@@ -72,7 +75,7 @@ class Correction:
         return Odometry(odometry.stamp, pose)
 
     def apply(self, readings: Readings) -> Readings:
-        """Return readings that odometry placed where they belong on the map."""
+        """Return readings placed by odometry, transformed to the map frame."""
         sensors = np.stack([readings.x, readings.y, readings.yaw], axis=1)
         placed = compose(self.last, sensors)
         early = readings.stamp <= self.end
@@ -82,18 +85,18 @@ class Correction:
         return at_poses(readings, placed)
 
     def path_of(self, stamp: np.ndarray, pose: Floats) -> Floats:
-        """Return the robot's path, shape (P, 2), metres; the parameters are those of `extended`."""
+        """Return the positions of `extended`, shape (P, 2), metres."""
         return self.extended(stamp, pose).pose[:, :2]
 
     def extended(self, stamp: np.ndarray, pose: Floats) -> Odometry:
-        """Return the trajectory, and after its end poses of odometry as they are on the map.
+        """Return the trajectory, and after its end poses of odometry transformed to the map frame.
 
         Parameters
         ----------
         stamp : int64, shape (M,)
             Nanoseconds, increasing.
         pose : float64, shape (M, 3)
-            As odometry gives them.
+            In the odometry frame.
         """
         after = int(np.searchsorted(stamp, self.end, side='right'))
         later = compose(self.last, pose[after:])
@@ -102,6 +105,6 @@ class Correction:
 
 
 def _joined(path: Odometry, later: Odometry, first: int) -> Odometry:
-    """Return a path, and of a later one what comes from pose `first` on."""
+    """Return a path, followed by the poses of another one from index `first` on."""
     stamp = np.concatenate([path.stamp, later.stamp[first:]])
     return Odometry(stamp, np.concatenate([path.pose, later.pose[first:]]))

@@ -1,13 +1,13 @@
-"""Following: the trajectory of a drive that goes on, a window at a time, from where it was found as a whole.
+"""Following: online SLAM that continues a refined trajectory, window by window, while the robot drives on.
 
-The last windows form a small pose graph, the *tail*. Its first nodes are settled: they stay. The others follow from
-odometry, calibrated as the whole drive has it, from the directions of walls and their distances, as in a whole drive,
-and from places that were mapped before. So the search for a window costs the same however long the drive is; what grows
-with the drive is the path, which is copied at each window, and the readings that it keeps to recognise places by.
+The last windows make a small pose graph, the *tail*. Its first nodes are fixed (*settled*). The others are determined
+by calibrated odometry, yaws and distances of walls, and loop closures with what was mapped before. So a window takes
+the same time however long the drive is. Only the path, which is copied with each window, and the readings for loop
+closures grow with the drive.
 
-Following has to prove itself. Every few windows the readings of a block are predicted before they are used, once with
-the correction that is followed and once with the last one that was proven. If the first predicts clearly better, it is
-proven from then on. While it predicts worse, the proven correction is in force.
+The result is checked. Every few windows, the readings of a block are predicted before they are used, with the followed
+correction and with the last proven one. If the followed correction predicts clearly better, it becomes the proven one.
+While it predicts worse, the proven one is in force.
 """
 
 from __future__ import annotations
@@ -38,58 +38,60 @@ from .pose_graph import Edges, Graph, Yaws, joined, no_edges, no_walls, solve
 from .poses import Floats, axes_at, compose, interpolated, relative
 from .refinement import SHORTEST
 from .scans import FEWEST_ON_MAP, Scans
-from .solving import LEAST_YAW, UNSEEN
+from .solving import LEAST_YAW, NOISE_FACTOR
 from .wall_distances import Distances
 from .walls import wall_votes
 from .windows import TRAVEL, TURN, Odometry, Windows, cut
 
 SETTLED, LONGEST, SHIFT = 12, 44, 8
-"""Windows at the begin of the tail that stay, those of the tail at the most, and those that leave it at once: of five
-metres, from which walls go on, 18 and 3."""
+"""Windows at the begin of the tail whose nodes are fixed (5 m, on which walls begin); most windows of the tail (18 m);
+windows that leave it in one step (3 m)."""
 
 LATE = NANOSECONDS // 5
-"""Nanoseconds that a window waits for readings which come out of order."""
+"""Nanoseconds that a window waits for readings that arrive out of order."""
 
 OF_VOTES = 4
-"""Windows before the first that is not settled whose echoes vote with it."""
+"""Windows before the first one that is not settled whose echoes vote with its echoes."""
 
 SIGMA_SETTLED = np.array([0.02, 0.02, math.radians(0.3)])
 """σ of a settled node: metres, metres, radians."""
 
 RECOGNISING = 2
-"""Windows after a block is judged at which its place is looked for, so that not all is done at once."""
+"""Windows after the judgement of a block at which a loop closure is searched, to spread the load."""
 
 AROUND, MOST_AROUND = 4.0, 1000
-"""Metres around the robot, and readings at the most, that the map of another time is made of."""
+"""Metres around the robot, and most readings, of the map for loop closures."""
 
 REACH, STEPS = np.array([0.6, 0.6, math.radians(7.5)]), (0.2, 0.2, math.radians(3.75))
-"""How far, and in which steps, the robot is looked for on it: metres, metres, radians; 2.5 σ."""
+"""Half the size and the steps of the search for loop closures: metres, metres, radians."""
 
 SIGMAS = 2.5
+"""`REACH` in σ of the prior."""
 
-ASKED, MEASURED, CLIMBS = 60, 100, 3
-"""Readings that the search asks, those that measure the best pose, and parabolas that it is moved to the top of."""
+EVALUATED, MEASURED, CLIMBS = 60, 100, 3
+"""Readings that are evaluated in the search, and to measure the best pose; times that this is moved to the top of a
+parabola."""
 
 GOOD = 0.65
-"""Part of the usual score of a reading that a place must have."""
+"""Least score of a loop closure, as a fraction of the usual score of its readings."""
 
 JUDGED = 12
-"""Blocks that following is judged by at the most: twenty metres."""
+"""Most blocks of the judgement: 20 m."""
 
 
 class _Tail(NamedTuple):
-    """The end of a drive, in the frame whose axes are those of walls.
+    """The last windows of a drive, in a frame whose axes are parallel to the walls.
 
     Attributes
     ----------
     odometry : Odometry
         From the begin of the first window on.
     nodes : float64, shape (K, 3)
-        Those of the windows that are whole.
+        Of the complete windows.
     settled : int
-        Nodes that stay, the first ones.
+        Number of the first nodes that are fixed.
     places : Edges
-        Where places were recognised: from the first node.
+        Loop closures, as edges from the first node.
     """
 
     odometry: Odometry
@@ -99,36 +101,36 @@ class _Tail(NamedTuple):
 
 
 class Follower:
-    """Extends the trajectory of a whole drive as the robot drives on.
+    """Extends the trajectory of a whole drive while the robot drives on.
 
-    What it finds depends on odometry and readings, and not on when it is asked, as long as readings come within `LATE`
-    of those of later stamps.
+    The result depends on odometry and readings only, not on when `follow` is called, as long as a reading arrives
+    within `LATE` of those of later stamps.
 
     Parameters
     ----------
     correction : Correction
         Of the whole drive.
     calibration : mapping of str to float
-        Of its odometry, by the names of `odometry_model`; those that are missing are 0.
+        Of its odometry, by the names of `odometry_model`; missing values are 0.
     parameters : Parameters
+        If `odometry_noise` is set, it replaces `noise`.
     noise : float
-        By how much the yaw of odometry strays, radians a √metre, as the whole drive says; 0 if it is not known. What
-        `odometry_noise` says goes before.
+        σ of the yaw error of odometry, radians a √metre, as estimated from the whole drive; 0 if unknown.
     right_angles : bool
-        Whether walls are taken to stand at right angles to each other; without, only places are recognised.
+        Whether walls stand at right angles to each other; if not, only odometry and loop closures are used.
 
     Attributes
     ----------
     correction : Correction
-        In force.
+        The one in force.
     kept : bool
-        Whether it is kept as it was, since what is followed predicts readings worse.
+        Whether this is the proven one, because the followed one predicts readings worse.
     windows : int
-        Followed so far.
+        Number of windows followed so far.
     places : int
-        Recognised so far.
+        Number of loop closures so far.
     obstacle : str
-        Why nothing is followed any more, in words; empty while it is.
+        Why following ended, in words; empty until then.
     """
 
     def __init__(
@@ -140,12 +142,12 @@ class Follower:
         right_angles: bool = True,
     ) -> None:
         self._right_angles = right_angles
-        self.correction = self._before = self._proven = self._now = correction
+        self.correction = self._settled = self._proven = self._followed = correction
         self.kept, self.windows, self.places, self.obstacle = False, 0, 0, ''
         self._parameters, self._stop = for_matching(parameters), np.zeros(1, np.uint8)
         self._calibration = np.array([calibration.get(name, 0.0) for name in CALIBRATION])
         known = parameters.association.odometry_noise or noise
-        self._noise = Noise(yaw=max(LEAST_YAW, UNSEEN * known)) if known else Noise()
+        self._noise = Noise(yaw=max(LEAST_YAW, NOISE_FACTOR * known)) if known else Noise()
         self._tail: _Tail | None = None
         self._axes = np.zeros(3)
         self._past = Readings.from_columns(z=[], x=[], y=[], yaw=[], z_max=[], half_angle=[])
@@ -153,19 +155,19 @@ class Follower:
         self._score, self._scored = 0.0, 0
 
     def cancel(self) -> None:
-        """Make `follow` raise `Cancelled` soon, and from there on; may be called from any thread."""
+        """Make `follow` raise `Cancelled`, soon and in all later calls; may be called from any thread."""
         self._stop[0] = 1
 
     def follow(self, readings: Readings, odometry: Odometry) -> bool:
-        """Go on as far as windows are whole and have their readings; return whether `correction` is another one.
+        """Continue up to the last window that is complete, with its readings; return whether `correction` has changed.
 
         Parameters
         ----------
         readings : Readings
-            Of the drive so far, as odometry placed them; after the first call those since the one before, and of the
-            last windows, are enough.
+            Of the drive so far, placed by odometry. After the first call, those since the call before and those of the
+            last windows are enough.
         odometry : Odometry
-            Likewise.
+            Of the same time.
 
         Raises
         ------
@@ -174,12 +176,12 @@ class Follower:
         """
         was, newest = self.correction, readings.stamp.max(initial=0)
         if self._tail is None and not self.obstacle:
-            self._tail = self._begun(readings)
+            self._tail = self._first_tail(readings)
         tail = self._tail
         while tail is not None and not self.obstacle:
             check(self._stop)
             whole = _continued(tail.odometry, odometry)
-            u = _steps(whole)
+            u = _window_coordinate(whole)
             end = int(np.searchsorted(u, len(tail.nodes) + 1))
             if end == len(u) or whole.stamp[end] + LATE > newest:
                 break
@@ -191,8 +193,8 @@ class Follower:
             tail = self._tail = self._step(tail, readings, part)
         return self.correction is not was
 
-    def _begun(self, readings: Readings) -> _Tail | None:
-        """Return the tail where the whole drive ends, and remember what was mapped before it."""
+    def _first_tail(self, readings: Readings) -> _Tail | None:
+        """Return the tail at the end of the whole drive, and store the readings before it."""
         path, whole = self.correction.trajectory, self.correction.odometry
         odometry = since_jump(whole)
         if odometry is not whole and odometry.travel[-1] < SHORTEST:
@@ -210,25 +212,25 @@ class Follower:
         if early.any():
             before = self.correction.apply(in_canonical_order(readings.select(early)))
             sensors = np.stack([before.x, before.y, before.yaw], axis=1)
-            self._past = _both(at_poses(before, relative(self._axes, sensors)), self._past)
+            self._past = _concatenated(at_poses(before, relative(self._axes, sensors)), self._past)
         nodes = relative(self._axes, nodes[begin:])
         nodes[:, 2] = np.unwrap(nodes[:, 2])
         return _Tail(_from_step(odometry, begin), nodes, len(nodes), no_edges())
 
     def _step(self, tail: _Tail, readings: Readings, odometry: Odometry) -> _Tail:
-        """Return the tail with what `odometry` has beyond it, of which the last window has just become whole."""
+        """Return the tail extended by the rest of `odometry`, whose last window has just become complete."""
         within = (readings.stamp > odometry.stamp[0]) & (readings.stamp <= odometry.stamp[-1])
         windows = cut(in_canonical_order(readings.select(within)), odometry)
         count, none = len(windows), np.zeros(len(windows), np.bool_)
         motion = motions(calibrated(odometry, self._calibration), windows)
-        nodes, places = _ahead(tail.nodes, motion), tail.places
+        nodes, places = _extrapolated(tail.nodes, motion), tail.places
         if count >= 2 * BLOCK and count % BLOCK in (0, RECOGNISING):
             scans = Scans(windows, self._parameters, self._stop, none)
             block = np.arange(count - BLOCK, count)
             if count % BLOCK:
                 places = joined(places, self._recognised(scans, nodes, block))
             else:
-                self._judge(scans, _ahead(tail.nodes[: block[0]], motion), block)
+                self._judge(scans, _extrapolated(tail.nodes[: block[0]], motion), block)
         solution = solve(self._graph(windows, motion, nodes, tail._replace(places=places)), nodes, np.zeros(0))
         self.windows += count - len(tail.nodes)
         tail = _Tail(odometry, solution.nodes, tail.settled, places)
@@ -252,12 +254,12 @@ class Follower:
             np.concatenate([np.full(len(settled), SIGMA_SETTLED[2] ** -2.0), of_votes]),
         )
         walls = Distances(windows, none, nodes).walls(True) if self._right_angles else no_walls()
-        # the calibration is known
+        # the calibration is no unknown here
         known = np.zeros((len(motion), 3, 0)), np.zeros(0)
         return Graph(steps, *known, joined(stay, tail.places), yaws, walls)
 
     def _recognised(self, scans: Scans, nodes: Floats, block: NDArray[np.int64]) -> Edges:
-        """Return the match of a block with the map of what was driven here before the tail, if it fits as usual."""
+        """Return the loop closure of a block with the map of earlier visits before the tail, if it fits as usual."""
         past, guess = self._past, nodes[block[-1]]
         joint = scans.joint(block, relative(guess, nodes[block]))
         near = np.flatnonzero(np.hypot(past.x - guess[0], past.y - guess[1]) < AROUND)
@@ -269,7 +271,7 @@ class Follower:
         around = local_map(placed, self._parameters, self._stop)
         at = relative(nodes[0], guess)
         poses = grid_around(at, REACH, STEPS)
-        values = scores(joint, around, poses, max(len(joint.readings) // ASKED, 1))
+        values = scores(joint, around, poses, max(len(joint.readings) // EVALUATED, 1))
         off = relative(at, poses) * SIGMAS / REACH
         best = poses[int((values - 0.5 * (off**2).sum(1)).argmax())]
         for _ in range(CLIMBS):
@@ -281,49 +283,49 @@ class Follower:
         return Edges(np.zeros(1, np.int64), block[-1:], match.pose[None], match.information[None])
 
     def _judge(self, scans: Scans, followed: Floats, block: NDArray[np.int64]) -> None:
-        """Compare how a block is predicted where it is followed, shape (K, 3), and by the correction that is proven."""
+        """Compare the predictions of a block by the followed nodes, shape (K, 3), and by the proven correction."""
         w, proven = scans.windows, self._proven
         kept = relative(self._axes, compose(proven.last, w.node))
         early = w.node_stamp <= proven.end
         kept[early] = followed[early]
         members = np.flatnonzero(w.node_progress[block[0]] - w.node_progress[: block[0]] < BEHIND)
-        count, place, said = int(scans.count[block].sum()), int(members[-1]), []
+        count, place, block_scores = int(scans.count[block].sum()), int(members[-1]), []
         for nodes in (followed, kept):
             around = scans.map(members, nodes[place], nodes)
             if around is None or not count:
                 return
             at = relative(nodes[place], nodes)
-            said.append(sum(float(scores(scans.scan[k], around, at[k : k + 1])[0]) for k in block))
-        self._score, self._scored = self._score + said[0], self._scored + count
-        self._gains = [*self._gains[1 - JUDGED :], (said[0] - said[1]) / count]
+            block_scores.append(sum(float(scores(scans.scan[k], around, at[k : k + 1])[0]) for k in block))
+        self._score, self._scored = self._score + block_scores[0], self._scored + count
+        self._gains = [*self._gains[1 - JUDGED :], (block_scores[0] - block_scores[1]) / count]
 
     def _put_in_force(self, tail: _Tail, windows: Windows) -> None:
-        """Set the correction: that of the tail, or the proven one where this predicts readings better."""
+        """Put the correction of the tail in force, or the proven one if that predicts readings better."""
         odometry = tail.odometry
         pose = windows.corrected(odometry.progress, odometry.pose, tail.nodes)
-        # the first pose is that of a window's begin
+        # the first pose is interpolated at the begin of a window
         stamp, path = odometry.stamp[1:], compose(self._axes, pose[1:])
-        now = self._before.continued(Odometry(stamp, odometry.pose[1:]), Odometry(stamp, path))
+        now = self._settled.continued(Odometry(stamp, odometry.pose[1:]), Odometry(stamp, path))
         better = gain(np.zeros(len(self._gains)), np.array(self._gains)).sigmas
         if better > LEAST_SIGMAS:
             self._proven, self._gains = now, []
         self.kept = better < (0.0 if self.kept else -MOST_WORSE)
-        self.correction, self._now = (self._proven if self.kept else now), now
+        self.correction, self._followed = (self._proven if self.kept else now), now
 
     def _shifted(self, tail: _Tail, windows: Windows) -> _Tail:
-        """Return the tail without its first windows; what they read is of another time from here on."""
+        """Return the tail without its first windows; their readings become part of the map for loop closures."""
         w, end = windows, windows.first[SHIFT]
         robot = w.corrected(w.progress[:end], w.robot[:end], tail.nodes)
         leaving = at_poses(w.readings.select(slice(0, end)), compose(robot, w.mount[:end]))
-        self._past = _both(self._past, leaving)
+        self._past = _concatenated(self._past, leaving)
         odometry = _from_step(tail.odometry, SHIFT)
-        self._before = self._now.until(max(int(odometry.stamp[0]), self._before.end))
-        places = _seen_from(tail.places, relative(tail.nodes[SHIFT], tail.nodes[0]), SHIFT)
+        self._settled = self._followed.until(max(int(odometry.stamp[0]), self._settled.end))
+        places = _edges_from(tail.places, relative(tail.nodes[SHIFT], tail.nodes[0]), SHIFT)
         return _Tail(odometry, tail.nodes[SHIFT:], SETTLED, places)
 
 
 def direction_of_walls(windows: Windows, nodes: Floats) -> float:
-    """Return the direction of walls, radians modulo a right angle, along known nodes, shape (K, 3)."""
+    """Return the direction of walls in the frame of the nodes, shape (K, 3), radians modulo a right angle."""
     at, votes = wall_votes(windows, np.zeros(len(windows), np.bool_))
     count = votes.shape[1]
     degrees, ends = np.arange(count), np.column_stack([votes, votes[:, :1]])
@@ -334,23 +336,23 @@ def direction_of_walls(windows: Windows, nodes: Floats) -> float:
     return direction - float((off * sure).sum() / max(sure.sum(), 1e-9))
 
 
-def _ahead(nodes: Floats, motion: Floats) -> Floats:
-    """Return nodes and those that follow from the motions behind them, shape (K, 3)."""
+def _extrapolated(nodes: Floats, motion: Floats) -> Floats:
+    """Return the nodes, extrapolated by the motions after them, shape (K, 3)."""
     out = list(nodes)
     for step in motion[len(nodes) - 1 :]:
         out.append(compose(out[-1], step))
     return np.array(out)
 
 
-def _steps(odometry: Odometry) -> Floats:
-    """Return u of each pose, as in `windows`."""
+def _window_coordinate(odometry: Odometry) -> Floats:
+    """Return u of each pose (module `windows`), in which each window is a step of 1."""
     out: Floats = odometry.travel / TRAVEL + odometry.turn / TURN
     return out
 
 
 def _from_step(odometry: Odometry, begin: int) -> Odometry:
-    """Return the odometry from where u is `begin` on."""
-    u = _steps(odometry)
+    """Return the odometry from u = `begin` on."""
+    u = _window_coordinate(odometry)
     first = int(np.searchsorted(u, begin, side='right'))
     part = (begin - u[first - 1]) / (u[first] - u[first - 1])
     stamp = odometry.stamp[first - 1] + round(part * (odometry.stamp[first] - odometry.stamp[first - 1]))
@@ -359,14 +361,14 @@ def _from_step(odometry: Odometry, begin: int) -> Odometry:
 
 
 def _continued(tail: Odometry, odometry: Odometry) -> Odometry:
-    """Return the odometry of the tail with what comes after it."""
+    """Return the odometry of the tail, continued with the poses of `odometry` after it."""
     first = int(np.searchsorted(odometry.stamp, tail.stamp[-1], side='right'))
     stamp = np.concatenate([tail.stamp, odometry.stamp[first:]])
     return Odometry.of(stamp, np.concatenate([tail.pose, odometry.pose[first:]]))
 
 
-def _seen_from(places: Edges, first: Floats, leaving: int) -> Edges:
-    """Return places without those of settled nodes when so many nodes leave.
+def _edges_from(places: Edges, first: Floats, leaving: int) -> Edges:
+    """Return loop closures as edges from another first node; those of nodes that become settled are dropped.
 
     Parameters
     ----------
@@ -375,14 +377,15 @@ def _seen_from(places: Edges, first: Floats, leaving: int) -> Edges:
     first : float64, shape (3,)
         Pose of this node in the frame of the one that will be the first.
     leaving : int
+        Number of nodes that leave the tail.
     """
     stay, axes = places.second >= leaving + SETTLED, axes_at(first[2])
     information = axes @ places.information[stay] @ axes.T
     return Edges(places.first[stay], places.second[stay] - leaving, compose(first, places.pose[stay]), information)
 
 
-def _both(one: Readings, other: Readings) -> Readings:
-    """Return readings, and later ones of the same drive."""
+def _concatenated(one: Readings, other: Readings) -> Readings:
+    """Return readings, followed by later ones of the same drive."""
     columns: dict[str, Any] = {
         column.name: np.concatenate([getattr(one, column.name), getattr(other, column.name)])
         for column in fields(Readings)

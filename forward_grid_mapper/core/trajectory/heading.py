@@ -1,20 +1,19 @@
 """The heading of the robot over the drive, from walls that mostly stand at right angles to each other.
 
-A hidden Markov model: the state is δ, what the yaw of odometry must be corrected by so that walls lie along the axes of
-the map. It moves as odometry drifts,
+A hidden Markov model. Its state is δ, the correction of the yaw of odometry with which walls are parallel to the axes
+of the map. δ changes as odometry drifts,
 
     δ' = δ + bias · travel + turn_scale · turn + noise
 
-and the votes of walls say how likely it is at each place. All values of δ are followed at once, so the heading is not
-lost in a hall or a slip. Bias, turn scale and the noise are those with the largest likelihood of all votes; for them δ
-is followed modulo 90°, as walls know it. Then it is followed around the full circle, where votes count less and noise
-more, since echoes of one wall vote many times: so the model says by itself where a right angle may have been lost.
+and the votes of walls are its likelihood at each place. The belief over all values of δ is kept, so the heading is not
+lost in a hall or by a slip. Bias, turn scale and noise maximise the likelihood of all votes; for this δ is filtered
+modulo 90°, as walls determine it. Then δ is filtered around the full circle, with tempered votes and larger noise,
+since each echo votes several times. This gives the probability that a right angle was lost, and where.
 
-A building may have parts that stand askew to each other: then the state has the direction of the walls beside the robot
-as well, which is one of a few, and stays the same for many metres. A direction is added where votes are much likelier
-with it.
+Parts of a building may stand at an angle to each other. So the state also has the direction of the walls beside the
+robot: one of a few, which seldom changes. A direction is added if votes are much likelier with it.
 
-Buildings whose walls stand at any angle have votes that agree on nothing, and then nothing is said.
+In buildings whose walls stand at any angle, votes do not agree, and there is no result.
 """
 
 from __future__ import annotations
@@ -37,11 +36,11 @@ STATES = 2 * DIRECTIONS
 
 STEP = math.radians(90.0 / STATES)
 
-DOUBT = 0.3
-"""Weight of a vote that says nothing: boxes and people have directions too."""
+UNIFORM_PART = 0.3
+"""Weight of the uniform part of the likelihood of a vote: boxes and people have directions too."""
 
 SLIPS = 0.03
-"""Part of the motions whose noise is three times larger."""
+"""Fraction of the motions whose noise is three times larger."""
 
 TURN_NOISE = math.radians(2.0)
 """Noise of a turn, radians a √radian."""
@@ -49,55 +48,54 @@ TURN_NOISE = math.radians(2.0)
 LEAST_NOISE = math.radians(0.3)
 
 NOISES = tuple(math.radians(v) for v in (0.5, 1.0, 2.0, 4.0))
-"""Noise of yaw that is tried, radians a √metre."""
+"""Values of the yaw noise that are tried, radians a √metre."""
 
 BIASES = np.radians(np.arange(-4.0, 4.01, 0.25))
 TURN_SCALES = np.arange(-0.08, 0.081, 0.02)
-"""Calibrations that are tried, radians a metre, and parts."""
+"""Values of the calibration that are tried, radians a metre, and fraction."""
 
 BIAS_SIGMA, TURN_SCALE_SIGMA = math.radians(1.5), 0.03
 
 NEAR = 8
-"""Degrees around the heading in which a vote is taken for one of it."""
+"""Degrees around the heading within which votes measure it."""
 
 PRECISION = 2.0
-"""Times that the mean direction of a peak is known better than one vote in it."""
+"""Information of the mean direction of a peak, in units of that of a single vote."""
 
 TEMPER, WIDER = 0.5, 1.5
-"""What a vote counts, and how many times larger the noise is, where δ is followed around the full circle."""
+"""Exponent of votes, and factor of the noise, if δ is filtered around the full circle."""
 
 LEAST_GAIN = 0.12
-"""Nats a vote that the best heading must be likelier than chance for it to be believed."""
+"""Nats a vote by which the best heading must be likelier than chance to be accepted."""
 
 
 FEWEST_VOTES = 4
 
 DOUBTFUL, PAUSE = 0.02, 5
-"""Probability of having lost a right angle from where on a place is doubtful, and votes between two such places."""
+"""Least probability that a right angle was lost at a doubtful place, and fewest votes between two such places."""
 
 NEGLIGIBLE = 1e-4
-"""Probability of it below which a place is not named."""
+"""Places with a smaller probability are ignored."""
 
 PARTS_ASKEW = 2
-"""Parts of a building that stand askew to the first, at the most."""
+"""Most parts of a building that stand at an angle to the first one."""
 
 ASKEW, FINER = np.radians(np.arange(6.0, 85.0, 3.0)), np.radians([-2.0, -1.0, 1.0, 2.0])
-"""Directions of walls that are tried, radians from those of the first part, and around the best of these."""
+"""Directions of walls that are tried, radians relative to the first part, and offsets around the best of these."""
 
 LEAST_APART = math.radians(6.0)
-"""Radians between the directions of two parts: less, and matching takes care of it."""
+"""Least angle between the directions of two parts, radians; matching corrects smaller ones."""
 
 ENTERED = 0.02
-"""How often the robot comes to walls of any direction, a metre."""
+"""Rate at which the direction of walls is drawn again, 1/m."""
 
 LEAST_ASKEW = 8.0
-"""Nats by which votes must be likelier with another direction of walls. In 64 drives through buildings at right angles
-they were so by 5.1 at the most. In 5 of 12 drives through buildings with a kink they were so by 10 to 21, in the others
-by less than 7."""
+"""Nats by which votes must be likelier with another direction of walls. It was at most 5.1 in 64 drives through
+buildings with right angles, 10 to 21 in 5 of 12 drives through buildings with a kink, less than 7 in the other 7."""
 
 
 class Drifts(NamedTuple):
-    """How the yaw of odometry drifts: radians a metre, parts, and radians a √metre. The signs are those of δ."""
+    """Drift of the yaw of odometry: radians a metre, fraction, and radians a √metre. The signs are those of δ."""
 
     bias: float
     turn_scale: float
@@ -106,31 +104,31 @@ class Drifts(NamedTuple):
 
 @dataclass(frozen=True)
 class Heading:
-    """What walls say about the yaw.
+    """The correction of the yaw from walls, at B places.
 
     Attributes
     ----------
     at : int64, shape (B,)
-        Nodes with votes.
+        Their nodes.
     correction : float64, shape (B,)
-        Of the yaw of odometry, radians, without jumps.
+        Of the yaw of odometry, radians, unwrapped.
     measured : float64, shape (B,)
         The same from the votes of this place alone, near `correction`.
     information : float64, shape (B,)
-        Of `measured`, in 1/rad²; 0 where the votes say nothing.
+        Of `measured`, 1/rad²; 0 if the votes do not determine it.
     drifts : Drifts
     gain : float
-        Nats a vote, over votes that agree on nothing.
+        Log-likelihood ratio to uniform votes, nats a vote.
     certainty : float
-        Least probability, over the drive, that no right angle was lost.
+        Probability that no right angle was lost, the smallest of the drive.
     over_odometry : float
-        Nats by which all votes are likelier than if odometry had no error of yaw.
+        Log-likelihood ratio of all votes to odometry without errors of the yaw, nats.
     askew : float64, shape (B,)
         Direction of the walls at each place, radians, modulo a right angle: 0 in the first part of the building.
     doubts : tuple of (int, float)
-        Nodes where a right angle may have been lost, and the probability of it.
+        Doubtful nodes, and the probability that a right angle was lost there.
     slight : tuple of (int, float)
-        Other nodes, and how little probable it is there.
+        Other nodes, at which this probability is small.
     """
 
     at: NDArray[np.int64]
@@ -146,22 +144,22 @@ class Heading:
     slight: tuple[tuple[int, float], ...] = ()
 
     def turned(self, node: int, angle: float) -> Heading:
-        """Return the same with what comes from a node on turned by `angle`, radians."""
+        """Return the heading turned by `angle`, radians, from a node on."""
         more = np.where(self.at >= node, angle, 0.0)
         return replace(self, correction=self.correction + more, measured=self.measured + more)
 
 
 class _Chain:
-    """The votes along a drive, and how likely they are given how odometry drifts.
+    """The hidden Markov model of a drive.
 
     Parameters
     ----------
     askew : sequence of float
-        Directions that walls have, radians; the first is 0.
+        Directions of walls, radians; the first is 0.
     around : int
-        Right angles that the states of δ go around: 1 or 4.
+        Number of right angles that the states of δ cover: 1 or 4.
     temper, wider : float
-        What a vote counts, and what the noise is multiplied with.
+        Exponent of votes, and factor of the noise.
 
     Attributes
     ----------
@@ -189,23 +187,23 @@ class _Chain:
         ends = np.column_stack([votes, votes[:, :1]])
         places = np.arange(DIRECTIONS + 1)
         rows = np.stack([np.interp(place, places, row) for place, row in zip(seen, ends, strict=True)])
-        self.likelihood: Floats = (DOUBT + (1.0 - DOUBT) * rows) ** temper
+        self.likelihood: Floats = (UNIFORM_PART + (1.0 - UNIFORM_PART) * rows) ** temper
         self._anywhere = np.full(self.states, 1 / self.states)
         self._other = -np.expm1(-ENTERED * self.length) if len(askew) > 1 else np.zeros(len(self.length))
 
     def drift(self, drifts: Drifts) -> Floats:
-        """Return by how much δ changes without noise from place to place."""
+        """Return the change of δ from each place to the next, without noise, radians, shape (B − 1,)."""
         out: Floats = drifts.bias * self.length + drifts.turn_scale * self.turn
         return out
 
     def off(self, value: Any) -> Floats:
-        """Return how far the states lie from a value, the shorter way around."""
+        """Return the signed difference of the states from a value, the shorter way around, radians."""
         period = self.states * STEP
         out: Floats = (self.grid - value + period / 2) % period - period / 2
         return out
 
     def _densities(self, drifts: Drifts) -> Floats:
-        """Return the densities that δ moves with from place to place, shape (B - 1, states)."""
+        """Return the densities of the change of δ from each place to the next, shape (B - 1, states)."""
         noise = self._wider * drifts.noise
         sigma = np.sqrt(noise**2 * self.length + TURN_NOISE**2 * self.turned + LEAST_NOISE**2)[:, None]
         x = self.off(self.drift(drifts)[:, None])
@@ -214,29 +212,29 @@ class _Chain:
         return out
 
     def log_likelihood(self, drifts: Drifts) -> float:
-        """Return that of all votes, in nats."""
+        """Return the log-likelihood of all votes, nats."""
         return forward(self.likelihood, self._densities(drifts), self._other, self._anywhere)[0]
 
     def smooth(self, drifts: Drifts, start: Floats | None = None) -> Floats:
-        """Return what all votes say of direction and δ at each place, shape (B, D, states).
+        """Return the belief over direction and δ at each place given all votes, shape (B, D, states).
 
         Parameters
         ----------
         drifts : Drifts
         start : float64, shape (states,), optional
-            How likely each δ is before any vote; by default all are equally likely.
+            Prior of δ; by default uniform.
         """
         begin = self._anywhere if start is None else start
         return smooth(self.likelihood, self._densities(drifts), self._other, begin)
 
     def without_drift(self) -> float:
-        """Return the log-likelihood of all votes if δ is the same everywhere."""
+        """Return the log-likelihood of all votes if δ is constant, nats."""
         each = np.log(self.likelihood.mean(1)).sum(0)
         return float(each.max() + math.log(np.exp(each - each.max()).mean()))
 
 
-def _followed(chain: _Chain, belief: Floats) -> tuple[Floats, Floats]:
-    """Return the most probable right angle's mean δ at each place, without jumps, and its probability."""
+def _most_probable(chain: _Chain, belief: Floats) -> tuple[Floats, Floats]:
+    """Return the mean δ of the most probable quarter of the circle at each place, unwrapped, and its probability."""
     half = (np.abs(chain.off(0.0)) < math.pi / 4).astype(np.float64)
     masses = np.fft.irfft(np.fft.rfft(belief, axis=1) * np.conj(np.fft.rfft(half)), chain.states, axis=1)
     middle = chain.grid[masses.argmax(1)]
@@ -247,13 +245,13 @@ def _followed(chain: _Chain, belief: Floats) -> tuple[Floats, Floats]:
 
 
 def doubts(at: NDArray[np.int64], certain: Floats) -> tuple[tuple[int, float], ...]:
-    """Return the nodes at which the probability of having lost no right angle falls, and by how much.
+    """Return the nodes at which the probability that no right angle was lost decreases, and by how much.
 
     Parameters
     ----------
     at : int64, shape (B,)
     certain : float64, shape (B,)
-        That probability from the begin of the drive to each node.
+        This probability from the begin of the drive to each node.
     """
     falls = _falls(certain)
     out = []
@@ -264,7 +262,7 @@ def doubts(at: NDArray[np.int64], certain: Floats) -> tuple[tuple[int, float], .
 
 
 def slight(at: NDArray[np.int64], certain: Floats) -> tuple[tuple[int, float], ...]:
-    """Return the other nodes at which that probability falls, and by how much; the parameters are those of `doubts`."""
+    """Return the nodes at which it decreases less than for a doubt, and by how much; the parameters of `doubts`."""
     falls = _falls(certain)
     for part in _doubtful(falls):
         falls[part] = 0.0
@@ -272,20 +270,20 @@ def slight(at: NDArray[np.int64], certain: Floats) -> tuple[tuple[int, float], .
 
 
 def _falls(certain: Floats) -> Floats:
-    """Return by how much the least probability so far falls at each place, shape (B,)."""
+    """Return the decrease of the running minimum at each place, shape (B,)."""
     out: Floats = -np.diff(np.minimum.accumulate(certain), prepend=certain[0])
     return out
 
 
 def _doubtful(falls: Floats) -> list[NDArray[np.int64]]:
-    """Return the runs of places that are doubtful."""
+    """Return the runs of consecutive places that are doubtful."""
     falling = np.flatnonzero(falls > DOUBTFUL / 10)
     runs = np.split(falling, np.flatnonzero(np.diff(falling) > PAUSE) + 1)
     return [run for run in runs if falls[run].sum() >= DOUBTFUL]
 
 
 def yaws_of_votes(votes: Floats, yaw: Floats, correction: Floats) -> tuple[Floats, Floats]:
-    """Return the correction that the votes of each place say by themselves near `correction`, and its information."""
+    """Return the correction by the votes of each place alone, near `correction`, and its information."""
     off = np.arange(-NEAR, NEAR + 1)
     seen = np.degrees(-(yaw + correction))[:, None] - off
     places = np.arange(DIRECTIONS + 1)
@@ -295,14 +293,14 @@ def yaws_of_votes(votes: Floats, yaw: Floats, correction: Floats) -> tuple[Float
     mass = excess.sum(1)
     mean = (excess * off).sum(1) / np.maximum(mass, 1e-9)
     spread = (excess * (off - mean[:, None]) ** 2).sum(1) / np.maximum(mass, 1e-9)
-    # a wall is told from chance where votes for it are several times the mean
+    # votes that are several times the mean are no chance
     weight = np.clip((rows.max(1) - 1.5) / 1.5, 0.0, 1.0)
     information = PRECISION * weight / np.radians(np.sqrt(spread + 2.0)) ** 2
     return correction + np.radians(mean), np.where(mass > 0, information, 0.0)
 
 
 def heading(windows: Windows, at: NDArray[np.int64], votes: Floats, noises: Sequence[float] = NOISES) -> Heading | None:
-    """Return what walls say about the yaw; None where they agree on nothing.
+    """Return the heading from the votes of walls; None if votes do not agree.
 
     Parameters
     ----------
@@ -310,7 +308,7 @@ def heading(windows: Windows, at: NDArray[np.int64], votes: Floats, noises: Sequ
     at, votes
         Those of `wall_votes`.
     noises : sequence of float
-        Noise of yaw that is tried, radians a √metre.
+        Values of the yaw noise that are tried, radians a √metre.
     """
     if len(at) < FEWEST_VOTES:
         return None
@@ -318,7 +316,7 @@ def heading(windows: Windows, at: NDArray[np.int64], votes: Floats, noises: Sequ
     chain = _Chain(windows, at, votes)
     best, value = _fitted(chain, Drifts(0.0, 0.0, noises[len(noises) // 2]), noises)
     while len(askew) <= PARTS_ASKEW:
-        angle, noise, likelier = _another(windows, at, votes, askew, best, noises)
+        angle, noise, likelier = _further_direction(windows, at, votes, askew, best, noises)
         if likelier <= value:
             break
         other = _Chain(windows, at, votes, [*askew, angle])
@@ -330,11 +328,11 @@ def heading(windows: Windows, at: NDArray[np.int64], votes: Floats, noises: Sequ
     if total < LEAST_GAIN * len(at):
         return None
     circle = _Chain(windows, at, votes, askew, 4, TEMPER, WIDER)
-    # where the drive begins any right angle will do
+    # at the begin of the drive any of the four right angles may be chosen
     first = chain.grid[int(chain.smooth(best)[0].sum(0).argmax())]
     start = (np.abs(circle.off(first)) < math.pi / 4).astype(np.float64)
     belief = circle.smooth(best, start)
-    correction, certain = _followed(circle, belief.sum(1))
+    correction, certain = _most_probable(circle, belief.sum(1))
     direction = np.array(askew)[belief.sum(2).argmax(1)]
     measured, information = yaws_of_votes(votes, windows.node[at, 2] - direction, correction)
     return Heading(
@@ -352,21 +350,21 @@ def heading(windows: Windows, at: NDArray[np.int64], votes: Floats, noises: Sequ
     )
 
 
-def _value(chain: _Chain, drifts: Drifts) -> float:
-    """Return the log-likelihood of all votes, with the prior of a calibration."""
+def _log_posterior(chain: _Chain, drifts: Drifts) -> float:
+    """Return the log-likelihood of all votes plus the log prior of the calibration, nats."""
     prior = (drifts.bias / BIAS_SIGMA) ** 2 + (drifts.turn_scale / TURN_SCALE_SIGMA) ** 2
     return chain.log_likelihood(drifts) - 0.5 * prior
 
 
 def _fitted(chain: _Chain, drifts: Drifts, noises: Sequence[float]) -> tuple[Drifts, float]:
-    """Return the likeliest drift, one figure after the other, and its value."""
+    """Return the likeliest drift, found one parameter after the other, and its log posterior."""
     for name, values in (('bias', BIASES), ('turn_scale', TURN_SCALES), ('noise', noises)):
         tried = [drifts._replace(**{name: float(value)}) for value in values]
-        drifts = max(tried, key=lambda each: _value(chain, each))
-    return drifts, _value(chain, drifts)
+        drifts = max(tried, key=lambda each: _log_posterior(chain, each))
+    return drifts, _log_posterior(chain, drifts)
 
 
-def _another(
+def _further_direction(
     windows: Windows,
     at: NDArray[np.int64],
     votes: Floats,
@@ -374,15 +372,15 @@ def _another(
     drifts: Drifts,
     noises: Sequence[float],
 ) -> tuple[float, float, float]:
-    """Return the direction of walls that is likeliest beside those known, radians, the noise with it, and its value."""
-    # where walls explain what looked like drift, odometry strays less
+    """Return the likeliest further direction of walls, radians, the yaw noise with it, and the log posterior."""
+    # with the new direction, less of the votes is explained by drift
     some = [noise for noise in noises if noise <= drifts.noise][-2:] or [drifts.noise]
 
     def best(angles: list[float], noises: Sequence[float]) -> tuple[float, float, float]:
         tried = []
         for angle in angles:
             chain = _Chain(windows, at, votes, [*askew, angle])
-            tried += [(angle, noise, _value(chain, drifts._replace(noise=noise))) for noise in noises]
+            tried += [(angle, noise, _log_posterior(chain, drifts._replace(noise=noise))) for noise in noises]
         return max(tried, key=lambda each: each[2])
 
     quarter = math.pi / 2

@@ -1,7 +1,7 @@
-"""What votes say of a state that goes around a circle while it moves at random: forward and backward passes.
+"""A hidden Markov model whose state is on a circle: forward filtering and backward smoothing.
 
-The state is one of S values on a circle, and one of D kinds. A motion has a density of its own, and after it the kind
-may be another one. All values are followed at once, so nothing is lost where votes contradict each other.
+The state has one of S values on a circle, and is of one of D kinds. Each motion has its own density, and the kind may
+change with it. The belief over all states is kept (histogram filter), so contradicting votes are not fatal.
 """
 
 from __future__ import annotations
@@ -14,20 +14,20 @@ from ..runtime.jit import kernel
 from .poses import Floats
 
 TINY = 1e-300
-"""Least probability of a state, so that votes may still speak for it."""
+"""Smallest probability of a state, so that later votes can still raise it."""
 
 
 @kernel
 def move(belief: Any, density: Any, other: float, out: Any) -> None:
-    """Write to `out` what is known of the state after a motion.
+    """Write the belief after a motion to `out`: the prediction step of the Bayes filter.
 
     Parameters
     ----------
     belief : float64, shape (D, S)
     density : float64, shape (S,)
-        Of moving on by 0, 1, … S − 1 steps.
+        Probabilities of moving by 0, 1, … S − 1 steps.
     other : float
-        Probability that the kind is drawn anew from all.
+        Probability that the kind is drawn again, uniformly from all D.
     out : float64, shape (D, S)
     """
     kinds, size = np.uint64(belief.shape[0]), np.uint64(belief.shape[1])
@@ -35,7 +35,7 @@ def move(belief: Any, density: Any, other: float, out: Any) -> None:
     for d in range(kinds):
         for i in range(size):
             here = belief[d, i]
-            # unsigned, so that an index need not be asked whether it counts from the end
+            # unsigned, so that numba does not test for negative indices
             for k in range(size - i):
                 out[d, i + k] += here * density[k]
             for k in range(size - i, size):
@@ -52,7 +52,7 @@ def move(belief: Any, density: Any, other: float, out: Any) -> None:
 
 @kernel
 def _weigh(belief: Any, weights: Any, out: Any) -> float:
-    """Write to `out` a belief times weights, of the sum 1; return what the sum was. `out` may be `belief`."""
+    """Write belief × weights, normalised, to `out`, and return the sum before; `out` may be `belief`."""
     total = 0.0
     for d in range(belief.shape[0]):
         for i in range(belief.shape[1]):
@@ -86,20 +86,20 @@ def _backward(likelihood: Any, densities: Any, others: Any, later: Any, weighed:
 def forward(
     likelihood: Floats, densities: Floats, others: Floats, start: Floats, keep: bool = False
 ) -> tuple[float, Floats]:
-    """Return the log-likelihood of all votes, and what those so far say of the state at each place.
+    """Return the log-likelihood of all votes, and the belief at each place given the votes up to it.
 
     Parameters
     ----------
     likelihood : float64, shape (B, D, S)
         Of the votes of each place.
     densities : float64, shape (B - 1, S)
-        Of the motions between places.
+        Of the motion from each place to the next.
     others : float64, shape (B - 1,)
-        Probability that the kind is drawn anew at each.
+        Probability that the kind is drawn again during each motion.
     start : float64, shape (S,)
-        Probabilities of the values before any vote; all kinds are equally likely.
+        Prior of the values; all kinds are equally likely.
     keep : bool
-        Whether all beliefs are kept, shape (B, D, S); otherwise some of them.
+        Whether all beliefs are returned, shape (B, D, S); otherwise only the last two.
     """
     beliefs = np.empty((len(likelihood) if keep else 2, *likelihood.shape[1:]))
     beliefs[0] = start / likelihood.shape[1]
@@ -109,10 +109,10 @@ def forward(
 
 
 def smooth(likelihood: Floats, densities: Floats, others: Floats, start: Floats) -> Floats:
-    """Return what all votes say of the state at each place, shape (B, D, S); the parameters are those of `forward`."""
+    """Return the belief at each place given all votes, shape (B, D, S); the parameters are those of `forward`."""
     _, out = forward(likelihood, densities, others, start, keep=True)
     later = np.empty_like(out)
-    # the other way round: back by as many steps, and the kind drawn anew is as likely either way
+    # backward in time the steps are reversed; drawing the kind again is symmetric
     _backward(likelihood, np.roll(densities[:, ::-1], 1, axis=1), others, later, np.empty_like(later[0]))
     out *= np.maximum(later, TINY)
     out /= out.sum(axis=(1, 2), keepdims=True)

@@ -1,9 +1,9 @@
-"""What becomes of places where a right angle of the heading may have been lost: matching decides.
+"""Hypotheses about the heading at places where a right angle may have been lost; matching decides between them.
 
-Votes of walls know the heading modulo 90°. In a hall whose walls are out of reach it may slip over to the next one. If
-places seen before such a hall are recognised after it, it did not. If they are not, the drive is solved with the
-heading turned by a right angle from there on, one way and the other, and what predicts its readings best is right. Of
-several such places, one after the other is asked: what follows the first one is right up to the second.
+Walls give the heading modulo 90°. In a hall whose walls are out of reach, it may be off by a right angle afterwards. It
+is not if blocks from before the hall are recognised after it. Otherwise the drive is solved again, with the heading
+turned by +90° and by −90° from there on, and the solution that predicts readings best is right. Several such places are
+examined in the order of the drive: after the decision on the first one, the heading is right up to the second.
 """
 
 from __future__ import annotations
@@ -23,15 +23,15 @@ from .scans import Scans
 from .solving import Solver
 
 JUDGED_ON = 60
-"""Blocks that solutions are compared on."""
+"""Most blocks that solutions are compared by."""
 
-MOST_OPEN = 3
-"""Places that are asked: each takes two solutions more, and of many none is likely to be right."""
+MOST_DOUBTFUL = 3
+"""Most doubtful places that are examined: each takes two more solutions, and with many hardly one would be right."""
 
 
 @dataclass(frozen=True)
 class Solved:
-    """A drive that was solved with one heading.
+    """A drive that was solved with one hypothesis of the heading.
 
     Attributes
     ----------
@@ -39,9 +39,9 @@ class Solved:
     solver : Solver
         Of this heading.
     along : Solution
-        By straight walls alone.
+        By odometry and straight walls.
     solution : Solution
-        With matches.
+        With matches as well.
     loops : list of Loop
     certainty : float
         Probability that no right angle was lost.
@@ -55,50 +55,50 @@ class Solved:
     certainty: float
 
 
-def solved(
+def solve_hypotheses(
     scans: Scans, heading: Heading, solver: Solver, along: Solution, solver_of: Callable[[Heading], Solver]
 ) -> Solved:
-    """Return the drive solved with the heading that was followed, or with another one if that is right.
+    """Return the drive solved with the given heading, or with a better hypothesis.
 
     Parameters
     ----------
     scans : Scans
     heading : Heading
     solver, along
-        Of this heading.
+        Of this heading, and its solution by straight walls.
     solver_of : callable
         Makes the solver of another heading.
     """
-    best = _matched(scans, heading, solver, along)
-    nodes = _open(scans, best)
-    if not 0 < len(nodes) <= MOST_OPEN:
+    best = _solve_with(scans, heading, solver, along)
+    doubtful_nodes = _doubtful_nodes(scans, best)
+    if not 0 < len(doubtful_nodes) <= MOST_DOUBTFUL:
         return best
     blocks = blocks_of(len(scans.windows), BLOCK, JUDGED_ON)
-    seen = predicted(scans, best.solution.nodes, blocks)
-    for node in nodes:
-        # it may be known by now, since an earlier one is
-        still = _open(scans, best)
-        if node not in still:
+    best_values = predicted(scans, best.solution.nodes, blocks)
+    for node in doubtful_nodes:
+        # the decision on an earlier place may have confirmed this one
+        doubtful = _doubtful_nodes(scans, best)
+        if node not in doubtful:
             continue
-        tried, values = [best], [seen]
+        tried, values = [best], [best_values]
         for angle in (math.pi / 2, -math.pi / 2):
             other = best.heading.turned(node, angle)
             solver = solver_of(other)
-            tried.append(_matched(scans, other, solver, solver.along_walls()))
+            tried.append(_solve_with(scans, other, solver, solver.along_walls()))
             values.append(predicted(scans, tried[-1].solution.nodes, blocks))
-        right, told = _best(scans, tried, values, node)
-        best, seen = tried[right], values[right]
-        # of two right angles that make up for each other, neither is better turned alone
-        if told and (right or len(still) == 1):
-            best = _known(best, node)
+        right, decisive = _best(scans, tried, values, node)
+        best, best_values = tried[right], values[right]
+        # two lost right angles may cancel, and then turning at one place alone is no better
+        if decisive and (right or len(doubtful) == 1):
+            best = _without_doubt(best, node)
     return best
 
 
 def _best(scans: Scans, tried: list[Solved], values: list[Floats], node: int) -> tuple[int, bool]:
-    """Return which solution is right, and whether that it predicts readings better than the others tells so by itself.
+    """Return the number of the right solution, and whether its prediction of readings alone proves that it is right.
 
-    Without that, the first one is, unless others that predict readings better have what was before the node
-    recognised: then the one of them that predicts them best.
+    It does if it is better than that of both others. Otherwise the first solution, which is not turned, is right unless
+    others predict readings better and have blocks from before the node recognised; then it is the best of these.
     """
     for k, now in enumerate(values):
         if all(gain(other, now).sigmas >= LEAST_SIGMAS for j, other in enumerate(values) if j != k):
@@ -111,8 +111,8 @@ def _best(scans: Scans, tried: list[Solved], values: list[Floats], node: int) ->
     return right, False
 
 
-def _known(found: Solved, node: int) -> Solved:
-    """Return what was found, with no doubt at a node."""
+def _without_doubt(found: Solved, node: int) -> Solved:
+    """Return the solved drive without the doubt at a node."""
     probability = dict(found.heading.doubts)[node]
     heading = replace(
         found.heading,
@@ -126,22 +126,22 @@ def _is_confirmed(scans: Scans, found: Solved, node: int) -> bool:
     return confirmed(scans, found.solution.nodes, found.loops, node)
 
 
-def _matched(scans: Scans, heading: Heading, solver: Solver, along: Solution) -> Solved:
+def _solve_with(scans: Scans, heading: Heading, solver: Solver, along: Solution) -> Solved:
     solution, loops = solver.with_matches(along)
     found = Solved(heading, solver, along, solution, loops, heading.certainty)
-    # what is confirmed was no loss
+    # at confirmed places no right angle was lost
     not_lost = [
         probability for node, probability in (*heading.doubts, *heading.slight) if _is_confirmed(scans, found, node)
     ]
     return replace(found, certainty=heading.certainty + sum(not_lost))
 
 
-def _open(scans: Scans, found: Solved) -> list[int]:
-    """Return the nodes at which a right angle may have been lost, as far as the drive can tell, in its order."""
+def _doubtful_nodes(scans: Scans, found: Solved) -> list[int]:
+    """Return the doubtful nodes that are not confirmed, in the order of the drive."""
     progress = scans.windows.node_progress
     return [
         node
         for node, _ in found.heading.doubts
-        # before the first metres there is nothing to recognise, and hardly anything to turn
+        # before the first metres there is nothing that could be recognised
         if progress[node] - progress[0] >= APART and not _is_confirmed(scans, found, node)
     ]

@@ -1,7 +1,7 @@
-"""Judging: whether readings speak for one trajectory rather than another, by what each predicts of readings not used.
+"""Judging trajectories by how well they predict readings that they were not fitted to.
 
-All over the drive, maps of a few metres of it are compared: so the drift of odometry shows. At places seen before, maps
-of all times are compared with windows that were held out: so a drive that is bent as a whole shows.
+Blocks all over the drive are predicted on maps of the few metres around them, which shows drift of odometry. Held-out
+windows are predicted on maps of all visits of a place, which shows a trajectory that is bent as a whole.
 """
 
 from __future__ import annotations
@@ -17,59 +17,60 @@ from .scans import Scans
 from .windows import Windows
 
 SPAN = 6.0
-"""Metres of progress before and after a block that the map is made of on which odometry is compared."""
+"""Metres of progress before and after a block within which windows make its map."""
 
 JUDGED_ON, HELD_OUT = 60, 40
-"""Blocks of `over_the_drive`, and held-out windows of `chosen`, at the most."""
+"""Most blocks of `gain_over_drive`, and most held-out windows of `last_not_worse`."""
 
 MOST_WORSE = 1.0
-"""Standard errors by which matching may predict what was held out worse."""
+"""Standard errors by which a later trajectory may predict held-out windows worse and is still taken."""
 
 TURNED, LEAST_SIGMAS_OF_TURNS = math.radians(8.0), 1.5
-"""Radians by which odometry must turn otherwise within `SPAN` for readings to tell it, and by how many standard errors
-they must then be predicted better: with corners that are not square it is -4 to -6, with drift 2 to 7."""
+"""A turn within `SPAN` is examined if trajectory and odometry differ by so many radians. Readings there must be
+predicted better by so many standard errors: it is -4 to -6 at corners that are not square, and 2 to 7 with drift."""
 
 
-def over_the_drive(scans: Scans, before: Floats, after: Floats, watch: Progress) -> Gain:
-    """Return by how much one trajectory predicts readings better than another, all over the drive.
+def gain_over_drive(scans: Scans, before: Floats, after: Floats, watch: Progress) -> Gain:
+    """Return the gain of one trajectory over another in predicting blocks all over the drive.
 
     Parameters
     ----------
     scans : Scans
     before, after : float64, shape (K, 3)
-        Nodes; those of `after` may owe readings a few figures for the whole drive, and nothing else.
+        Nodes; those of `after` may have only a few parameters that were fitted to the readings.
     watch : callable
+        Receives the fraction of the work that is done.
     """
     blocks = blocks_of(len(before), BLOCK, JUDGED_ON)
-    # places of another time are left out: where they overlap by half they contradict, far apart they say nothing
-    one = predicted(scans, before, blocks, SPAN)
+    # without other visits: under drift their maps contradict this one, or lie too far off to matter
+    before_values = predicted(scans, before, blocks, SPAN)
     watch(0.5)
-    return gain(one, predicted(scans, after, blocks, SPAN))
+    return gain(before_values, predicted(scans, after, blocks, SPAN))
 
 
-def seen_again(scans: Scans, before: Floats, after: Floats) -> Gain:
-    """Return by how much what was held out is predicted better on maps of all times that the robot came by."""
-    # it is the only proof, so all that was held out has a say
+def gain_at_revisits(scans: Scans, before: Floats, after: Floats) -> Gain:
+    """Return the gain of one trajectory over another in predicting held-out windows, on maps of all visits."""
+    # the only proof in this case, so all held-out windows are used
     blocks = held_out_blocks(scans, len(before))
     return gain(predicted(scans, before, blocks), predicted(scans, after, blocks))
 
 
-def chosen(scans: Scans, first: Floats, *others: Floats) -> Floats:
-    """Return the last nodes that do not predict what was held out from them worse than those before."""
+def last_not_worse(scans: Scans, first: Floats, *others: Floats) -> Floats:
+    """Return the last trajectory that does not predict held-out windows worse than the one taken before it."""
     blocks = held_out_blocks(scans, HELD_OUT)
-    best, seen = first, predicted(scans, first, blocks)
+    best, best_values = first, predicted(scans, first, blocks)
     for nodes in others:
-        now = predicted(scans, nodes, blocks)
-        if gain(seen, now).sigmas > -MOST_WORSE:
-            best, seen = nodes, now
+        values = predicted(scans, nodes, blocks)
+        if gain(best_values, values).sigmas > -MOST_WORSE:
+            best, best_values = nodes, values
     return best
 
 
-def explained_better(scans: Scans, before: Floats, after: Floats) -> Gain:
-    """Return by how much more J is along one trajectory than along another, nats a block of all readings but held-out.
+def gain_of_objective(scans: Scans, before: Floats, after: Floats) -> Gain:
+    """Return the gain in J of one trajectory over another, nats a block; without held-out readings.
 
-    Either trajectory was fitted to these readings, so a small gain means nothing; a large one tells a trajectory that
-    contradicts itself.
+    Both trajectories were fitted to these readings, so a small gain means nothing. A large one shows that the other
+    trajectory contradicts itself.
     """
     (value, windows), (more, of_more) = (scans.explained(nodes) for nodes in (before, after))
     blocks = np.add.reduceat(of_more - windows, np.arange(0, len(windows), BLOCK))
@@ -78,23 +79,23 @@ def explained_better(scans: Scans, before: Floats, after: Floats) -> Gain:
     return Gain((more - value) / len(blocks), float(blocks.std(ddof=1) / np.sqrt(len(blocks))))
 
 
-def turned_right(scans: Scans, nodes: Floats) -> bool:
-    """Return whether readings are predicted better where nodes turn within a few metres as odometry does not.
+def turns_supported(scans: Scans, nodes: Floats) -> bool:
+    """Return whether readings support the turns that the trajectory makes within a few metres and odometry does not.
 
-    So it is, too, where there are too few such turns to tell. A robot that goes around a corner which is not square
-    looks as if its odometry were off by as much.
+    True as well if there are too few such turns. A corner that is wrongly taken for a right angle looks like an error
+    of odometry.
     """
     windows = scans.windows
     blocks = blocks_of(len(windows), BLOCK, len(windows))
-    by = np.array([_turned(windows, nodes, block[len(block) // 2]) for block in blocks])
-    sharp = [blocks[k] for k in np.sort(np.argsort(-by, kind='stable')[:JUDGED_ON]) if by[k] > TURNED]
+    excess = np.array([_excess_turn(windows, nodes, block[len(block) // 2]) for block in blocks])
+    sharp = [blocks[k] for k in np.sort(np.argsort(-excess, kind='stable')[:JUDGED_ON]) if excess[k] > TURNED]
     if len(sharp) < FEWEST_BLOCKS:
         return True
     better = gain(*(predicted(scans, each, sharp, SPAN) for each in (windows.node, nodes)))
     return bool(np.isinf(better.error)) or better.sigmas > LEAST_SIGMAS_OF_TURNS
 
 
-def _turned(windows: Windows, nodes: Floats, middle: int) -> float:
-    """Return by how much nodes turn, radians, within `SPAN` about one of them, beyond what odometry has."""
+def _excess_turn(windows: Windows, nodes: Floats, middle: int) -> float:
+    """Return the difference between the turns of nodes and of odometry within `SPAN` around a node, radians."""
     near = np.flatnonzero(np.abs(windows.node_progress - windows.node_progress[middle]) <= SPAN / 2)[[0, -1]]
     return float(abs(wrapped(np.diff(nodes[near, 2] - windows.node[near, 2])[0])))

@@ -1,13 +1,13 @@
-"""Jumps of odometry: where they are, and where the robot was after one.
+"""Jumps of odometry: finding them, and the pose of the robot after each.
 
-Odometry that begins anew, as a driver that is started again, says nothing of where the robot is on the map, but all the
-same how it moves from there on. So what lies between two jumps is a drive of its own, and two guesses say where it
-begins: where the robot stood before the jump, or where odometry has it, as where messages are missing. Around both its
-readings are compared with the map of what was driven before.
+After a restart, odometry does not tell where the robot is on the map, but it still measures how the robot moves. So the
+part between two jumps is a drive of its own. Its begin is searched around two guesses: where the robot stood before the
+jump, and where odometry has it, which is right if only messages are missing. There its readings are matched with the
+map of what was driven before.
 
-Two kinds of steps are most often right, and jumps only if readings say that the robot stood. A turn that is too fast
-for a robot is most often one of a simulated robot; else a gyroscope began anew. A step that is long, but no faster than
-this robot drives, is most often one of odometry with few messages.
+Two kinds of doubtful steps are usually real motions, and are jumps only if readings show that the robot stood still. A
+turn that is too fast for a robot is usually that of a simulated robot; otherwise a gyroscope restarted. A step that is
+long, but no faster than this robot drives, usually comes from odometry with few messages.
 """
 
 from __future__ import annotations
@@ -28,81 +28,82 @@ from .registration import SILENT, OnMap, moved_to, readings_moved
 from .windows import Odometry
 
 LONGEST_STEP = 1.0
-"""Metres between two poses of odometry up to which nothing is asked."""
+"""Metres between two poses of odometry up to which a step is no jump."""
 
 USUAL, TIMES_USUAL, FEWEST_STEPS = 0.9, 2.0, 20
-"""Quantile of the lengths and speeds of all steps that is usual; how often as long, or as fast, a step may be; and
-steps from which on that is known."""
+"""The usual length and speed of steps are this quantile of all; a step may be so many times as long and as fast; fewest
+steps for this quantile."""
 
 FEW_STEPS = 5
-"""Steps from which on the median is usual: of so few the quantile may be a jump. Of fewer nothing is usual."""
+"""Fewest steps for the median in place of the quantile, which may be a jump if steps are few. With fewer steps, the
+usual length and speed are unknown."""
 
 STANDING = 0.01
-"""Metres a second up to which a robot stands: poses of a filter tremble meanwhile, and say nothing of how it drives."""
+"""Metres a second up to which the robot stands still: steps are then noise of a filter, and are ignored."""
 
 LONGEST_GAP, TIMES_GAP = 2.0, 4.0
-"""Seconds between two poses, and how often the median of all, up to either of which no driver was started again."""
+"""A driver was not restarted if the time between two poses is at most so many seconds, or so many times the median."""
 
 LONGEST_TURN, FASTEST_TURN = 0.5, 2 * math.pi
-"""Radians between two poses, and radians a second, beyond both of which no robot turns."""
+"""Radians between two poses, and radians a second: no robot turns by more than both."""
 
 MOST_DOUBTFUL = 20
-"""Doubtful steps that are looked at: a robot that moves so more often does."""
+"""Most doubtful steps that are examined: if there are more, the robot does move so."""
 
 LOOKED_BACK = 20.0
-"""Metres before such a step that the map is made of on which readings are compared."""
+"""Metres of travel before such a step whose readings make the map."""
 
 LONGEST_OUTLIER = 0.5
-"""Seconds between the poses before and after others that are outliers."""
+"""Longest time between the poses before and after outliers, seconds."""
 
 FASTEST = 3.0
-"""Metres a second that a robot may have driven across a jump."""
+"""Metres a second that a robot can drive at most."""
 
 MOST_JUMPS = 20
-"""Jumps from which on it is no wheel odometry."""
+"""Most jumps of wheel odometry; with more, a drive is not refined."""
 
 FEWEST_READINGS = 100
-"""Readings before a jump, and after it, that it takes to tell where the robot was."""
+"""Fewest readings before a jump, and after it, to find the pose of the robot."""
 
 SIGMA = np.array([0.25, 0.25, math.radians(10.0)])
-"""σ of both guesses: metres, and radians."""
+"""σ of both guesses: metres, metres, radians."""
 
 BLOCK = 0.8
-"""Metres of the drive that are compared as one."""
+"""Metres of travel of each block whose predictions are compared."""
 
-FIRST_WAY, OWN = 1.0, 8.0
-"""Metres after a jump whose readings must fit, before sonars in front see what is new, and those that they are on a map
-of their own with."""
+FIRST_METRES, OWN_MAP = 1.0, 8.0
+"""Metres of travel after a jump: the readings of the first ones must fit on the map, since sonars in front soon see new
+territory; those of the second make a map of their own for comparison."""
 
 GOOD, GOOD_AT_REST = 0.65, 0.4
-"""Part of the score that readings have on a map of their own which a place must have, as a place that is recognised
-while driving; and which it must have where the robot stood, if it cannot have driven: odometry begins anew far more
-often than a robot is carried. Where it stood readings had 0.5 to 0.9 of it, elsewhere in the building 0.0 to 0.66."""
+"""Least score of readings at a place, as a fraction of that on a map of their own: as for a loop closure; and where the
+robot stood, if it cannot have driven, because a restart of odometry is far more frequent than a robot that is carried.
+The fraction was 0.5 to 0.9 where the robot stood, and 0.0 to 0.66 elsewhere in the building."""
 
 LEAST_KNOWN, FEWEST_KNOWN = 0.2, 30
-"""Part of the first readings, and how many, that must lie on the map."""
+"""Fraction of the first readings, and their number, that must lie on the map."""
 
 SAME = 0.25
-"""Metres between two places that are one."""
+"""Metres up to which two places are the same."""
 
-MOST_SAID = 3
-"""Jumps that are told of."""
+MOST_REPORTED = 3
+"""Most jumps that are listed in words."""
 
 
 def jumps(odometry: Odometry) -> NDArray[np.int64]:
-    """Return the numbers of the poses that odometry jumps to; those of doubtful steps are not among them."""
+    """Return the indices of the poses after jumps; without doubtful steps."""
     found, doubtful = _found(odometry)
     return found[~doubtful]
 
 
 def doubtful_steps(odometry: Odometry) -> NDArray[np.int64]:
-    """Return the numbers of the poses that odometry turns to faster than a robot can, or drives far to in one step."""
+    """Return the indices of the poses after doubtful steps: turns that are too fast, or long steps at usual speed."""
     found, doubtful = _found(odometry)
     return found[doubtful]
 
 
 def _found(odometry: Odometry) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-    """Return the numbers of the poses that odometry may have jumped to, and of which of them that is doubtful."""
+    """Return the indices of the poses after jumps and doubtful steps, and which of them are doubtful."""
     seconds, pose = np.diff(odometry.stamp) * 1e-9, odometry.pose
     far = np.hypot(*np.diff(pose[:, :2], axis=0).T)
     moved = (far > STANDING * seconds) & (seconds > 0.0)
@@ -113,22 +114,22 @@ def _found(odometry: Odometry) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
         longest = max(longest, TIMES_USUAL * float(np.quantile(far[moved], usual)))
         fastest = min(TIMES_USUAL * float(np.quantile(far[moved] / seconds[moved], usual)), FASTEST)
     elif FASTEST * apart > LONGEST_STEP:
-        # a robot may drive so far from one message to the next
+        # with so few messages, a robot can drive more than the longest step between two
         fastest = FASTEST
-    found = np.flatnonzero((far > longest) | _turned(np.diff(pose[:, 2]), seconds))
+    found = np.flatnonzero((far > longest) | _turned_too_fast(np.diff(pose[:, 2]), seconds))
     gap = max(LONGEST_GAP, TIMES_GAP * apart)
     driven = (far <= fastest * seconds) & (seconds <= gap)
     return found + 1, ((far <= longest) | driven)[found]
 
 
-def _turned(turn: Any, seconds: Any) -> Any:
-    """Return whether no robot turns so from one pose to the next: radians, and seconds."""
+def _turned_too_fast(turn: Any, seconds: Any) -> Any:
+    """Return whether a turn, radians, is too fast for a robot in so many seconds."""
     turn = np.abs(wrapped(turn))
     return (turn > LONGEST_TURN) & (turn > FASTEST_TURN * np.asarray(seconds))
 
 
 def too_far(metres: Any, seconds: Any) -> Any:
-    """Return whether no robot drives so far in that time, though messages may be missing."""
+    """Return whether a distance is too far for a robot in that time, even if messages are missing."""
     return metres > LONGEST_STEP + FASTEST * seconds
 
 
@@ -140,7 +141,7 @@ def since_jump(odometry: Odometry) -> Odometry:
 
 
 def without_outliers(odometry: Odometry) -> Odometry:
-    """Return odometry without poses that it jumps to and soon back from, to where it goes on as if they were not there.
+    """Return the odometry without outliers: poses that it jumps to, and soon back from to where it continues.
 
     The same object if there are none.
     """
@@ -149,23 +150,23 @@ def without_outliers(odometry: Odometry) -> Odometry:
         around = [begin - 1, end]
         seconds = float(np.diff(odometry.stamp[around])[0]) * 1e-9
         x, y, turn = np.diff(odometry.pose[around], axis=0)[0].tolist()
-        back = math.hypot(x, y) <= LONGEST_STEP and not _turned(turn, seconds)
+        back = math.hypot(x, y) <= LONGEST_STEP and not _turned_too_fast(turn, seconds)
         if stay[begin - 1] and seconds <= LONGEST_OUTLIER and back:
             stay[begin:end] = False
     return odometry if stay.all() else Odometry.of(odometry.stamp[stay], odometry.pose[stay])
 
 
 class Part(NamedTuple):
-    """What lies between two jumps, or between one and an end of the drive.
+    """The part of a drive between two jumps, or between one and an end of the drive.
 
     Attributes
     ----------
     readings : Readings
         Placed by `path`.
     odometry, path : Odometry
-        As odometry has it, and the trajectory, which begins where odometry does.
+        The odometry, and the trajectory, which begins at the first pose of the odometry.
     lost : bool
-        Whether the heading got lost, so that nothing should be fitted to it.
+        Whether the heading was lost, so that the part cannot be registered.
     """
 
     readings: Readings
@@ -175,15 +176,15 @@ class Part(NamedTuple):
 
 
 class Begin(NamedTuple):
-    """Where a part begins on the map, shape (3,), and what that is taken from."""
+    """The pose at the begin of a part on the map, shape (3,), and where it was found."""
 
     pose: Floats
     how: str
 
 
 FIRST, STOOD, DRIVEN, UNKNOWN = 'first', 'stood', 'driven', 'unknown'
-"""The first part that has readings; where the robot was before the jump; where odometry has it, and readings agree; and
-where odometry has it, though readings do not tell."""
+"""Values of `Begin.how`: the first part with enough readings; near the pose before the jump; at the pose by odometry,
+which readings confirm; at the pose by odometry, which they do not confirm."""
 
 
 def with_doubtful(
@@ -193,7 +194,7 @@ def with_doubtful(
     parameters: Parameters,
     stop: NDArray[np.uint8],
 ) -> NDArray[np.int64]:
-    """Return the jumps, and with them those doubtful steps that the robot did not make, as its readings say.
+    """Return the jumps, and those doubtful steps that are jumps by the readings.
 
     Parameters
     ----------
@@ -218,17 +219,17 @@ def with_doubtful(
         begin = max((k for k in out if k < at), default=0)
         end = min((k for k in out if k > at), default=len(odometry.stamp))
         begin = max(begin, int(np.searchsorted(travel, travel[at - 1] - LOOKED_BACK)))
-        end = min(end, int(np.searchsorted(travel, travel[at] + OWN)))
+        end = min(end, int(np.searchsorted(travel, travel[at] + OWN_MAP)))
         before, after = _piece(odometry, begin, at), _piece(odometry, at, end)
         part = Part(_read_along(readings, after), after, after, False)
         on_map = _read_along(readings, before)
         if min(len(part.readings), len(on_map)) < FEWEST_READINGS:
             continue
-        # right at the step odometry has not drifted yet, so nothing is searched
+        # odometry does not drift in a single step, so no search is needed
         around = OnMap(part.readings, after.pose[0], on_map, parameters, stop)
-        usual = _Usual(part, parameters, stop)
-        stood, went = (usual.fits(around, pose, GOOD_AT_REST) for pose in (before.pose[-1], after.pose[0]))
-        if stood and not went:
+        check = _FitCheck(part, parameters, stop)
+        fits_before, fits_after = (check.fits(around, pose, GOOD_AT_REST) for pose in (before.pose[-1], after.pose[0]))
+        if fits_before and not fits_after:
             out.add(at)
     return np.array(sorted(out), np.int64)
 
@@ -242,7 +243,7 @@ def _read_along(readings: Readings, path: Odometry) -> Readings:
 
 
 def parts_at(readings: Readings, odometry: Odometry, jumped_to: NDArray[np.int64]) -> list[tuple[Readings, Odometry]]:
-    """Return the readings and the odometry of each part; readings of the time of a jump are of none."""
+    """Return the readings and the odometry of each part; readings taken during a jump belong to none."""
     parts = []
     for begin, end in itertools.pairwise([0, *jumped_to.tolist(), len(odometry.stamp)]):
         part = _piece(odometry, begin, end)
@@ -251,7 +252,7 @@ def parts_at(readings: Readings, odometry: Odometry, jumped_to: NDArray[np.int64
 
 
 def begins_of(parts: Sequence[Part], parameters: Parameters, stop: NDArray[np.uint8]) -> list[Begin]:
-    """Return where each part begins on the map of those before it.
+    """Return the begin of each part on the map of those before it.
 
     Raises
     ------
@@ -260,7 +261,7 @@ def begins_of(parts: Sequence[Part], parameters: Parameters, stop: NDArray[np.ui
     """
     out: list[Begin] = []
     on_map: list[Readings] = []
-    # the frames of odometry on the map, the latest last, and where and when the robot was
+    # the odometry frames on the map, the latest last, and the last pose of the robot and its stamp
     frames, end, stamp = [np.zeros(3)], np.zeros(3), 0
     for part in parts:
         seconds = (int(part.odometry.stamp[0]) - stamp) * 1e-9
@@ -268,7 +269,7 @@ def begins_of(parts: Sequence[Part], parameters: Parameters, stop: NDArray[np.ui
         begin = Begin(driven[0], FIRST if len(part.readings) >= FEWEST_READINGS else UNKNOWN)
         stood = driven[0]
         if on_map:
-            # odometry may be back in a frame that it was in before
+            # odometry may have returned to an earlier frame
             guess = next((pose for pose in driven if not _too_fast(end, pose, seconds)), None)
             stood, other = end, driven[0] if guess is None else guess
             begin = _begin_after(part, (stood, other), guess is None, of_drives(on_map), parameters, stop)
@@ -300,17 +301,17 @@ def _begin_after(
     parameters: Parameters,
     stop: NDArray[np.uint8],
 ) -> Begin:
-    """Return where a part begins that follows a jump.
+    """Return the begin of a part that follows a jump.
 
     Parameters
     ----------
     part : Part
     guesses : (float64, float64), both of shape (3,)
-        The begin on the map if the robot stood, and as odometry has it.
+        The pose on the map if the robot stood still, and the one by odometry.
     fast : bool
-        Whether the robot cannot have driven from one to the other.
+        Whether the distance between the two is too far for a robot.
     others : Readings
-        Of the parts before, on the map.
+        Of the parts before, in the map frame.
     parameters, stop
         As in `begins_of`.
     """
@@ -320,31 +321,34 @@ def _begin_after(
     around = OnMap(part.readings, part.path.pose[0], others, parameters, stop)
     blocks = max(int(part.path.travel[-1] / BLOCK), 1)
     found = [around.search(guess, SIGMA, blocks) for guess in guesses]
-    usual = _Usual(part, parameters, stop)
-    stood, driven, exactly = (_said(around.predicted(pose, blocks)) for pose in (*found, guesses[1]))
+    check = _FitCheck(part, parameters, stop)
+    stood, driven, exactly = (_nan_if_new(around.predicted(pose, blocks)) for pose in (*found, guesses[1]))
     better = compared(driven, stood).sigmas
-    if usual.fits(around, found[0], GOOD_AT_REST if fast else GOOD) and (fast or better >= LEAST_SIGMAS):
+    if check.fits(around, found[0], GOOD_AT_REST if fast else GOOD) and (fast or better >= LEAST_SIGMAS):
         return Begin(found[0], STOOD)
-    # both guesses may lead to one place
+    # both guesses may lead to the same place
     same = np.hypot(*relative(found[1], found[0])[:2]) < SAME
-    if usual.fits(around, found[1], GOOD) and not fast and (-better >= LEAST_SIGMAS or same):
+    if check.fits(around, found[1], GOOD) and not fast and (-better >= LEAST_SIGMAS or same):
         return Begin(found[1] if compared(exactly, driven).sigmas >= LEAST_SIGMAS else guesses[1], DRIVEN)
     return unknown
 
 
-class _Usual:
-    """How well the first readings of a part fit on a map, beside how well they fit on their own."""
+class _FitCheck:
+    """Compares the fit of the first readings of a part on a map with that on a map of their own."""
 
     def __init__(self, part: Part, parameters: Parameters, stop: NDArray[np.uint8]) -> None:
         readings, path = part.readings, part.path
         travel = np.interp(readings.stamp - path.stamp[0], path.stamp - path.stamp[0], path.travel)
-        own = readings.select(travel <= OWN)
-        self._count = int(np.count_nonzero(travel <= FIRST_WAY))
+        own = readings.select(travel <= OWN_MAP)
+        self._count = int(np.count_nonzero(travel <= FIRST_METRES))
         begin = path.pose[0]
         self._own = OnMap(own, begin, own, parameters, stop).of_each(begin, self._count)
 
     def fits(self, around: OnMap, begin: Floats, least: float) -> bool:
-        """Return whether they fit so well, in parts of that, as far as they are on the map: a part of them must be."""
+        """Return whether the score of readings on the map is at least a fraction `least` of that on their own map.
+
+        Enough of the readings must lie on the map.
+        """
         there = around.of_each(begin, self._count)
         known = np.abs(there) > SILENT
         if np.count_nonzero(known) < max(LEAST_KNOWN * len(known), FEWEST_KNOWN):
@@ -352,30 +356,30 @@ class _Usual:
         return bool(there[known].sum() >= least * self._own[known].sum() > 0.0)
 
 
-def _said(values: Floats) -> Floats:
-    """Return what blocks say, NaN where all they read is new."""
+def _nan_if_new(values: Floats) -> Floats:
+    """Return the values of blocks, with NaN for blocks in new territory."""
     out: Floats = np.where(np.abs(values) > SILENT, values, np.nan)
     return out
 
 
 def compared(before: Floats, after: Floats) -> Gain:
-    """Return the gain of `after` over blocks that say something in either place; what is new says nothing."""
+    """Return the gain of `after` over `before`, by blocks that are on the map at either place; NaN counts as 0."""
     some = np.isfinite(before) | np.isfinite(after)
     return gain(np.nan_to_num(before[some]), np.nan_to_num(after[some]))
 
 
-def words(begins: Sequence[Begin], parts: Sequence[Part]) -> str:
-    """Return what became of each jump."""
-    said = []
+def jump_words(begins: Sequence[Begin], parts: Sequence[Part]) -> str:
+    """Return the result for each jump in words."""
+    texts = []
     for k, ((before, part), begin) in enumerate(zip(itertools.pairwise(parts), begins[1:], strict=True), 1):
         far = math.dist(before.odometry.pose[-1, :2].tolist(), part.odometry.pose[0, :2].tolist())
         driven = sum(float(each.odometry.travel[-1]) for each in parts[:k])
-        said.append(f'odometry jumps by {far:.1f} m after {driven:.0f} m of driving{BECAME[begin.how]}')
-    more = f'; and {len(said) - MOST_SAID} more' if len(said) > MOST_SAID else ''
-    return '; '.join(said[:MOST_SAID]) + more
+        texts.append(f'odometry jumps by {far:.1f} m after {driven:.0f} m of driving{OUTCOME_WORDS[begin.how]}')
+    more = f'; and {len(texts) - MOST_REPORTED} more' if len(texts) > MOST_REPORTED else ''
+    return '; '.join(texts[:MOST_REPORTED]) + more
 
 
-BECAME = {
+OUTCOME_WORDS = {
     FIRST: ', where there are hardly any readings before',
     STOOD: ': the readings fit where the robot was before it, and what follows is mapped from there',
     DRIVEN: ', and the readings after it fit where odometry has them',
@@ -384,4 +388,4 @@ BECAME = {
         'wrong; after a jump call reset, or map what follows by itself'
     ),
 }
-"""What became of a jump."""
+"""The result for a jump in words, by `Begin.how`."""

@@ -1,7 +1,7 @@
-"""What was found before is the one to beat: a trajectory stays when a later run leaves odometry as it is.
+"""Keeping the trajectory of an earlier run if a later run does not accept one.
 
-That a run finds nothing better than odometry does not say that odometry is better: little may speak for either. So the
-readings of windows that are held out from every match decide between the two, as they do within a run.
+That a run does not accept a trajectory does not show that odometry is better: the readings may not tell. So held-out
+windows decide between the earlier trajectory and odometry.
 """
 
 from __future__ import annotations
@@ -21,26 +21,26 @@ from .scans import Scans
 from .windows import Odometry, cut
 
 SAME = 1e-3
-"""Metres, and radians, between poses of one stamp, if they are of the same odometry."""
+"""Largest difference of two poses of the same stamp in the same odometry, metres and radians."""
 
 
-def kept(
+def keep_if_not_worse(
     before: Refinement,
     correction: Correction,
     refused: Refinement,
     parameters: Parameters,
     stop: NDArray[np.uint8],
 ) -> Refinement:
-    """Return an earlier trajectory that goes on to the end of a drive, or `refused` if odometry is better.
+    """Return an earlier trajectory, continued to the end of the drive, or `refused` if odometry is better.
 
     Parameters
     ----------
     before : Refinement
-        Of the earlier run.
+        Result of the earlier run.
     correction : Correction
-        In force since then.
+        The one in force since then.
     refused : Refinement
-        Of the run that leaves odometry as it is.
+        Result of the later run, which kept odometry.
     parameters : Parameters
     stop : uint8, shape (1,)
         Not 0 to end the work.
@@ -51,10 +51,10 @@ def kept(
         If `stop` was set.
     """
     readings, odometry = refused.readings, refused.trajectory
-    if without_times(readings, odometry) or not _begins(correction, odometry):
+    if without_times(readings, odometry) or not _same_odometry(correction, odometry):
         return refused
     path = correction.along(odometry)
-    better = _odometry_better(readings, odometry, path, for_matching(parameters), stop)
+    better = _gain_of_odometry(readings, odometry, path, for_matching(parameters), stop)
     if better.sigmas >= LEAST_SIGMAS:
         return refused
     moved, turned = differences(odometry, path)
@@ -76,8 +76,8 @@ def kept(
     )
 
 
-def _begins(correction: Correction, odometry: Odometry) -> bool:
-    """Return whether a correction is of the begin of this odometry."""
+def _same_odometry(correction: Correction, odometry: Odometry) -> bool:
+    """Return whether a correction was made from the begin of this odometry."""
     first, known = odometry.stamp[:1], correction.odometry
     if not known.stamp[0] <= first[0] <= known.stamp[-1]:
         return False
@@ -86,10 +86,10 @@ def _begins(correction: Correction, odometry: Odometry) -> bool:
     return bool(np.abs(off).max() < SAME)
 
 
-def _odometry_better(
+def _gain_of_odometry(
     readings: Readings, odometry: Odometry, path: Odometry, parameters: Parameters, stop: NDArray[np.uint8]
 ) -> Gain:
-    """Return by how much odometry predicts the readings that are held out better than a path does."""
+    """Return the gain of odometry over a path in predicting held-out windows."""
     windows = cut(readings, odometry)
     scans = Scans(windows, parameters, stop, held_out(len(windows)))
     blocks = held_out_blocks(scans, HELD_OUT) if scans.held_out.any() else []

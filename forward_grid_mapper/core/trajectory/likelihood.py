@@ -1,12 +1,14 @@
-"""How likely readings are from another pose of the robot, given a local map: the forward model over probabilities.
+"""The likelihood of readings from any pose of the robot, given a local map: the forward model with probabilities.
 
-The density of a range is that of `sensor.density`. A cone is walked ring by ring, a cell deep; what a ring returns is
-the largest of the probabilities that rays through the cone meet in it, h_d. With s_d = Π (1 − h) over the nearer rings
+The density of a range is that of `sensor.density`. The cone is divided into rings, each one cell deep. The probability
+h_d that a ring returns the echo is the largest probability that rays through the cone meet in it. With
+s_d = Π (1 − h) over the nearer rings
 
-    p(z | map) = causes that no map changes + (1 − p_rand − p_lost) · (Σ_d s_d h_d N(z; d, σ) + s_end N(z; z_max, σ))
+    p(z | map) = causes independent of the map
+                 + (1 − p_rand − p_lost) · (Σ_d s_d h_d N(z; d, σ) + s_end N(z; z_max, σ))
 
-A surface that the reading meets beyond the incidence angle, and goes past, does not count (`surface_normals`). Divided
-by the same of a map without any known cell, new territory counts nothing either way.
+A surface that the sound meets beyond the incidence angle does not count if the reading is longer (`surface_normals`).
+The result is a likelihood ratio to a map without known cells, so that new territory counts nothing.
 """
 
 from __future__ import annotations
@@ -27,31 +29,32 @@ from .local_map import LocalMap
 from .poses import Floats
 
 RAYS = (3, 5, 7, 11)
-"""Rays through a cone, the middle one along its axis: as few as lie a cell apart or less, 11 at the most."""
+"""Numbers of rays through a cone, the middle one along its axis: as many as needed to be at most a cell apart, 11 at
+most."""
 
 SPREAD = 0.85
-"""Part of the half angle that the rays span: beyond it a cone hears little."""
+"""Fraction of the half angle that the rays span: near the edge of the cone, sensors detect little."""
 
 LEAST_SURVIVAL = 1e-4
-"""s_d below which what lies behind is not asked."""
+"""s_d below which the rings behind are ignored."""
 
 OFF = 1.0
-"""Cells by which the middle of a cell that a ray meets may be off the ring at the most, and more."""
+"""Cells; more than the centre of a cell that a ray meets can be away from the ring."""
 
 LANES, SIDE_BY_SIDE = 64, 4
-"""Poses that are asked side by side at the most, and of what they are a multiple."""
+"""Most poses that are evaluated in parallel (SIMD), and the number that they are a multiple of."""
 
 SCAN = np.dtype(
     [(name, np.float64) for name in ('x', 'y', 'yaw', 'half', 'z', 'sigma', 'reach', 'floor', 'silence', 'unknown')],
     align=True,
 )
-"""A reading of a scan: the pose of its sensor in the frame of the scan, half the spread of its rays in radians, the
-range and σ in metres, how far rings matter, and p of the causes that no map changes, N(z; z_max, σ), and log p where
-nothing is known."""
+"""A reading of a scan: pose of its sensor in the frame of the scan; half the angle that its rays span, radians; range,
+σ and the distance up to which rings matter, metres; density of the causes independent of the map (`floor`),
+N(z; z_max, σ) (`silence`), and log p on an unknown map."""
 
 
 class Scan(NamedTuple):
-    """Readings that move together.
+    """Readings in one frame, which are moved as a rigid body.
 
     Attributes
     ----------
@@ -66,7 +69,7 @@ class Scan(NamedTuple):
 
 @kernel
 def _log_unknown(reading: Any, weight: float, resolution: float, unknown: float) -> float:
-    """Return log p(z) where no cell is known."""
+    """Return log p(z) on a map without known cells."""
     survival, hit = 1.0, 0.0
     for k in range(int(math.ceil(reading.reach / resolution))):
         error = (reading.z - (k + 0.5) * resolution) / reading.sigma
@@ -93,7 +96,7 @@ def make_scan(readings: Readings, poses: Floats, model: ModelParameters, resolut
         Of the sensors in the frame of the scan.
     model : ModelParameters
     resolution, unknown : float
-        Those of the local maps to match with.
+        Cell size, metres, and probability of unknown cells of the local maps.
     """
     sigma = effective_sigma(readings, model, resolution)
     causes = causes_of(readings, sigma, model, resolution)
@@ -110,10 +113,10 @@ def make_scan(readings: Readings, poses: Floats, model: ModelParameters, resolut
 
 
 def blurred(scan: Scan, by: float, around: LocalMap) -> Scan:
-    """Return a scan whose echoes have a larger σ, for poses that lie far apart; `by` metres are added."""
+    """Return a scan with larger σ, for coarse grids of poses: the root of σ² + by², metres."""
     table = scan.readings.copy()
     table['sigma'] = np.hypot(table['sigma'], by)
-    # nothing is heard beyond z_max, which is as far as readings without echo reach
+    # readings without echo reach up to z_max, and nothing is detected beyond
     echo = table['reach'] > table['z']
     table['reach'] += np.where(echo, CUT * (table['sigma'] - scan.readings['sigma']), 0.0)
     blurry = Scan(table, scan.weight)
@@ -122,22 +125,23 @@ def blurred(scan: Scan, by: float, around: LocalMap) -> Scan:
 
 
 class Lanes(NamedTuple):
-    """What is known of L poses that are asked side by side, so that processors work on several at a time.
+    """The state of L poses that are evaluated in parallel (SIMD).
 
     Attributes
     ----------
     x, y : float64, shape (L,)
-        Of the sensor, in cells of the map.
+        Position of the sensor, in cells of the map.
     fan : float64, shape (1 + len(RAYS), RAYS[-1], 2, L)
-        Unit vectors along the rays: those of one ray, then those of as many as `RAYS` has it.
+        Unit vectors along the rays: first for a single ray, then for each number in `RAYS`.
     best, ray : float64, shape (L,)
-        The largest probability that rays have met so far in a ring, and which of them met it first on the map, or −1.
+        The largest probability that rays have met in the current ring, and the first ray that met it inside of the map,
+        or −1.
     survival, hit : float64, shape (L,)
         s_d, and Σ s_d h_d N(z; d, σ).
     cell : int32, shape (RAYS[-1], L)
-        What each ray meets in a ring: a row of `cells` of the map.
+        The cell that each ray meets in the current ring: index of a row of `LocalMap.cells`.
     met : float32, shape (RAYS[-1], 3, L)
-        That row.
+        The values of that row.
     """
 
     x: Floats
@@ -160,7 +164,7 @@ def _lanes(count: int) -> Lanes:
 
 @kernel
 def _fan_out(reading: Any, yaw: float, resolution: float, lanes: Lanes, part: tuple[int, int]) -> None:
-    """Set the rays of a reading, as many as it needs, in some lanes, all of one yaw."""
+    """Set the rays of a reading in the lanes `part[0]` to `part[1]`, which have the same yaw."""
     fan, begin = lanes.fan, yaw + reading.yaw - reading.half
     axis_x, axis_y = math.cos(begin), math.sin(begin)
     fan[0, 0, 0, part[0] : part[1]], fan[0, 0, 1, part[0] : part[1]] = axis_x, axis_y
@@ -179,7 +183,7 @@ def _fan_out(reading: Any, yaw: float, resolution: float, lanes: Lanes, part: tu
 
 @kernel
 def _meet(around: LocalMap, lanes: Lanes, wide: int, rays: int, d: float) -> None:
-    """Set what the rays of each lane meet at distance d."""
+    """Look up the cells that the rays of each lane meet at distance d, cells."""
     x, y, fan, cell, met, cells = lanes.x, lanes.y, lanes.fan, lanes.cell, lanes.met, around.cells
     height, width = float(around.shape[0]), float(around.shape[1])
     for k in range(rays):
@@ -194,14 +198,14 @@ def _meet(around: LocalMap, lanes: Lanes, wide: int, rays: int, d: float) -> Non
 
 @kernel
 def _raise(around: LocalMap, lanes: Lanes, wide: int, rays: int, limit: float) -> None:
-    """Set the largest probability that the rays of each lane met."""
+    """Find the largest probability that the rays of each lane meet."""
     best, ray, fan, cell, met = lanes.best, lanes.ray, lanes.fan, lanes.cell, lanes.met
     outside, unknown = len(around.cells) - 1, around.unknown
     best[:], ray[:] = 0.0, -1.0
     for k in range(rays):
         this = float(k)
         for p in range(len(best)):
-            # NaN where there is no normal, and not below the limit
+            # without a normal `along` is NaN, and the comparison is false
             along = fan[wide, k, 0, p] * met[k, 1, p] + fan[wide, k, 1, p] * met[k, 2, p]
             here = 0.0 if along * along < limit else np.float64(met[k, 0, p])
             beyond = cell[k, p] == outside
@@ -213,7 +217,7 @@ def _raise(around: LocalMap, lanes: Lanes, wide: int, rays: int, limit: float) -
 
 @kernel
 def _hear(reading: Any, resolution: float, lanes: Lanes, wide: int, d: float) -> None:
-    """Add what a ring returns of the reading."""
+    """Add s_d h_d N(z; d, σ) of a ring."""
     x, y, fan = lanes.x, lanes.y, lanes.fan
     for p in range(len(x)):
         off_x, off_y = d, 0.0
@@ -229,7 +233,7 @@ def _hear(reading: Any, resolution: float, lanes: Lanes, wide: int, d: float) ->
 
 @kernel
 def _walk(reading: Any, around: LocalMap, lanes: Lanes) -> None:
-    """Walk the cone of a reading ring by ring, in all lanes."""
+    """Go through the rings of the cone of a reading, in all lanes."""
     resolution, best, survival = around.resolution, lanes.best, lanes.survival
     through = (reading.z - THROUGH * reading.sigma) / resolution
     heard = (reading.z - CUT * reading.sigma) / resolution - OFF
@@ -251,9 +255,10 @@ def _walk(reading: Any, around: LocalMap, lanes: Lanes) -> None:
 
 @kernel
 def score_poses(scan: Scan, around: LocalMap, poses: Any, stride: int, lanes: Lanes, out: Any) -> None:
-    """Write Σ log ratio of a scan from each pose, shape (P, 3), to `out`; of every `stride`-th reading, times that.
+    """Write the log-likelihood ratio of a scan at each pose, shape (P, 3), to `out`.
 
-    P is a multiple of the number of lanes. It is quickest where poses of the same yaw follow each other.
+    Only every `stride`-th reading is evaluated, and the sum is multiplied by `stride`. P must be a multiple of the
+    number of lanes. It is fastest if poses are sorted by yaw.
     """
     resolution, count = around.resolution, len(lanes.x)
     out[:] = 0.0
@@ -280,16 +285,19 @@ def score_poses(scan: Scan, around: LocalMap, poses: Any, stride: int, lanes: La
 
 
 def scores(scan: Scan, around: LocalMap, poses: Floats, stride: int = 1) -> Floats:
-    """Return Σ log p(z | map) − log p(z | nothing known) of a scan from each pose, shape (P, 3), in nats."""
+    """Return the log-likelihood ratio Σ log p(z | map) − log p(z | unknown map) of a scan at poses (P, 3), nats.
+
+    Only every `stride`-th reading is evaluated, and the sum is multiplied by `stride`.
+    """
     count = len(poses)
     if not count:
         return np.empty(0)
     rounds = max(-(-count // LANES), 1)
     wide = max(-(-count // (rounds * SIDE_BY_SIDE)), 1) * SIDE_BY_SIDE
     order = np.argsort(poses[:, 2], kind='stable')
-    # lanes that are left over repeat the last pose
-    asked = np.concatenate([order, np.full(rounds * wide - count, order[-1])])
-    found, out = np.empty(len(asked)), np.empty(count)
-    score_poses(scan, around, poses[asked], stride, _lanes(wide), found)
+    # spare lanes repeat the last pose
+    padded = np.concatenate([order, np.full(rounds * wide - count, order[-1])])
+    found, out = np.empty(len(padded)), np.empty(count)
+    score_poses(scan, around, poses[padded], stride, _lanes(wide), found)
     out[order] = found[:count]
     return out

@@ -1,7 +1,7 @@
-"""Local maps: the maximum likelihood map of some windows' readings, as probabilities that a scan is matched with.
+"""Local maps: the maximum likelihood map of the readings of some windows, as probabilities for scan matching.
 
-The map is that of the core's search, with its prior of walls and its surface normals. A standard occupancy grid would
-not do: it is biased where cones overlap, and a scan matched with it comes out several centimetres off.
+The map is made by the same search as the final maps, with the prior for walls and the surface normals. A standard
+occupancy grid is biased where cones overlap: poses matched with it are off by several centimetres.
 """
 
 from __future__ import annotations
@@ -26,26 +26,27 @@ from ..sensor.density import hit_probability
 from .poses import Floats
 
 OCCUPIED, FREE = 1 / (1 + math.exp(-3.0)), 1 / (1 + math.exp(4.0))
-"""Probabilities of cells that a local map shows as occupied, and as free."""
+"""Probabilities of occupied and of free cells of a local map."""
 
 UNKNOWN = 0.06
-"""Probability of cells that it does not know: the usual fraction of occupied cells."""
+"""Probability of unknown cells: the usual fraction of occupied cells."""
 
 RESOLUTION = 0.1
-"""Metres; matches are made on cells of one size, whatever size the maps are to have."""
+"""Metres; the cell size of local maps, independent of that of the final maps."""
 
 MODEL = {'p_hit': 0.7, 'p_rand': 0.4, 'p_lost': 0.42, 'min_incidence_angle': NO_INCIDENCE_LIMIT}
-"""The sensor model of matches, whatever that of the maps is. With it the errors that matches state are the real ones;
-that of the maps lets a reading say less, since a wall must not hang on one. All surfaces have one incidence angle: with
-angles of their own, which take away what readings say, trajectories are a little worse."""
+"""The sensor model of matching, independent of that of the final maps. With it, the covariances of matches agree with
+their errors. In the model of the final maps a single reading weighs less, since one reading must not make a wall. All
+surfaces have the same limit of the incidence angle: learned limits discard readings, and trajectories are a little
+worse."""
 
 
 OF_LOCAL_MAPS = 1e9
-"""Bytes that pairs of a local map may take: more than they do."""
+"""Memory limit for the pairs of a local map, bytes; never reached."""
 
 
 class LocalMap(NamedTuple):
-    """Probabilities of a local map; what lies outside is unknown.
+    """A local map; cells outside of it are unknown.
 
     Attributes
     ----------
@@ -56,12 +57,12 @@ class LocalMap(NamedTuple):
     shape : int, int
         Rows and columns.
     cells : float32, shape (rows * columns + 1, 3)
-        Probability that a cell returns the echo of a reading that reaches it, and the unit vector along the normal of
-        its surface, as of `SurfaceNormals`, NaN where it is not known. The last row is for what lies outside.
+        Probability that a cell returns an echo if the sound reaches it, and the unit vector of its surface normal
+        (`SurfaceNormals`), NaN if unknown. The last row stands for all cells outside.
     cos2_limit : float
         As in `surface_normals.SurfaceNormals`.
     unknown : float
-        `hit` of unknown cells.
+        The probability in `cells` of unknown cells.
     """
 
     column: float
@@ -74,7 +75,7 @@ class LocalMap(NamedTuple):
 
 
 def cells_of(hit: NDArray[np.float32], x: NDArray[np.float32], y: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return the `cells` of a local map, given the normals of the surfaces: 0 where they are not known."""
+    """Return `LocalMap.cells`; the normals (x, y) are 0 if unknown."""
     out = np.full((hit.size + 1, 3), np.nan, np.float32)
     out[:-1, 0] = hit.ravel()
     known = (x.ravel() != 0) | (y.ravel() != 0)
@@ -83,18 +84,18 @@ def cells_of(hit: NDArray[np.float32], x: NDArray[np.float32], y: NDArray[np.flo
 
 
 def for_matching(parameters: Parameters) -> Parameters:
-    """Return the parameters that scans are matched with: those of the maps but for `RESOLUTION` and `MODEL`."""
+    """Return the parameters for scan matching: those of the final maps, with `RESOLUTION` and `MODEL`."""
     return parameters.varied({'resolution': RESOLUTION, **MODEL})
 
 
 def at_poses(readings: Readings, poses: Floats) -> Readings:
-    """Return the readings with sensors at other poses, shape (N, 3)."""
+    """Return the readings with their sensors at these poses, shape (N, 3)."""
     x, y, yaw = np.ascontiguousarray(poses.T)
     return replace(readings, x=x, y=y, yaw=yaw)
 
 
 def local_map(readings: Readings, parameters: Parameters, stop: NDArray[np.uint8]) -> LocalMap:
-    """Return the map of readings that are placed in its frame.
+    """Return the local map of readings; their poses are in the frame of the map.
 
     Raises
     ------
@@ -106,9 +107,9 @@ def local_map(readings: Readings, parameters: Parameters, stop: NDArray[np.uint8
 
 
 def explained(readings: Readings, parameters: Parameters, stop: NDArray[np.uint8]) -> tuple[float, Floats]:
-    """Return J of readings, what the search maximises, at the map that it finds, and what each reading has of it.
+    """Return the objective J of the map that the search finds, and the log-likelihood of each reading in it.
 
-    J is in nats; what readings have, shape (N,), is in nats, too, and is all of J but the prior of the map.
+    Both are in nats. The log-likelihoods, shape (N,), are tempered; with the prior of the map they add up to J.
 
     Raises
     ------
@@ -123,7 +124,7 @@ def explained(readings: Readings, parameters: Parameters, stop: NDArray[np.uint8
 def _searched(
     readings: Readings, parameters: Parameters, stop: NDArray[np.uint8], memory: float
 ) -> tuple[Grid, Evidence, NDArray[np.bool_], SearchResult]:
-    """Return the grid of readings, what they say there, the cells that sensors were moved over, and the search."""
+    """Return the grid of readings, their evidence, the traversed cells, and the result of the search."""
     grid = grid_of(readings, parameters.model, parameters.grid)
     evidence = Evidence(grid, parameters.model, memory, 1, stop)
     evidence.extend(readings)
@@ -132,7 +133,7 @@ def _searched(
 
 
 def soft_map(evidence: Evidence, grid: Grid, traversed: NDArray[np.bool_], model: ModelParameters) -> LocalMap:
-    """Return the probabilities of a map that was searched."""
+    """Return the local map of a maximum likelihood map."""
     ml = evidence.observed()
     p_hit, normals = hit_probability(model, grid.resolution), evidence.state.normals
     shown = np.where(ml == 1, OCCUPIED, np.where((ml == 0) | traversed, FREE, UNKNOWN))

@@ -1,11 +1,10 @@
-"""Loops: blocks matched with local maps of places that the robot came by at another time.
+"""Loop closures: blocks matched with local maps of other visits of a place.
 
-How far a place may be off is asked from the posterior of the graph, of which deviations are drawn; there the block is
-searched, wherever it may be. That posterior knows nothing of a wall that was taken for another one or of votes that are
-wrong together, so places are off by more; and where the right place is not searched, rooms that look alike are found
-instead. So the search goes farther than the posterior does. A loop counts if its readings fit about as well as those
-matched with their own surroundings, and nowhere else in the searched area nearly as well. What does not agree with the
-rest is taken out again when the graph is solved.
+The searched area follows from samples of the posterior of the pose graph. The posterior does not include a wall that
+was taken for another one, or votes with a common error, so real errors are larger. If the right pose is outside of the
+searched area, a room that looks alike is found instead. So the area is larger than the posterior. A loop closure is
+accepted if its readings fit about as well as in the matches with neighbouring windows, and clearly better than at any
+other pose in the area. Loop closures that disagree with the rest are removed when the graph is solved.
 """
 
 from __future__ import annotations
@@ -19,80 +18,82 @@ from numpy.typing import NDArray
 
 from .local_map import LocalMap
 from .matching import measure
-from .passes import FEWEST, Found, Progress
+from .passes import FEWEST, Matches, Progress
 from .poses import Floats, axes_at, compose, relative, wrapped
 from .scans import FEWEST_ON_MAP, Scans
 from .searching import search
 
 LENGTH = 8
-"""Windows of a block that is looked for."""
+"""Windows of a block."""
 
 APART = 8.0
-"""Metres of progress from which on two places are of different times."""
+"""Metres of progress between two visits of a place."""
 
 REACH = 3.0
-"""Metres between a block and a place that its map may hold."""
+"""Largest distance between a block and the node of a place, metres, beside the uncertainty."""
 
 AROUND = 4.0
-"""Metres of travel before and after a place that its map is made of."""
+"""Metres of progress before and after a place within which windows make its map."""
 
-UNSURE = np.array([2.0, 2.0, 1.0])
-"""Times that places, and yaws, are farther off than the posterior has it."""
+SIGMA_FACTOR = np.array([2.0, 2.0, 1.0])
+"""Factors of σ of the posterior, for x, y and yaw."""
 
 SIGMAS = 2.5
 LARGEST = np.array([2.5, 2.5, math.radians(20.0)])
-"""How far a block is searched: σ, and metres and radians at most."""
+"""Half the size of the searched area: in σ, and its upper limit, metres and radians."""
 
 LEAST = np.array([0.2, 0.2, math.radians(3.0)])
+"""Its lower limit, metres and radians."""
 
 SHARED = 4
-"""Windows between places, so that blocks, and each time the robot comes by, share maps."""
+"""Windows between the nodes of places, so that blocks and visits share local maps."""
 
 MEASURED = 150
-"""Readings that measure the best pose of the search."""
+"""Readings that are evaluated to measure the best pose of the search."""
 
 GOOD = 0.65
-"""Part of the usual score of a reading that a loop must have."""
+"""Least score of a loop closure, as a fraction of the usual score of its readings."""
 
-OTHER = 0.45
-"""Metres from the best pose from where on another is another place."""
+LEAST_SEPARATION = 0.45
+"""Metres from the best pose beyond which a pose is an alternative to it."""
 
-TOLD = 8.0
-"""σ² by which another place must differ in what is measured at the best one: along a bare corridor none does."""
+LEAST_DISTANCE = 8.0
+"""Least squared Mahalanobis distance of an alternative, by the information of the best pose: without it, poses along a
+bare corridor would count as alternatives."""
 
-CLEAR = 12.0
-"""Nats by which the best pose must be better than any of another place."""
+LEAST_MARGIN = 12.0
+"""Nats by which the best pose must be better than any alternative."""
 
 CLIMBS = 3
-"""Parabolas that the best pose of the search is moved to the top of."""
+"""Times that the best pose is moved to the top of a parabola fitted around it."""
 
 CANDIDATES = 2
-"""Places that a block is looked for at, at the most."""
+"""Most places that a block is matched with."""
 
 
 @dataclass(frozen=True)
 class Loop:
-    """A block that was found at another time's place.
+    """A loop closure: a block that was matched with the map of another visit.
 
     Attributes
     ----------
     block, place : int
         Nodes in the middle of the block, and of the map.
-    found : Found
-        Matches of the block's windows.
+    matches : Matches
+        Of the windows of the block with the map.
     """
 
     block: int
     place: int
-    found: Found
+    matches: Matches
 
 
-Looked = dict[tuple[int, int], Loop | None]
-"""What came of looking for blocks at places, by the nodes in their middle: None where a block was not found."""
+SearchResults = dict[tuple[int, int], Loop | None]
+"""Results of searches by (block, place), the nodes in their middle; None if the block was not recognised there."""
 
 
 class Places:
-    """Local maps of places, made when they are asked for, from the nodes as they are."""
+    """Local maps around nodes, each made when it is first used."""
 
     def __init__(self, scans: Scans, nodes: Floats) -> None:
         self._scans, self._nodes = scans, nodes
@@ -109,7 +110,20 @@ class Places:
 def candidates(
     nodes: Floats, samples: Floats, progress: Floats, middle: int, known: Sequence[int] = ()
 ) -> list[tuple[int, Floats]]:
-    """Return places where a block may have been before or after, other than known ones, and σ of its pose there."""
+    """Return the places that a block may lie at, without known ones, and σ of its pose relative to them.
+
+    Parameters
+    ----------
+    nodes : float64, shape (K, 3)
+    samples : float64, shape (S, K, 3)
+        Deviations of the nodes.
+    progress : float64, shape (K,)
+        Metres.
+    middle : int
+        Node in the middle of the block.
+    known : sequence of int
+        Places where it was recognised already.
+    """
     places = np.arange(0, len(nodes), SHARED)
     there = nodes[places] + samples[:, places]
     drawn = relative(there, (nodes[middle] + samples[:, middle])[:, None])
@@ -128,14 +142,30 @@ def candidates(
         if len(taken) >= CANDIDATES:
             break
         if all(abs(progress[node] - progress[other]) > AROUND for other in taken):
-            out.append((node, UNSURE * sigma[k]))
+            out.append((node, SIGMA_FACTOR * sigma[k]))
     return out
 
 
 def find_loop(
     scans: Scans, block: NDArray[np.int64], nodes: Floats, place: int, sigma: Floats, around: LocalMap, usual: float
 ) -> Loop | None:
-    """Return the loop of a block with a place, or None."""
+    """Return the loop closure of a block with a place; None if it is not recognised there.
+
+    Parameters
+    ----------
+    scans : Scans
+    block : int64
+        Windows.
+    nodes : float64, shape (K, 3)
+    place : int
+        Node of the place.
+    sigma : float64, shape (3,)
+        σ of the pose of the block relative to the place: metres, metres, radians.
+    around : LocalMap
+        Of the place.
+    usual : float
+        Usual log-likelihood ratio of a reading, nats.
+    """
     middle = block[len(block) // 2]
     shape = relative(nodes[middle], nodes[block])
     joint = scans.joint(block, shape)
@@ -149,13 +179,13 @@ def find_loop(
     count = len(joint.readings)
     if final.score < GOOD * usual * count:
         return None
-    # directions that are not measured may not decide
+    # poses that differ only in directions that are not measured are no alternatives
     apart, axes = relative(best, found.poses), axes_at(best[2])
     curved = np.einsum('pi,ij,pj->p', apart, axes.T @ final.information @ axes, apart)
-    elsewhere = (np.hypot(apart[:, 0], apart[:, 1]) > OTHER) & (curved > TOLD)
-    if elsewhere.any() and final.score - found.values[elsewhere].max() < CLEAR:
+    elsewhere = (np.hypot(apart[:, 0], apart[:, 1]) > LEAST_SEPARATION) & (curved > LEAST_DISTANCE)
+    if elsewhere.any() and final.score - found.values[elsewhere].max() < LEAST_MARGIN:
         return None
-    matches = Found()
+    matches = Matches()
     for j, local in zip(block, shape, strict=True):
         if scans.count[j] >= FEWEST:
             matches.add(place, int(j), measure(scans.scan[j], around, compose(best, local)), int(scans.count[j]))
@@ -163,9 +193,9 @@ def find_loop(
 
 
 def find_loops(
-    scans: Scans, nodes: Floats, samples: Floats, usual: float, watch: Progress, known: Looked | None = None
-) -> Looked:
-    """Return what came of looking for each block of a drive where it may have been.
+    scans: Scans, nodes: Floats, samples: Floats, usual: float, watch: Progress, known: SearchResults | None = None
+) -> SearchResults:
+    """Return the results of searching each block of a drive at the places that it may lie at.
 
     Parameters
     ----------
@@ -174,13 +204,14 @@ def find_loops(
     samples : float64, shape (S, K, 3)
         Deviations of the nodes.
     usual : float
-        The usual score of a reading, nats.
+        Usual log-likelihood ratio of a reading, nats.
     watch : callable
+        Receives the fraction of the work that is done.
     known : dict, optional
-        What is known already, and not looked for again.
+        Results that are taken over without a search.
     """
     known = known or {}
-    places, out, progress = Places(scans, nodes), Looked(), scans.windows.node_progress
+    places, out, progress = Places(scans, nodes), SearchResults(), scans.windows.node_progress
     for k in range(0, len(nodes) - LENGTH // 2, LENGTH):
         watch(k / len(nodes))
         block = np.arange(k, min(k + LENGTH, len(nodes)))
@@ -197,6 +228,6 @@ def find_loops(
     return out
 
 
-def loops_of(looked: Looked) -> list[Loop]:
-    """Return the loops that were found."""
-    return [loop for loop in looked.values() if loop is not None]
+def loops_of(results: SearchResults) -> list[Loop]:
+    """Return the loop closures among results."""
+    return [loop for loop in results.values() if loop is not None]

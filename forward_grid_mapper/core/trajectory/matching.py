@@ -1,11 +1,11 @@
-"""Matching: where a scan fits in a local map, and how certain that is.
+"""Scan matching on a local map: the pose of a scan, and its information matrix.
 
-Near a pose the log-likelihood ratio is taken as a parabola through 27 poses around it:
+A parabola is fitted to the log-likelihood ratio at 27 poses around a pose:
 
     Σ log ratio(x + s q) ≈ a + gᵀ q − ½ qᵀ H q
 
-whose top is the measured pose, with the information H. Directions in which the parabola is not curved, as along a bare
-corridor, are not measured.
+Its top is the measured pose, and H, in units of the steps s, the information. Directions in which the parabola has no
+curvature, as along a bare corridor, are not measured.
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ from .local_map import LocalMap
 from .poses import Floats, compose
 
 CURVED = np.array([0.06, 0.06, math.radians(1.5)])
-"""s: metres ahead and aside, and radians, between the poses of a parabola."""
+"""s: steps between the 27 poses; metres along x and y of the map, and radians."""
 
 LEAST_CURVATURE = 0.02
-"""Nats from which on a direction is measured: less is the chance of where cells happen to lie."""
+"""Least curvature of a direction that is measured, nats a step²: smaller ones come from the discrete cells."""
 
 FARTHEST_TOP = 2.0
-"""Steps that the top of a parabola may lie away."""
+"""Largest distance of the top of a parabola from the middle, steps; it is clipped to this."""
 
 ENOUGH = 32
-"""Readings that measure a pose: more of a short piece of the drive tell little more, and take time."""
+"""Readings that are evaluated to measure a pose: more of a short piece of the drive add little, and take time."""
 
 COARSE = (0.1, 0.1, math.radians(2.5))
 """Steps of a search: metres ahead and aside, radians."""
@@ -40,7 +40,7 @@ NEIGHBOURS = np.array(list(itertools.product((-1.0, 0.0, 1.0), repeat=3)))
 
 
 def _parabola() -> Floats:
-    """Return the matrix (10, 27) from values at `NEIGHBOURS` to 1, x, y, t, xx, yy, tt, xy, xt, yt."""
+    """Return the matrix (10, 27) that fits 1, x, y, t, x²/2, y²/2, t²/2, xy, xt, yt to values at `NEIGHBOURS`."""
     x, y, t = NEIGHBOURS.T
     columns = [np.ones(27), x, y, t, x * x / 2, y * y / 2, t * t / 2, x * y, x * t, y * t]
     out: Floats = np.linalg.pinv(np.stack(columns, axis=1))
@@ -51,16 +51,16 @@ _PARABOLA = _parabola()
 
 
 class Match(NamedTuple):
-    """Where a scan fits.
+    """The measured pose of a scan on a local map.
 
     Attributes
     ----------
     pose : float64, shape (3,)
         Of the scan in the frame of the map.
     information : float64, shape (3, 3)
-        Along the axes of the map; of rank 3 or less.
+        In the axes of the map; its rank is less than 3 if a direction is not measured.
     score : float
-        Σ log ratio at the pose that was asked for, in nats.
+        Sum of the log-likelihood ratios of the readings at the given pose, not at the measured one; nats.
     """
 
     pose: Floats
@@ -69,7 +69,7 @@ class Match(NamedTuple):
 
 
 def measure(scan: Scan, around: LocalMap, pose: Floats, most: int = ENOUGH) -> Match:
-    """Return where a scan fits near a pose; of more readings than `most`, some are asked, evenly."""
+    """Return the measured pose of a scan near a pose; if it has more than `most` readings, every n-th is evaluated."""
     stride = max(math.ceil(len(scan.readings) / most), 1)
     values = scores(scan, around, pose + NEIGHBOURS * CURVED, stride)
     fit = _PARABOLA @ values
@@ -78,13 +78,13 @@ def measure(scan: Scan, around: LocalMap, pose: Floats, most: int = ENOUGH) -> M
     kept = curvature > LEAST_CURVATURE
     curvature, axes = curvature[kept], axes[:, kept]
     top = np.clip(axes @ (axes.T @ fit[1:4] / curvature), -FARTHEST_TOP, FARTHEST_TOP)
-    # those asked tell no more than they are, though they stand for all in the score
+    # scores are scaled up to all readings, but only those evaluated give information
     information: Floats = (axes * curvature) @ axes.T / np.outer(CURVED, CURVED) / stride
     return Match(pose + top * CURVED, information, float(values[13]))
 
 
 def grid_around(center: Floats, reach: Floats, steps: tuple[float, float, float] = COARSE) -> Floats:
-    """Return poses on a grid in the frame of `center`, up to `reach` either way, shape (P, 3)."""
+    """Return the poses of a grid along the axes of `center`, within ± `reach` of it, shape (P, 3)."""
     axes = []
     for far, step in zip(reach, steps, strict=True):
         n = math.floor(far / step + 1e-9)

@@ -1,7 +1,7 @@
-"""What odometry measures, and how well: its calibration, and its noise.
+"""The model of odometry: its calibration (systematic errors) and its noise.
 
-Of a small motion, `ahead` and `aside` in the robot's frame and `turn`, odometry measures what the calibration c makes
-right:
+A small motion has the components `ahead` and `aside` in the frame of the robot, and `turn`. The calibration c corrects
+what odometry measured:
 
     ahead + i·aside  =  (1 + scale) e^{i·heading} (ahead + i·aside)_measured
     turn             =  (1 + turn_scale) turn_measured + bias · ahead_measured
@@ -18,15 +18,15 @@ from .poses import Floats, relative, wrapped
 from .windows import Odometry, Windows
 
 CALIBRATION = ('scale', 'heading', 'bias', 'turn_scale')
-"""The calibration: parts, radians, radians a metre, parts."""
+"""The calibration: fraction, radians, radians a metre, fraction."""
 
 CALIBRATION_SIGMA = np.array([0.03, math.radians(1.5), math.radians(1.5), 0.03])
-"""A priori."""
+"""σ of the prior of the calibration."""
 
 
 @dataclass(frozen=True)
 class Noise:
-    """Noise of odometry.
+    """σ of the random errors of odometry, which grow with the square root of the distance.
 
     Attributes
     ----------
@@ -34,10 +34,10 @@ class Noise:
         Radians a √metre.
     yaw_of_turn : float
         Radians a √radian.
-    along : float
-        Metres a √metre.
+    along, across : float
+        In the direction of driving, and at right angles to it: metres a √metre.
     least : tuple of float
-        Metres and radians that a window has at least.
+        Smallest σ of a window: metres and radians.
     """
 
     yaw: float = math.radians(3.0)
@@ -48,11 +48,11 @@ class Noise:
 
 
 def calibrated(odometry: Odometry, calibration: Floats) -> Odometry:
-    """Return the odometry with a calibration applied, from the same first pose on."""
+    """Return the odometry with a calibration applied; its first pose stays."""
     scale, heading, bias, turn_scale = calibration
     pose = odometry.pose
     turns = np.diff(pose[:, 2])
-    # motions are arcs: they go along the chord, whose direction is that of the middle
+    # each motion is taken for an arc; its chord has the yaw of the middle
     middle = pose[:-1, 2] + turns / 2
     steps = np.diff(pose[:, :2], axis=0)
     c, s = np.cos(middle), np.sin(middle)
@@ -69,13 +69,13 @@ def calibrated(odometry: Odometry, calibration: Floats) -> Odometry:
 
 
 def with_yaw(odometry: Odometry, progress: Floats, correction: Floats) -> Odometry:
-    """Return the odometry with its yaw corrected, linearly between places, and its motions turned along.
+    """Return the odometry with corrected yaw; its motions are rotated by the same correction.
 
     Parameters
     ----------
     odometry : Odometry
     progress, correction : float64, shape (B,)
-        Where, in metres of progress, and by how much, radians.
+        Corrections of the yaw, radians, at these places, metres of progress; interpolated linearly between them.
     """
     pose = odometry.pose
     more = np.interp(odometry.progress, progress, correction)
@@ -93,7 +93,7 @@ def motions(odometry: Odometry, windows: Windows) -> Floats:
 
 
 def sensitivity(odometry: Odometry, windows: Windows) -> Floats:
-    """Return how these motions change with the calibration, shape (K − 1, 3, 4)."""
+    """Return the derivatives of `motions` with respect to the calibration, shape (K − 1, 3, 4)."""
     before = motions(odometry, windows)
     out = np.empty((*before.shape, len(CALIBRATION)))
     for k in range(len(CALIBRATION)):
@@ -111,7 +111,7 @@ def covariances(windows: Windows, noise: Noise) -> Floats:
     yaw = noise.yaw**2 * length + noise.yaw_of_turn**2 * turn + noise.least[1] ** 2
     out = np.zeros((len(length), 3, 3))
     out[:, 0, 0] = noise.along**2 * length + noise.least[0] ** 2
-    # a yaw error grows on the way, and so does what it makes aside
+    # the yaw error is a random walk, and the error across is its integral
     out[:, 1, 1] = noise.across**2 * length + noise.least[0] ** 2 + yaw * length**2 / 3
     out[:, 1, 2] = out[:, 2, 1] = yaw * length / 2
     out[:, 2, 2] = yaw

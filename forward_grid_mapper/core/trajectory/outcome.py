@@ -1,4 +1,4 @@
-"""What became of a drive that was to be refined: its trajectory and readings, and why, of a whole drive or of parts."""
+"""The result of refining a drive, as a whole or in parts: its trajectory, its readings, and the reason."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..common.readings import Readings
-from .jumps import UNKNOWN, Begin, Part, words
+from .jumps import UNKNOWN, Begin, Part, jump_words
 from .local_map import at_poses
 from .poses import compose, relative
 from .registration import moved_to
@@ -18,37 +18,36 @@ from .windows import Odometry
 
 @dataclass(frozen=True)
 class Refinement:
-    """What became of a drive.
+    """The result of refining a drive.
 
     Attributes
     ----------
     accepted : bool
-        Whether the trajectory is another one than odometry's.
+        Whether a refined trajectory was accepted; otherwise `trajectory` is the odometry.
     reason : str
-        Why not, or what it is better by, in words.
+        Why it was not, or how much better it is, in words.
     readings : Readings
-        Placed by the trajectory; those that were given if it is odometry's.
+        Placed by the trajectory; unchanged if this is the odometry.
     trajectory : Odometry
         The pose of the robot at each stamp of the odometry.
     calibration : dict
-        `scale`, `heading`, `bias` and `turn_scale` of `odometry_model`; empty if nothing was found.
+        `scale`, `heading`, `bias` and `turn_scale` of `odometry_model`; empty if none was estimated.
     moved, turned : float
-        Root mean square of how far positions, metres, and yaws, radians, were off, after the best alignment.
+        Errors of the odometry, rms after rigid alignment with the trajectory: metres and radians.
     loops : int
-        Places that were recognised.
+        Number of loop closures.
     gain : float
-        Nats by which a reading is predicted better.
+        How much better readings are predicted than with odometry, nats a reading.
     lost : bool
-        Whether odometry is off by so much that its heading could not be followed: then it stays, but nothing should be
-        fitted to it.
+        Whether the heading was lost: then odometry is kept, but the drive must not take part in registration.
     jumps : str
-        What became of jumps of odometry, in words; empty where there are none.
+        What was done about jumps of odometry, in words; empty without jumps.
     unplaced : bool
-        Whether it is not known where the robot was after one of them.
+        Whether the pose of the robot after one of the jumps is unknown.
     stretch : tuple of int, optional
-        First and last stamp of what `calibration` and `noise` are of; None for the whole drive.
+        First and last stamp of the part that `calibration` and `noise` were estimated from; None for the whole drive.
     noise : float
-        By how much the yaw of odometry strays, radians a √metre, as walls say; 0 if they say nothing.
+        σ of the yaw error of odometry, radians a √metre, as estimated from walls; 0 if unknown.
     right_angles : bool
         Whether walls are taken to stand at right angles to each other.
     """
@@ -77,12 +76,12 @@ def joined_parts(
     outcomes: Sequence[Refinement],
     begins: Sequence[Begin],
 ) -> Refinement:
-    """Return what became of a drive whose parts were refined each by itself, and begin where `begins` says."""
-    said, unplaced = words(begins, parts), any(begin.how == UNKNOWN for begin in begins[1:])
+    """Return the result for a drive from those of its parts, each moved so that it begins at the pose in `begins`."""
+    jump_text, unplaced = jump_words(begins, parts), any(begin.how == UNKNOWN for begin in begins[1:])
     taken = [k for k, outcome in enumerate(outcomes) if outcome.accepted]
     best = max(taken, key=lambda k: float(parts[k].odometry.travel[-1]), default=0)
     of, span = outcomes[best], parts[best].odometry.stamp
-    reason = said
+    reason = jump_text
     if taken:
         reason += f'; in the longest part that was refined, {parts[best].odometry.travel[-1]:.0f} m, {of.reason}'
     same = all(
@@ -90,7 +89,7 @@ def joined_parts(
     )
     if not taken and same:
         lost = any(outcome.lost for outcome in outcomes)
-        return Refinement(False, reason, readings, odometry, {}, lost=lost, jumps=said, unplaced=unplaced)
+        return Refinement(False, reason, readings, odometry, {}, lost=lost, jumps=jump_text, unplaced=unplaced)
     pose = np.concatenate([moved_to(begin.pose, part.path.pose) for begin, part in zip(begins, parts, strict=True)])
     pose[:, 2] = np.unwrap(pose[:, 2])
     trajectory = Odometry(odometry.stamp, pose)
@@ -107,7 +106,7 @@ def joined_parts(
         loops,
         of.gain,
         noise=of.noise,
-        jumps=said,
+        jumps=jump_text,
         unplaced=unplaced,
         stretch=(int(span[0]), int(span[-1])),
         right_angles=all(outcome.right_angles for outcome in outcomes),
@@ -115,7 +114,7 @@ def joined_parts(
 
 
 def with_outliers(found: Refinement, readings: Readings, odometry: Odometry, count: int) -> Refinement:
-    """Return what became of a drive from what became of it without so many poses of its odometry."""
+    """Return the result for a drive from the one for its odometry without outliers; `count` is their number."""
     named = f'{count} poses that odometry jumps to and back are outliers' if count > 1 else 'one pose is an outlier'
     reason = f'{found.reason}; {named}'
     if not found.accepted:
@@ -132,7 +131,7 @@ def replaced(readings: Readings, odometry: Odometry, trajectory: Odometry) -> Re
 
 
 def differences(odometry: Odometry, trajectory: Odometry) -> tuple[float, float]:
-    """Return the rms distance, metres, and the rms turn, radians, between two trajectories after the best alignment."""
+    """Return the rms differences of positions, metres, and yaws, radians, of two trajectories after rigid alignment."""
     a = odometry.pose[:, :2] - odometry.pose[:, :2].mean(0)
     b = trajectory.pose[:, :2] - trajectory.pose[:, :2].mean(0)
     turn = math.atan2((a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum(), (a * b).sum())

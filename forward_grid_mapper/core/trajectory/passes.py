@@ -1,4 +1,4 @@
-"""The passes over a drive: each gives matches of windows with local maps, which the pose graph joins."""
+"""Passes over a drive: each matches all blocks with local maps; the matches are edges of the pose graph."""
 
 from __future__ import annotations
 
@@ -16,27 +16,28 @@ BLOCK = 4
 """Windows that are matched with one local map."""
 
 BEHIND, BACK = 5.0, 1.2
-"""Metres of progress before a block that its map is made of in the first pass, and at which the match is tied to it."""
+"""The first pass matches a block with a map of so many metres before it. The edge begins at the node so many metres
+before the block. Metres of progress."""
 
 AROUND = 4.0
-"""Metres of progress before and after a block that its map is made of in the second pass."""
+"""Metres of progress before and after a block whose readings make its map in the second pass."""
 
 FEWEST = 3
-"""Readings that a window must have to be matched, and windows that a map must have."""
+"""Fewest readings of a window that is matched, and fewest windows of a map."""
 
 Progress = Callable[[float], None]
-"""Receives how much of a pass is done, from 0 to 1."""
+"""Receives the fraction of the work that is done, from 0 to 1."""
 
 
-class Found:
-    """Matches as they are found.
+class Matches:
+    """Matches of windows with local maps.
 
     Attributes
     ----------
     score : float
-        Σ log ratio, nats.
+        Sum of the log-likelihood ratios of all matched readings, nats.
     readings : int
-        Of how many.
+        Their number.
     """
 
     def __init__(self) -> None:
@@ -48,14 +49,14 @@ class Found:
         return len(self._rows)
 
     def add(self, place: int, window: int, match: Match, count: int) -> None:
-        """Add a match of a window of `count` readings with the map of a place, given in the frame of its node."""
+        """Add a match of a window of `count` readings with a local map in the frame of the node `place`."""
         self._rows.append((place, window, match.pose, match.information))
         self.score += match.score
         self.readings += count
 
     @property
-    def usual(self) -> float:
-        """The mean log ratio of a reading, nats."""
+    def mean_score(self) -> float:
+        """The mean log-likelihood ratio of a reading, nats."""
         return self.score / max(self.readings, 1)
 
     def edges(self) -> Edges:
@@ -66,16 +67,16 @@ class Found:
         return Edges(np.array(place), np.array(window), np.array(pose), np.array(information))
 
 
-def bent(progress: Floats, before: Floats, after: Floats, at: NDArray[np.int64]) -> Floats:
-    """Return by how much the nodes around some have moved relative to each other, shape (len(at),), metres.
+def deformation(progress: Floats, before: Floats, after: Floats, at: NDArray[np.int64]) -> Floats:
+    """Return how much the trajectory around each of some nodes has changed its shape, shape (len(at),), metres.
 
-    It is the root mean square after the best alignment of the nodes that a map of both sides is made of: a map that
-    was only carried along as a whole is the same again.
+    It is the rms distance after rigid alignment of the nodes within `AROUND`: a local map that moved as a whole stays
+    the same.
 
     Parameters
     ----------
     progress : float64, shape (K,)
-        Metres, of all nodes.
+        Of all nodes, metres.
     before, after : float64, shape (K, 3)
     at : int64
         Nodes.
@@ -84,13 +85,13 @@ def bent(progress: Floats, before: Floats, after: Floats, at: NDArray[np.int64])
     return np.array([rms_after_alignment(before[each], after[each]) for each in near])
 
 
-def ahead(scans: Scans, nodes: Floats, watch: Progress) -> Found:
-    """Match each block with the map of what was driven just before it, where the nodes are now.
+def match_preceding(scans: Scans, nodes: Floats, watch: Progress) -> Matches:
+    """Return the matches of each block with the map of the `BEHIND` metres before it, at the present nodes.
 
-    What it has in common with that map lies about `BACK` behind it, so there the match is tied to. It tells the scale
-    of odometry, which a map of both sides does not: it is stretched as the drive is.
+    The block and that map overlap about `BACK` behind the block, so the edges begin at the node there. These matches
+    give the scale of odometry. Those with a map of both sides do not: such a map is stretched as the trajectory is.
     """
-    w, found = scans.windows, Found()
+    w, found = scans.windows, Matches()
     for k in range(0, len(nodes), BLOCK):
         watch(k / len(nodes))
         block = np.arange(k, min(k + BLOCK, len(nodes)))
@@ -102,9 +103,9 @@ def ahead(scans: Scans, nodes: Floats, watch: Progress) -> Found:
     return found
 
 
-def again(scans: Scans, nodes: Floats, watch: Progress) -> Found:
-    """Match each block with the map of what was driven before and after it, where the nodes are now."""
-    w, found = scans.windows, Found()
+def match_surrounding(scans: Scans, nodes: Floats, watch: Progress) -> Matches:
+    """Return the matches of each block with the map of `AROUND` metres before and after it, at the present nodes."""
+    w, found = scans.windows, Matches()
     for k in range(0, len(nodes), BLOCK):
         watch(k / len(nodes))
         block = np.arange(k, min(k + BLOCK, len(nodes)))
@@ -118,9 +119,9 @@ def again(scans: Scans, nodes: Floats, watch: Progress) -> Found:
 
 
 def _match(
-    scans: Scans, nodes: Floats, block: NDArray[np.int64], members: NDArray[np.int64], place: int, found: Found
+    scans: Scans, nodes: Floats, block: NDArray[np.int64], members: NDArray[np.int64], place: int, found: Matches
 ) -> None:
-    """Match the windows of a block with the map of others, in the frame of a node."""
+    """Add the matches of a block's windows with the map of the windows `members`, in the frame of the node `place`."""
     around = scans.map(members, nodes[place], nodes)
     if around is None:
         return

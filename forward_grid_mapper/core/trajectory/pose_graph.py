@@ -1,15 +1,16 @@
-"""The pose graph: the nodes that agree best with odometry and with all matches, and the calibration of the odometry.
+"""The pose graph: nodes and calibration of the odometry that fit all measurements best, by nonlinear least squares.
 
-Unknown are the poses x_k of the nodes and the calibration c of the odometry. With d_ij the pose of node j in the frame
-of node i, the sum of
+Unknowns are the poses x_k of the nodes, the calibration c of the odometry, and of each wall its offset w and its angle
+a to the axis. With d_ij the pose of node j in the frame of node i, the solution minimises
 
-    ρ(‖d_ij − z_ij‖²_Ω) over matches   and   ρ(‖d_k,k+1 − (o_k + C_k c)‖²_Ω) over odometry   and   ‖c‖²_Ω
+    Σ ρ(‖d_ij − z_ij‖²_Ω)                          matches and loop closures z_ij
+    + Σ ρ(‖d_k,k+1 − (o_k + C_k c)‖²_Ω) + ‖c‖²_Ω   odometry o_k, its calibration and the prior of this
+    + Σ τ((θ_k − y_k)² Ω)                          measured yaws y_k
+    + Σ τ((n · x_k + z_k − w − a t_k)² Ω)          measured distances z_k to walls of normal n; t_k along the wall
 
-and, where walls are measured, of τ((θ_k − y_k)² Ω) over yaws and τ((n · x_k + z_k − w − a t_k)² Ω) over distances, is
-minimised by Gauss-Newton steps. The offset w of each wall and the angle a at which it stands askew, half a degree or
-so, are unknown as well; t_k is how far along the wall node k is. ρ(s) = k² log(1 + s / k²) is the loss of Cauchy;
-τ(s) = s / (1 + s / k²), that of Geman and McClure, lets go of what is far off, as the direction of a wall is that
-stands askew. Both work by weights that follow the residuals. The normal equations are sparse, and solved as such.
+where ρ(s) = k² log(1 + s / k²) is Cauchy's loss and τ(s) = s / (1 + s / k²) that of Geman and McClure, under which
+outliers, such as the direction of a wall at another angle, have almost no influence. Solved by Gauss-Newton with
+iteratively reweighted residuals and damping; the normal equations are sparse.
 """
 
 from __future__ import annotations
@@ -26,25 +27,25 @@ from .bordered import Bordered
 from .poses import Floats, relative, wrapped
 
 ROBUST = 4.0
-"""σ from which on a match counts less and less: k of Cauchy's loss for matches."""
+"""k of Cauchy's loss for matches, σ: larger residuals count less and less."""
 
 ROBUST_ODOMETRY = 3.0
-"""The same for odometry: wheels slip more often than a normal distribution has it."""
+"""k of Cauchy's loss for odometry, σ: slip of wheels has heavier tails than a normal distribution."""
 
 ROBUST_YAW = 3.0
-"""σ from which on a measured yaw, or the distance of a wall, is let go."""
+"""k of Geman and McClure's loss for measured yaws and distances of walls, σ."""
 
 ASKEW = math.radians(0.5)
-"""σ of the angle between a wall and the axis that it follows."""
+"""σ of the angle between a wall and its axis, radians."""
 
 ITERATIONS = 30
 
 LEAST_STEP = 1e-4
-"""Metres and radians below which a step ends the iterations."""
+"""The iterations end if no node moves by more than this, metres and radians."""
 
 
 class Edges(NamedTuple):
-    """Relative poses that were measured: E of them.
+    """E measured relative poses.
 
     Attributes
     ----------
@@ -62,7 +63,7 @@ class Edges(NamedTuple):
 
 
 class Yaws(NamedTuple):
-    """Yaws that were measured, with an unknown few wrong ones among them: Y of them.
+    """Y measured yaws; a few of them may be outliers.
 
     Attributes
     ----------
@@ -72,7 +73,7 @@ class Yaws(NamedTuple):
     information : float64, shape (Y,)
         In 1/rad².
     part : float
-        What the loss of each counts: less than 1 where they measure the same.
+        Factor of the loss of each; less than 1 if their errors are correlated.
     """
 
     node: NDArray[np.int64]
@@ -82,22 +83,22 @@ class Yaws(NamedTuple):
 
 
 class Walls(NamedTuple):
-    """Distances of nodes from straight walls along the axes of the map: D of them, of W walls.
+    """D measured distances of nodes from W straight walls, which are nearly parallel to axes.
 
     Attributes
     ----------
     node, wall : int64, shape (D,)
-        Walls are numbered from 0 on.
+        Index of the node; number of the wall, from 0.
     normal : float64, shape (D, 2)
-        Unit vectors along an axis, from the node to the wall.
+        Unit vector along an axis, from the node to the wall.
     distance : float64, shape (D,)
-        Of the wall from the node, metres.
+        From the node to the wall, metres.
     lever : float64, shape (D,)
-        By how much the distance grows with the yaw of the node: metres a radian.
+        Derivative of the offset of the wall with respect to the yaw of the node, metres a radian.
     yaw : float64, shape (D,)
-        Yaw of the node that `distance` is for.
+        Yaw of the node at which `distance` was measured.
     along : float64, shape (D,)
-        Metres along the wall.
+        Position of the node along the wall, metres.
     information : float64, shape (D,)
         In 1/m².
     """
@@ -117,7 +118,7 @@ class Walls(NamedTuple):
         return int(self.wall.max(initial=-1)) + 1
 
     def places(self, nodes: Floats) -> Floats:
-        """Return where each distance puts its wall along the normal, shape (D,), metres."""
+        """Return the offset of its wall along the normal by each distance, shape (D,), metres."""
         at = nodes[self.node]
         off = wrapped(at[:, 2] - self.yaw)
         out: Floats = (self.normal * at[:, :2]).sum(1) + self.distance + self.lever * off
@@ -125,18 +126,18 @@ class Walls(NamedTuple):
 
 
 def no_walls() -> Walls:
-    """Return distances of walls, of which there are none."""
+    """Return an empty set of distances."""
     none, zero = np.zeros(0, np.int64), np.zeros(0)
     return Walls(none, none, np.zeros((0, 2)), zero, zero, zero, zero, zero)
 
 
 def no_yaws() -> Yaws:
-    """Return measured yaws, of which there are none."""
+    """Return an empty set of yaws."""
     return Yaws(np.zeros(0, np.int64), np.zeros(0), np.zeros(0))
 
 
 def no_edges() -> Edges:
-    """Return edges, of which there are none."""
+    """Return an empty set of edges."""
     none = np.zeros(0, np.int64)
     return Edges(none, none, np.zeros((0, 3)), np.zeros((0, 3, 3)))
 
@@ -148,16 +149,16 @@ def joined(*parts: Edges) -> Edges:
 
 @dataclass(frozen=True)
 class Graph:
-    """What is measured. The first node keeps its place, and without `yaws` its yaw as well.
+    """All measurements. The first node is fixed; with `yaws`, its yaw is not.
 
     Attributes
     ----------
     odometry : Edges
-        From each node to the next one, shape K − 1, without calibration.
+        From each node to the next one, K − 1 edges, without calibration.
     sensitivity : float64, shape (K − 1, 3, C)
-        How the pose of each odometry edge changes with the calibration.
+        Derivative of the pose of each odometry edge with respect to the calibration.
     calibration_sigma : float64, shape (C,)
-        A priori.
+        σ of the prior.
     matches : Edges
     yaws : Yaws
     walls : Walls
@@ -173,18 +174,18 @@ class Graph:
 
 @dataclass(frozen=True)
 class Solution:
-    """The poses and the calibration that agree best with a graph.
+    """The solution of a graph.
 
     Attributes
     ----------
     nodes : float64, shape (K, 3)
-        The first one as it was given.
     calibration : float64, shape (C,)
     squared : float64, shape (E,)
-        Squared residual of each match, in σ².
+        Squared residual of each match, σ².
     odometry_squared : float64, shape (K − 1,)
+        The same of odometry.
     samples : float64, shape (S, K, 3)
-        Deviations drawn from the posterior.
+        Deviations of the nodes from the solution, drawn from the posterior.
     """
 
     nodes: Floats
@@ -195,7 +196,7 @@ class Solution:
 
 
 def solution_at(nodes: Floats, calibration: int) -> Solution:
-    """Return nodes as a solution without residuals, with a calibration of so many figures that are 0."""
+    """Return nodes as a solution without residuals and samples; the calibration has so many values, all 0."""
     return Solution(nodes, np.zeros(calibration), np.zeros(0), np.zeros(0), np.zeros((0, *nodes.shape)))
 
 
@@ -208,7 +209,7 @@ def residuals(nodes: Floats, edges: Edges) -> Floats:
 
 
 def jacobians(nodes: Floats, edges: Edges) -> tuple[Floats, Floats]:
-    """Return how the residuals change with the poses of the first and of the second node, both (E, 3, 3)."""
+    """Return the Jacobians of the residuals with respect to the first and the second node, both (E, 3, 3)."""
     d = relative(nodes[edges.first], nodes[edges.second])
     yaw = nodes[edges.first, 2]
     c, s = np.cos(yaw), np.sin(yaw)
@@ -220,7 +221,7 @@ def jacobians(nodes: Floats, edges: Edges) -> tuple[Floats, Floats]:
 
 
 def weights(squared: Floats, robust: Floats) -> Floats:
-    """Return the weights of Cauchy's loss for squared residuals in σ²."""
+    """Return the weights of Cauchy's loss for squared residuals, σ²; `robust` is its k."""
     out: Floats = 1.0 / (1.0 + squared / robust**2)
     return out
 
@@ -290,7 +291,7 @@ class _Normal:
         self._add_prior()
 
     def _yaws(self) -> tuple[Any, Floats, Floats]:
-        """Return how the residuals of measured yaws change with the unknowns, the residuals, and their information."""
+        """Return the Jacobian of the residuals of measured yaws, the residuals, and their information."""
         yaws = self.graph.yaws
         j = sparse.csr_matrix(
             (np.ones(len(yaws.node)), (np.arange(len(yaws.node)), 3 * yaws.node + 2)), (len(yaws.node), self.size)
@@ -310,7 +311,7 @@ class _Normal:
         return j, off, walls.information
 
     def _add(self, j: Any, off: Floats, information: Floats, part: float = 1.0) -> tuple[Any, Floats]:
-        """Add a part of the loss of Geman and McClure of what is measured; return what it has to do with a draw."""
+        """Add measurements with Geman and McClure's loss, times `part`; return what `draw` needs of them."""
         far = 1.0 + off**2 * information / ROBUST_YAW**2
         self.cost += part * float((off**2 * information / far).sum())
         pull = part * information / far**2
@@ -341,7 +342,7 @@ class _Normal:
         return Bordered((self.h + more).tocsc(), slice(first, first + len(self.state.calibration)))
 
     def draw(self, count: int, rng: np.random.Generator) -> Floats:
-        """Return deviations of all unknowns, shape (3 K + C + 2 W, count)."""
+        """Return deviations of all unknowns, drawn from the posterior, shape (3 K + C + 2 W, count)."""
         if not count:
             return np.zeros((self.size, 0))
         roots = np.linalg.cholesky(self.information + 1e-9 * np.eye(3))
@@ -354,7 +355,7 @@ class _Normal:
 
 
 def _where_walls_are(walls: Walls, nodes: Floats) -> Floats:
-    """Return the offset of each wall, the median of what its distances say, and no angle, shape (W, 2)."""
+    """Return offset and angle of each wall, shape (W, 2): the median by its distances, and 0."""
     at = walls.places(nodes)
     order = np.lexsort((at, walls.wall))
     first = np.searchsorted(walls.wall[order], np.arange(walls.total + 1))
@@ -364,15 +365,17 @@ def _where_walls_are(walls: Walls, nodes: Floats) -> Floats:
 
 
 def solve(graph: Graph, nodes: Floats, calibration: Floats, samples: int = 0, seed: int = 0) -> Solution:
-    """Return the solution of a graph near a guess.
+    """Return the solution of a graph.
 
     Parameters
     ----------
     graph : Graph
     nodes : float64, shape (K, 3)
+        Initial guess.
     calibration : float64, shape (C,)
+        Initial guess.
     samples : int
-        How many deviations to draw from the posterior.
+        Number of deviations that are drawn from the posterior.
     """
     normal, damping = _Normal(graph, _State(nodes, calibration, _where_walls_are(graph.walls, nodes))), 0.0
     for _ in range(ITERATIONS):

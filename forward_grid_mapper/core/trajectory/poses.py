@@ -17,7 +17,7 @@ def wrapped(angle: Any) -> Any:
 
 
 def compose(frame: Floats, pose: Floats) -> Floats:
-    """Return `pose`, given in `frame`, in the frame that `frame` is given in; shapes broadcast."""
+    """Return frame ⊕ pose: `pose`, which is given in `frame`, in the parent frame of `frame`; shapes broadcast."""
     c, s = np.cos(frame[..., 2]), np.sin(frame[..., 2])
     x = frame[..., 0] + c * pose[..., 0] - s * pose[..., 1]
     y = frame[..., 1] + s * pose[..., 0] + c * pose[..., 1]
@@ -25,7 +25,7 @@ def compose(frame: Floats, pose: Floats) -> Floats:
 
 
 def relative(frame: Floats, pose: Floats) -> Floats:
-    """Return `pose` in `frame`, both given in a third one; the yaw is in [−π, π)."""
+    """Return `pose` in the frame `frame`; both are given in the same parent frame. The yaw is in [−π, π)."""
     c, s = np.cos(frame[..., 2]), np.sin(frame[..., 2])
     dx, dy = pose[..., 0] - frame[..., 0], pose[..., 1] - frame[..., 1]
     return np.stack(
@@ -40,19 +40,19 @@ def axes_at(yaw: float) -> Floats:
 
 
 def inverse(pose: Floats) -> Floats:
-    """Return the pose of the frame that `pose` is given in, in the frame of `pose`."""
+    """Return the inverse: the pose of the parent frame in the frame `pose`."""
     return relative(pose, np.zeros(3))
 
 
 def interpolated(at: NDArray[Any], knots: NDArray[Any], poses: Floats) -> Floats:
-    """Return poses at increasing `knots`, linear between them; `poses` must have a continuous yaw."""
+    """Return poses interpolated linearly between those at `knots`, which increase; their yaw must be unwrapped."""
     return np.stack([np.interp(at, knots, column) for column in poses.T], axis=-1)
 
 
 def rms_after_alignment(estimate: Floats, truth: Floats) -> float:
-    """Return the rms distance of the points `estimate` from `truth`, both (N, ≥ 2), after the best rigid motion.
+    """Return the absolute trajectory error (ATE): the rms distance of `estimate` from `truth` after rigid alignment.
 
-    It is the absolute trajectory error (ATE).
+    Both have the shape (N, ≥ 2).
     """
     a, b = estimate[:, :2] - estimate[:, :2].mean(0), truth[:, :2] - truth[:, :2].mean(0)
     turn = np.arctan2((a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum(), (a * b).sum())

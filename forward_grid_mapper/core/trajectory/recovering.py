@@ -1,4 +1,4 @@
-"""Odometry of a time whose messages are gone, from the readings that it placed: after a restart from a journal."""
+"""Odometry recovered from readings that were placed by it; after a restart from a journal, its messages are lost."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from .windows import Odometry
 
 
 def recovered(odometry: Odometry, readings: Readings, mounts: Mapping[str, Sequence[float]]) -> Odometry:
-    """Return odometry from the first reading on, where it begins later.
+    """Return the odometry, extended back to the first reading of a sensor that is fixed to the robot.
 
-    A reading of a sensor that is fixed to the robot says where odometry had the robot:
+    Such a reading has the pose of the robot by odometry:
 
         robot = sensor · mount⁻¹
 
@@ -22,14 +22,14 @@ def recovered(odometry: Odometry, readings: Readings, mounts: Mapping[str, Seque
     ----------
     odometry : Odometry
     readings : Readings
-        Placed by odometry, in its frame.
+        Placed by odometry, in the odometry frame.
     mounts : mapping of str to (x, y, yaw)
-        Poses of fixed sensors on the robot, by frame; readings of others are of no use.
+        Poses of fixed sensors on the robot, by frame; readings of other sensors are not used.
 
     Returns
     -------
     Odometry
-        `odometry` itself where no earlier reading tells anything.
+        `odometry` itself if there is no earlier reading of a fixed sensor.
     """
     poses = [mounts.get(name.lstrip('/'), mounts.get(name)) for name in readings.sensor_names]
     known = np.array([pose is not None for pose in poses], np.bool_)

@@ -1,12 +1,12 @@
-"""From readings and drifting odometry to the trajectory that explains both: the steps, one after the other.
+"""SLAM of a whole drive: from readings and drifting odometry to a refined trajectory, in these steps.
 
-windows         the drive in pieces of 0.4 m, each a node of the pose graph
-heading         yaw from walls at right angles, followed over the whole drive
-straight walls  distances of walls along the drive, which hold it straight and tell scale and heading of the wheels
-matching        each block matched with what was driven before it, and then with what lies around it
-places          blocks matched with what was mapped there at another time
-scan matching   where walls tell no heading, or a doubtful one: windows matched one by one, then blocks and places
-judgement       what was held out and where walls stand must speak for the trajectory, or odometry stays
+windows         the drive is cut into pieces of 0.4 m, each with a node of the pose graph
+heading         yaw from the directions of walls at right angles, by a hidden Markov model over the whole drive
+straight walls  distances to walls, which keep the trajectory straight and give scale and heading of the wheels
+matching        each block is matched with a local map of what was driven before it, then of what lies around it
+loop closures   blocks are matched with local maps of other visits
+scan matching   if walls give no heading or a doubtful one: matching alone, then loop closures
+judgement       the trajectory is accepted if held-out readings or walls support it; otherwise odometry is kept
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from ..common.errors import InputError
 from ..common.parameters import Parameters
 from ..common.readings import Readings
 from ..runtime.cancelling import check
-from .any_angle import matched
-from .certainty import MOST, of_yaw
+from .any_angle import match_drive
+from .certainty import LARGEST_SIGMA, yaw_errors
 from .heading import NOISES, Heading, heading
-from .holding_out import LEAST_SIGMAS, Gain, came_back, held_out
-from .hypotheses import solved
-from .judging import chosen, explained_better, over_the_drive, seen_again, turned_right
+from .holding_out import LEAST_SIGMAS, Gain, has_revisits, held_out
+from .hypotheses import solve_hypotheses
+from .judging import gain_at_revisits, gain_of_objective, gain_over_drive, last_not_worse, turns_supported
 from .jumps import MOST_JUMPS, Part, begins_of, jumps, parts_at, with_doubtful, without_outliers
 from .local_map import for_matching
 from .odometry_model import CALIBRATION
@@ -41,25 +41,25 @@ from .walls import wall_votes
 from .windows import TRAVEL, Odometry, Windows, corrected, cut
 
 SHORTEST = 8.0
-"""Metres of a drive below which nothing is refined: its drift is small, and there is little to judge it by."""
+"""Shortest drive that is refined, metres: shorter ones drift little, and have few readings for the judgement."""
 
 FEWEST_READINGS = 200
 
 LEAST_ECHOES = 0.05
-"""Part of the readings that must have an echo."""
+"""Fraction of the readings that must have an echo."""
 
 LEAST_SENSORS = 2
 
-LEAST_WITNESS, LEAST_SIGMAS_WITH_WALLS = 10.0, -1.0
-"""Nats that the votes of walls must say against odometry's yaw, beyond what sensors say by where they look, to be a
-witness of their own, and the standard errors that are then enough where the robot came to no place twice: readings must
-not be predicted worse. Little drift hardly shows in a few metres."""
+LEAST_VOTE_GAIN, LEAST_SIGMAS_WITH_WALLS = 10.0, -1.0
+"""If votes of walls are likelier by so many nats than with the yaw of odometry, beyond what random ranges give, and the
+robot came back to no place, the gain in predicting readings need only be so many standard errors: readings must not be
+predicted worse. Small drift hardly shows within a few metres."""
 
 LEAST_CERTAINTY = 0.9
-"""Probability that the heading did not get lost by a right angle."""
+"""Least probability that no right angle of the heading was lost."""
 
 LEAST_MOVED = 0.15
-"""Metres that odometry must be off, in the root mean square: about the error of what takes its place."""
+"""Least difference from odometry of an accepted trajectory, metres (rms): about the error of the trajectory itself."""
 
 NOT_ENOUGH = ': not enough to tell that odometry is off'
 
@@ -71,15 +71,15 @@ NO_WALLS = (
 NOR_MATCHES = '; matches alone tell no better trajectory'
 
 SCAN_MATCHED = 2 * TRAVEL
-"""Metres between poses, for half of the way, up to which matching alone is tried. Scan matching takes the shape of two
-windows from odometry, and readings between poses are on a straight line: turns are lost."""
+"""Largest median distance between poses of odometry for matching alone, metres. Scan matching takes the shape of two
+windows from odometry, and between poses readings are interpolated on a straight line, so turns are lost."""
 
 Watch = Callable[[str, float], None]
-"""Receives what is going on, and how much of it is done, from 0 to 1."""
+"""Receives the name of the stage, and the fraction of it that is done, from 0 to 1."""
 
 
 class _Drive(NamedTuple):
-    """A drive, in windows."""
+    """A drive, its windows and their scans."""
 
     readings: Readings
     odometry: Odometry
@@ -88,7 +88,7 @@ class _Drive(NamedTuple):
 
 
 class _Attempt(NamedTuple):
-    """What became of a drive in one way: its nodes, and whether no other way needs to be tried."""
+    """The result by one method, its nodes, and whether it is so sure that no other method needs to be tried."""
 
     refinement: Refinement
     nodes: Floats
@@ -96,10 +96,10 @@ class _Attempt(NamedTuple):
 
 
 class Refiner:
-    """Runs from a drive to its trajectory; can be cancelled from another thread, once and for all."""
+    """Estimates the trajectories of drives; can be cancelled from another thread, for good."""
 
     def __init__(self, parameters: Parameters) -> None:
-        """Prepare runs with these parameters; the search and σ are those of the maps."""
+        """Set the parameters; cell size and sensor model are replaced (`for_matching`)."""
         self._parameters = for_matching(parameters)
         self._stop = np.zeros(1, np.uint8)
         self._watch: Watch = lambda stage, part: None
@@ -117,7 +117,7 @@ class Refiner:
             Placed by `odometry`.
         odometry : Odometry
         watch : callable
-            Called from this thread as the work goes on.
+            Called from this thread during the work.
 
         Raises
         ------
@@ -140,20 +140,20 @@ class Refiner:
         return self._in_parts(readings, odometry, jumped_to)
 
     def _in_parts(self, readings: Readings, odometry: Odometry, jumped_to: NDArray[np.int64]) -> Refinement:
-        """Return the trajectory of a drive whose odometry jumps: of each part by itself, each on the map of others."""
+        """Return the trajectory of a drive with jumps: each part is refined alone, then placed on the map before it."""
         watch, cuts, outcomes = self._watch, parts_at(readings, odometry, jumped_to), []
         for k, (own, part) in enumerate(cuts, 1):
-            self._watch = partial(_named, watch, f'part {k} of {len(cuts)}, ')
-            # to be placed, a part needs the best heading that there is, however little it moves
+            self._watch = partial(_report_part, watch, f'part {k} of {len(cuts)}, ')
+            # the placement needs the best heading, so refined parts are accepted however little they move
             outcomes.append(self._whole(own, part, 0.0))
         self._watch = watch
-        self._say('what follows jumps of odometry')
+        self._start_stage('what follows jumps of odometry')
         parts = [Part(o.readings, part, o.trajectory, o.lost) for (_, part), o in zip(cuts, outcomes, strict=True)]
         begins = begins_of(parts, self._parameters, self._stop)
         return joined_parts(readings, odometry, parts, outcomes, begins)
 
     def _whole(self, readings: Readings, odometry: Odometry, least_moved: float = LEAST_MOVED) -> Refinement:
-        """Return the trajectory of a drive whose odometry does not jump; one that moves it by less is not taken."""
+        """Return the trajectory of a drive without jumps; it must differ from odometry by `least_moved` metres."""
         reason = unfit(readings, odometry)
         if reason:
             return Refinement(False, reason, readings, odometry, {})
@@ -166,99 +166,105 @@ class Refiner:
         return self._at_any_angle(drive, by_walls, least_moved)
 
     def _at_right_angles(self, drive: _Drive, least_moved: float) -> _Attempt:
-        """Return the trajectory if walls stand at right angles to each other, or why there is none."""
+        """Return the trajectory with walls at right angles to each other, or why there is none."""
         readings, odometry, windows, scans = drive
-        walls, witness = self._heading(windows, scans)
+        walls, vote_gain = self._heading(windows, scans)
         if walls is None:
             return _Attempt(Refinement(False, NO_WALLS, readings, odometry, {}), windows.node)
 
         def solver_of(heading: Heading) -> Solver:
-            return Solver(odometry, windows, scans, heading, self._say)
+            return Solver(odometry, windows, scans, heading, self._start_stage)
 
-        def left(reason: str, better: Gain) -> _Attempt:
-            refused = Refinement(False, reason, readings, odometry, named, gain=better.mean)
+        def keep_odometry(reason: str, better: Gain) -> _Attempt:
+            refused = Refinement(False, reason, readings, odometry, by_name, gain=better.mean)
             return _Attempt(refused, windows.node)
 
         solver = solver_of(walls)
         along = solver.along_walls()
         calibration = solver.calibration_of(along)
         simple = solver.simple(calibration)
-        better = over_the_drive(scans, windows.node, simple, self._say('judgement'))
-        said = _said(better)
-        named = dict(zip(CALIBRATION, calibration.tolist(), strict=True))
+        better = gain_over_drive(scans, windows.node, simple, self._start_stage('judgement'))
+        gain_words = _gain_words(better)
+        by_name = dict(zip(CALIBRATION, calibration.tolist(), strict=True))
         proven = better.sigmas >= LEAST_SIGMAS
-        witnessed = witness > LEAST_WITNESS and better.sigmas >= LEAST_SIGMAS_WITH_WALLS
-        # where walls stand at right angles along odometry as it is, that is the answer
-        stands = differences(odometry, refined(odometry, windows, along.nodes))[0] < LEAST_MOVED
-        unproven = left(said + NOT_ENOUGH, better)._replace(sure=stands)
-        if not proven and not witnessed:
+        votes_suffice = vote_gain > LEAST_VOTE_GAIN and better.sigmas >= LEAST_SIGMAS_WITH_WALLS
+        # if walls agree with odometry, other methods need not be tried
+        agrees = differences(odometry, refined(odometry, windows, along.nodes))[0] < LEAST_MOVED
+        unproven = keep_odometry(gain_words + NOT_ENOUGH, better)._replace(sure=agrees)
+        if not proven and not votes_suffice:
             if walls.certainty < LEAST_CERTAINTY:
-                return _lost(drive, walls.certainty)
-            if witness <= LEAST_WITNESS:
+                return _heading_lost(drive, walls.certainty)
+            if vote_gain <= LEAST_VOTE_GAIN:
                 return unproven
-        found = solved(scans, walls, solver, along, solver_of)
+        found = solve_hypotheses(scans, walls, solver, along, solver_of)
         if found.certainty < LEAST_CERTAINTY:
-            return _lost(drive, found.certainty)
+            return _heading_lost(drive, found.certainty)
         if found.solver is not solver:
             solver, simple = found.solver, found.solver.simple(found.solver.calibration_of(found.along))
-        self._say('judgement')
-        nodes = chosen(scans, simple, found.along.nodes, found.solution.nodes)
+        self._start_stage('judgement')
+        nodes = last_not_worse(scans, simple, found.along.nodes, found.solution.nodes)
         if not proven:
-            # places seen before tell wheels that are right over metres from those that are not, and walls that stand
-            # askew from a yaw that is off; where odometry alone says that the robot came back, it need not be so
-            again = came_back(scans, nodes)
-            if not again and not witnessed:
+            # revisits show drift over the whole drive, and walls that are not parallel; whether the robot came back is
+            # decided along the refined nodes, since by odometry it may be wrong
+            revisited = has_revisits(scans, nodes)
+            if not revisited and not votes_suffice:
                 return unproven
-            better = seen_again(scans, windows.node, nodes)
-            said = f'with places seen before, {_said(better)}' if again else _said(better)
-            if better.sigmas < (LEAST_SIGMAS if again else LEAST_SIGMAS_WITH_WALLS):
-                return left(said + NOT_ENOUGH, better)._replace(sure=stands)
-            if not again:
-                said = f'that walls stand at right angles is likelier by {witness:.0f} nats than with odometry; {said}'
+            better = gain_at_revisits(scans, windows.node, nodes)
+            gain_words = f'with places seen before, {_gain_words(better)}' if revisited else _gain_words(better)
+            if better.sigmas < (LEAST_SIGMAS if revisited else LEAST_SIGMAS_WITH_WALLS):
+                return keep_odometry(gain_words + NOT_ENOUGH, better)._replace(sure=agrees)
+            if not revisited:
+                likelier = f'that walls stand at right angles is likelier by {vote_gain:.0f} nats than with odometry'
+                gain_words = f'{likelier}; {gain_words}'
         loops = found.loops if nodes is found.solution.nodes else []
         if nodes is found.solution.nodes:
-            named = dict(zip(CALIBRATION, solver.calibration_of(found.solution).tolist(), strict=True))
+            by_name = dict(zip(CALIBRATION, solver.calibration_of(found.solution).tolist(), strict=True))
         trajectory = refined(odometry, windows, nodes)
         moved, turned = differences(odometry, trajectory)
         if moved < least_moved:
-            return left(too_little_words(moved), better)._replace(sure=True)
+            return keep_odometry(too_little_words(moved), better)._replace(sure=True)
         placed, noise = replaced(readings, odometry, trajectory), walls.drifts.noise
-        outcome = Refinement(True, said, placed, trajectory, named, moved, turned, len(loops), better.mean, noise=noise)
-        sure = recognised_part(scans, nodes, loops) >= LEAST_RECOGNISED and turned_right(scans, nodes)
+        outcome = Refinement(
+            True, gain_words, placed, trajectory, by_name, moved, turned, len(loops), better.mean, noise=noise
+        )
+        sure = recognised_part(scans, nodes, loops) >= LEAST_RECOGNISED and turns_supported(scans, nodes)
         return _Attempt(outcome, nodes, sure)
 
     def _at_any_angle(self, drive: _Drive, by_walls: _Attempt, least_moved: float) -> Refinement:
-        """Return the trajectory that matches alone say, if it is better than what walls at right angles say."""
+        """Return the trajectory by matching alone, if it is better than that by walls at right angles."""
         readings, odometry, windows, scans = drive
         known = by_walls.nodes if by_walls.refinement.accepted else None
         apart = usual_step(odometry)
         if apart > SCAN_MATCHED:
-            return _stays(by_walls.refinement, too_sparse_words(apart))
+            return _without_better(by_walls.refinement, too_sparse_words(apart))
         try:
-            found = matched(odometry, scans, self._say, self._parameters.association.odometry_noise, known)
+            found = match_drive(odometry, scans, self._start_stage, self._parameters.association.odometry_noise, known)
         except InputError:
-            # its cells are of one size, so that a map of the whole drive may be too large though the maps are not
+            # at the cell size of matching, the map of the whole drive may be too large although the final maps are not
             found = None
         if found is None:
-            return _stays(by_walls.refinement)
+            return _without_better(by_walls.refinement)
         nodes = found.nodes
-        if known is not None and explained_better(scans, known, nodes).sigmas < LEAST_SIGMAS:
+        if known is not None and gain_of_objective(scans, known, nodes).sigmas < LEAST_SIGMAS:
             return by_walls.refinement
-        better = seen_again(scans, windows.node, nodes)
+        better = gain_at_revisits(scans, windows.node, nodes)
         trajectory = refined(odometry, windows, nodes)
         moved, turned = differences(odometry, trajectory)
         if better.sigmas < LEAST_SIGMAS or moved < least_moved:
-            return _stays(by_walls.refinement)
-        again = 'with places seen before, ' if came_back(scans, nodes) else ''
-        named = dict.fromkeys(CALIBRATION, 0.0) | {
-            name: told.value for name, told in of_yaw(odometry, trajectory).items() if told.sigma <= MOST[name]
+            return _without_better(by_walls.refinement)
+        at_revisits = 'with places seen before, ' if has_revisits(scans, nodes) else ''
+        by_name = dict.fromkeys(CALIBRATION, 0.0) | {
+            name: estimate.value
+            for name, estimate in yaw_errors(odometry, trajectory).items()
+            if estimate.sigma <= LARGEST_SIGMA[name]
         }
         return Refinement(
             True,
-            f'walls are not taken to stand at right angles; {again}{_said(better)}{_doubt(found.part)}',
+            f'walls are not taken to stand at right angles; {at_revisits}{_gain_words(better)}'
+            f'{_recognition_words(found.part)}',
             replaced(readings, odometry, trajectory),
             trajectory,
-            named,
+            by_name,
             moved,
             turned,
             len(found.loops),
@@ -266,7 +272,7 @@ class Refiner:
             right_angles=False,
         )
 
-    def _say(self, stage: str) -> Callable[[float], None]:
+    def _start_stage(self, stage: str) -> Callable[[float], None]:
         def progress(part: float) -> None:
             check(self._stop)
             self._watch(stage, part)
@@ -275,25 +281,27 @@ class Refiner:
         return progress
 
     def _heading(self, windows: Windows, scans: Scans) -> tuple[Heading | None, float]:
-        """Return what walls say about the yaw, and the nats by which they say that odometry's is wrong."""
-        self._say('directions of walls')
-        told = self._parameters.association.odometry_noise
-        noises = (told,) if told else NOISES
+        """Return the heading from walls, and by how many nats votes are likelier than with the yaw of odometry.
+
+        The same gain of random ranges is subtracted.
+        """
+        self._start_stage('directions of walls')
+        given_noise = self._parameters.association.odometry_noise
+        noises = (given_noise,) if given_noise else NOISES
         found = heading(windows, *wall_votes(windows, scans.held_out), noises)
         if found is None:
             return None, 0.0
-        # sensors have directions of their own, which vote with whatever ranges: a robot that drives and looks along
-        # two axes seems to know of walls
+        # a robot that drives and looks along two axes gets votes for these even with random ranges
         readings, rng = windows.readings, np.random.default_rng(0)
         drawn = np.where(readings.echo, rng.random(len(readings)) * readings.z_max, readings.z)
-        by_chance = replace(windows, readings=replace(readings, z=drawn))
-        chance = heading(by_chance, *wall_votes(by_chance, scans.held_out), noises)
-        looks = 0.0 if chance is None else max(chance.over_odometry, 0.0)
-        return found, found.over_odometry - looks
+        randomised = replace(windows, readings=replace(readings, z=drawn))
+        chance = heading(randomised, *wall_votes(randomised, scans.held_out), noises)
+        gain_by_chance = 0.0 if chance is None else max(chance.over_odometry, 0.0)
+        return found, found.over_odometry - gain_by_chance
 
 
 def without_times(readings: Readings, odometry: Odometry) -> str:
-    """Return why odometry does not tell where each reading was taken; empty if it does."""
+    """Return why the odometry does not cover all readings; empty if it does."""
     if not len(odometry.stamp):
         return 'the poses of odometry are not at hand, as in a journal'
     early, late = readings.stamp.min(initial=odometry.stamp[0]), readings.stamp.max(initial=odometry.stamp[-1])
@@ -320,18 +328,18 @@ def unfit(readings: Readings, odometry: Odometry) -> str:
 
 
 def too_little_words(moved: float) -> str:
-    """Return why a drive stays that is off by so little, metres."""
+    """Return the reason for keeping an odometry whose error, metres, is so small."""
     return f'odometry is off by {moved:.2f} m, which is no more than sonar can tell'
 
 
 def usual_step(odometry: Odometry) -> float:
-    """Return the median distance between two poses over the way of the robot, metres."""
+    """Return the step between poses that half of the distance was driven with or less, metres (weighted median)."""
     steps = np.sort(np.diff(odometry.travel))
     return float(steps[np.searchsorted(np.cumsum(steps), steps.sum() / 2)])
 
 
 def too_sparse_words(apart: float) -> str:
-    """Return why matches alone are not tried where poses are so far apart, metres."""
+    """Return why matching alone is not tried if poses are so far apart, metres."""
     return (
         f'; poses of odometry are usually {apart:.1f} m apart, and matches alone need one every {SCAN_MATCHED:g} m: '
         f'record odometry at a higher rate'
@@ -339,12 +347,12 @@ def too_sparse_words(apart: float) -> str:
 
 
 def lost_words(certainty: float) -> str:
-    """Return why a drive stays whose heading is this certain."""
+    """Return the reason for keeping odometry if the heading is only this certain."""
     return f'the heading was lost somewhere: that it is not off by a right angle is only {certainty:.0%} certain'
 
 
 def refined(odometry: Odometry, windows: Windows, nodes: Floats) -> Odometry:
-    """Return the corrected odometry, which begins where odometry does."""
+    """Return the trajectory: odometry corrected by nodes, moved so that its first pose is that of odometry."""
     w = windows
     pose = corrected(odometry.progress, odometry.pose, w.node_progress, w.node, nodes)
     home = compose(odometry.pose[0], inverse(pose[0]))
@@ -353,17 +361,17 @@ def refined(odometry: Odometry, windows: Windows, nodes: Floats) -> Odometry:
     return Odometry(odometry.stamp, pose)
 
 
-def _stays(found: Refinement, why: str = NOR_MATCHES) -> Refinement:
-    """Return what walls said, where matches alone told nothing better, or were not tried."""
+def _without_better(found: Refinement, why: str = NOR_MATCHES) -> Refinement:
+    """Return the result by walls, with the reason why matching alone gave no better one if it is not accepted."""
     return found if found.accepted else replace(found, reason=found.reason + why)
 
 
-def _lost(drive: _Drive, certainty: float) -> _Attempt:
+def _heading_lost(drive: _Drive, certainty: float) -> _Attempt:
     refused = Refinement(False, lost_words(certainty), drive.readings, drive.odometry, {}, lost=True)
     return _Attempt(refused, drive.windows.node)
 
 
-def _said(better: Gain) -> str:
+def _gain_words(better: Gain) -> str:
     if not np.isfinite(better.error):
         return (
             'there are too few readings on maps of others to tell whether they are predicted better than with odometry'
@@ -371,12 +379,12 @@ def _said(better: Gain) -> str:
     return f'readings are predicted {better.mean:+.3f} ± {better.error:.3f} nats a reading better than with odometry'
 
 
-def _doubt(part: float) -> str:
-    """Return what is to be said where this part of the blocks at places seen before is recognised."""
+def _recognition_words(part: float) -> str:
+    """Return the warning about the fraction of blocks on earlier visits that are recognised; empty if it is large."""
     if part >= LEAST_RECOGNISED:
         return ''
     return f'; {part:.0%} of the way through places seen before is recognised: the drive may be bent as a whole'
 
 
-def _named(watch: Watch, name: str, stage: str, part: float) -> None:
+def _report_part(watch: Watch, name: str, stage: str, part: float) -> None:
     watch(name + stage, part)

@@ -1,9 +1,9 @@
-"""Registration: where a drive lies on the map of other drives.
+"""Registration of a drive with the map of other drives.
 
-A trajectory that was found for itself begins where its odometry does, and there the yaw of odometry has errors as
-everywhere: over the whole drive they swing it about its begin. Three figures for the whole drive, place and yaw of its
-begin, are those with which its readings are likeliest given the map of the others. They are searched from coarse to
-fine, with steps of the yaw that move the readings as far as those of the place do.
+A trajectory begins at the first pose of its odometry. An error of the yaw there turns the whole drive about its begin.
+So the drive is moved as a rigid body: the pose of its begin (x, y, yaw) is the one for which its readings are likeliest
+on the map of the others. It is searched from coarse to fine; a step of the yaw moves the readings, in the rms, as far
+as a step of the position.
 """
 
 from __future__ import annotations
@@ -25,38 +25,39 @@ from .matching import grid_around
 from .poses import Floats, compose, relative
 
 SIGMA = np.array([0.1, 0.1, math.radians(4.0)])
-"""σ of the begin a priori: metres, and radians."""
+"""σ of the prior of the begin: metres, metres, radians."""
 
 SIGMAS = 2.5
+"""Half the size of the searched area, σ."""
 
 STEP, FINER, LEVELS = 0.15, 1 / 3, 3
-"""Metres between two places of the first search, what the next is finer by, and how many there are."""
+"""Step of the first grid, metres; factor of the steps from one grid to the next; number of grids."""
 
-ASKED = (150, 600, 2000)
-"""Readings that each search asks."""
+EVALUATED = (150, 600, 2000)
+"""Readings that are evaluated at each pose, of each grid."""
 
 ON_MAP = 20_000
-"""Readings that the map of the others is made of at the most."""
+"""Most readings that the map of the others is made from."""
 
 BLOCKS = 40
-"""Pieces of the drive, in order of time, whose readings are compared before and after."""
+"""Blocks of the drive, in order of time, whose predictions before and after are compared."""
 
 FEWEST = 5
-"""Readings of a piece that is compared."""
+"""Fewest readings of a block that is compared."""
 
 SILENT = 1e-6
-"""Nats a reading of a block that says nothing, since all of it is new."""
+"""Nats: a log-likelihood ratio up to this is 0, since the map is unknown there."""
 
 
 class Registration(NamedTuple):
-    """Where a drive lies.
+    """The pose of a drive on the map.
 
     Attributes
     ----------
     begin : float64, shape (3,)
-        The pose of its begin, on the map; as it was if nothing better was found.
+        The pose of its begin; unchanged if no better one was found.
     gain : Gain
-        By how much its readings are predicted better.
+        How much better its readings are predicted there.
     """
 
     begin: Floats
@@ -66,7 +67,7 @@ class Registration(NamedTuple):
 def register(
     readings: Readings, begin: Floats, others: Readings, parameters: Parameters, stop: NDArray[np.uint8]
 ) -> Registration:
-    """Return where a drive lies on the map of others.
+    """Return the pose of a drive on the map of others.
 
     Parameters
     ----------
@@ -75,7 +76,7 @@ def register(
     begin : float64, shape (3,)
         The first pose of the trajectory.
     others : Readings
-        Placed where they stay.
+        Readings of the other drives, which are not moved.
     parameters : Parameters
     stop : uint8, shape (1,)
         Not 0 to end the work.
@@ -92,9 +93,9 @@ def register(
 
 
 class OnMap:
-    """A drive as one scan, to be put on the map of others.
+    """A drive as one scan, and the map of others.
 
-    The parameters are those of `register`; `begin` is where the drive begins as its readings are placed.
+    The parameters are those of `register`.
     """
 
     def __init__(
@@ -106,39 +107,39 @@ class OnMap:
         readings = readings.select(np.argsort(readings.stamp, kind='stable'))
         sensors = relative(begin, np.stack([readings.x, readings.y, readings.yaw], axis=1))
         self._scan = make_scan(readings, sensors, model, resolution, UNKNOWN * hit_probability(model, resolution))
-        self._far = _far(sensors[:, :2])
+        self._extent = _extent(sensors[:, :2])
 
     def search(self, begin: Floats, sigma: Floats, blocks: int = 0) -> Floats:
-        """Return the best begin near one, shape (3,), with these σ a priori: metres, metres, radians.
+        """Return the best pose of the begin near `begin`, shape (3,); `sigma` of the prior is in metres and radians.
 
-        With `blocks`, readings are asked only of those blocks that lie on the map.
+        If `blocks` is not 0, the drive is divided into so many blocks, and those that are not on the map are ignored.
         """
-        scan, far = self._scan, self._far
+        scan, extent = self._scan, self._extent
         if blocks:
             parts = np.array_split(scan.readings, blocks)
-            told = [p for p, value in zip(parts, self.predicted(begin, blocks), strict=True) if abs(value) > SILENT]
-            if not told:
+            on_map = [p for p, value in zip(parts, self.predicted(begin, blocks), strict=True) if abs(value) > SILENT]
+            if not on_map:
                 return begin
-            scan = Scan(np.concatenate(told), scan.weight)
-            far = _far(np.stack([scan.readings['x'], scan.readings['y']], axis=1))
-        found, reach, steps = begin, SIGMAS * sigma, np.array([STEP, STEP, STEP / far])
+            scan = Scan(np.concatenate(on_map), scan.weight)
+            extent = _extent(np.stack([scan.readings['x'], scan.readings['y']], axis=1))
+        found, reach, steps = begin, SIGMAS * sigma, np.array([STEP, STEP, STEP / extent])
         information = np.diag(sigma**-2.0)
-        for asked in ASKED[:LEVELS]:
+        for count in EVALUATED[:LEVELS]:
             poses = grid_around(found, reach, (steps[0], steps[1], steps[2]))
-            found = _best(scan, self._around, poses, begin, information, asked)
+            found = _best(scan, self._around, poses, begin, information, count)
             reach, steps = steps, FINER * steps
         return found
 
     def of_each(self, begin: Floats, count: int) -> Floats:
-        """Return the log ratio of each of the first `count` readings, in order of time."""
+        """Return the log-likelihood ratio of each of the first `count` readings, in order of time, nats."""
         readings, weight = self._scan.readings[:count], self._scan.weight
         each = [scores(Scan(readings[k : k + 1], weight), self._around, begin[None])[0] for k in range(len(readings))]
         return np.array(each)
 
     def predicted(self, begin: Floats, blocks: int) -> Floats:
-        """Return the mean log ratio of the readings of each of so many blocks, in order of time, shape (blocks,).
+        """Return the mean log-likelihood ratio of the readings of each block, in order of time, shape (blocks,), nats.
 
-        It is NaN where they are few.
+        It is NaN for blocks with fewer than `FEWEST` readings.
         """
         out = np.full(blocks, np.nan)
         for k, part in enumerate(np.array_split(self._scan.readings, blocks)):
@@ -147,28 +148,28 @@ class OnMap:
         return out
 
 
-def _far(xy: Floats) -> float:
-    """Return how far readings are from the begin of the drive, metres."""
+def _extent(xy: Floats) -> float:
+    """Return the rms distance of readings from the begin of the drive, at least 1 m."""
     return max(float(np.sqrt((xy**2).sum(1).mean())), 1.0)
 
 
-def _best(scan: Scan, around: LocalMap, poses: Floats, begin: Floats, information: Floats, asked: int) -> Floats:
-    """Return the best of `poses`, given where the drive begins a priori, by about so many readings."""
+def _best(scan: Scan, around: LocalMap, poses: Floats, begin: Floats, information: Floats, count: int) -> Floats:
+    """Return the pose of the largest posterior; the prior is around `begin`; about `count` readings are evaluated."""
     off = relative(begin, poses)
-    value = scores(scan, around, poses, max(len(scan.readings) // asked, 1))
+    value = scores(scan, around, poses, max(len(scan.readings) // count, 1))
     value -= 0.5 * np.einsum('pi,ij,pj->p', off, information, off)
     best: Floats = poses[int(value.argmax())]
     return best
 
 
 def moved_to(begin: Floats, poses: Floats) -> Floats:
-    """Return poses of a drive, shape (M, 3), with the first one at `begin` and the others moved along."""
+    """Return the poses of a drive, shape (M, 3), moved as a rigid body so that the first one is at `begin`."""
     out: Floats = compose(begin, relative(poses[0], poses))
     out[:, 2] = begin[2] + poses[:, 2] - poses[0, 2]
     return out
 
 
 def readings_moved(readings: Readings, before: Floats, begin: Floats) -> Readings:
-    """Return readings of a drive that began at `before`, shape (3,), as they are if it begins at `begin`."""
+    """Return the readings of a drive, moved as a rigid body so that its begin goes from `before` to `begin`."""
     sensors = np.stack([readings.x, readings.y, readings.yaw], axis=1)
     return at_poses(readings, compose(begin, relative(before, sensors)))

@@ -1,9 +1,9 @@
-"""Stretches of a drive that were put in a wrong place, and where they belong.
+"""Stretches of a drive that lie in a wrong place, and where they belong.
 
-Where wheels stray in a hall whose walls are out of reach, all that comes after it is off by metres. Loops are then
-looked for in the wrong places; rooms that look alike are found, or nothing. So of the blocks that lie where the robot
-was before hardly any is recognised. Such a stretch is searched as a whole, farther than one block can be: 25 metres of
-a building look like hardly anything else in it.
+If odometry is off by metres after a hall whose walls are out of reach, loop closures are searched in the wrong places,
+and either rooms that look alike are found or nothing. So hardly any block on an earlier visit is recognised. Such a
+stretch is matched as a whole in a larger area than a single block: 25 m of a building hardly look like any other part
+of it.
 """
 
 from __future__ import annotations
@@ -23,59 +23,65 @@ from .poses import Floats, compose, relative
 from .scans import FEWEST_ON_MAP, Scans
 
 NEAR = 2.0
-"""Metres within which a block lies where the robot was before."""
+"""Metres from an earlier part of the drive within which a block lies on an earlier visit."""
 
 RUN, FEW = 8, 3
-"""Blocks of a stretch, and how many of them are recognised at the most where it is searched."""
+"""Blocks of a stretch, and the most of them that are recognised if it is searched."""
 
 LONGEST = RUN + 4
-"""Blocks from the first to the last of a stretch: what lies between moves along, as stiff as it is."""
+"""Most blocks from the first to the last of a stretch; those between, on no earlier visit, follow by the pose graph."""
 
 CONFIRMING = 5
-"""Blocks that must be recognised across a place to know how it was passed, and more than half of those that could."""
+"""Fewest blocks from before a node that must be recognised after it to confirm the heading there; it must be more than
+half of those that lie on such a visit, too."""
 
 AROUND = 10.0
-"""Metres from the stretch up to which the robot's way of before is on the map."""
+"""Metres around the stretch within which earlier windows make the map."""
 
 ON_MAP = 6000
-"""Readings that the map of a stretch is made of at the most."""
+"""Most readings that the map is made from."""
 
 REACH = np.array([5.0, 5.0, math.radians(10.0)])
+"""Half the size of the searched area: metres ahead and aside, radians."""
+
 STEPS = (0.2, 0.2, math.radians(2.5))
-ASKED, FOLLOWED = (60, 600), 600
-"""Readings that are asked at all poses of the search and at the best of them, and how many these are."""
+"""Steps of the first grid."""
+
+EVALUATED, FOLLOWED = (60, 600), 600
+"""Readings that are evaluated at all poses of the first grid, and at the best ones; the number of these."""
 
 FINER = ((0.1, 0.1, math.radians(1.2)), (0.05, 0.05, math.radians(0.6)))
+"""Steps of the finer grids."""
 
 MOVED = 0.5
-"""Metres from where on it is another place."""
+"""Least distance between two places of a stretch, metres."""
 
 SIGMA = np.array([0.1, 0.1, math.radians(1.5)])
-"""σ of a block in the stretch, once this is in its place."""
+"""σ of the pose of a block after its stretch was moved: metres, metres, radians."""
 
 LEAST_RECOGNISED = 0.85
-"""Part of the blocks that lie where the robot was before that are recognised where nothing is bent."""
+"""Fraction of the blocks on an earlier visit that are recognised if the trajectory is not bent."""
 
-MORE = 2
-"""Blocks more that must be recognised in another place."""
+MORE_RECOGNISED = 2
+"""So many more blocks must be recognised at another place."""
 
 
 def recognised(loops: Sequence[Loop]) -> set[int]:
-    """Return the blocks that were recognised where the robot was before, by their numbers."""
+    """Return the numbers of the blocks that were recognised on an earlier visit."""
     return {max(loop.block, loop.place) // LENGTH for loop in loops}
 
 
 def revisits(scans: Scans, nodes: Floats, passed: int | None = None) -> NDArray[np.int64]:
-    """Return the numbers of blocks that lie where the robot was before.
+    """Return the numbers of the blocks that lie on an earlier visit.
 
-    With `passed`, of blocks behind this node that lie where the robot was before it.
+    With `passed`, only blocks after this node that lie on a visit before it.
     """
     progress, out = scans.windows.node_progress, []
     for first in range(0, len(nodes) - LENGTH // 2, LENGTH):
         middle = min(first + LENGTH // 2, len(nodes) - 1)
         if passed is not None and middle < passed:
             continue
-        # progress grows, so what was before is the first nodes
+        # progress increases, so earlier nodes are the first ones
         until = int(np.searchsorted(progress, progress[middle] - APART))
         before = nodes[: until if passed is None else min(until, passed), :2]
         if len(before) and np.hypot(*(before - nodes[middle, :2]).T).min() < NEAR:
@@ -84,15 +90,21 @@ def revisits(scans: Scans, nodes: Floats, passed: int | None = None) -> NDArray[
 
 
 def recognised_part(scans: Scans, nodes: Floats, loops: Sequence[Loop]) -> float:
-    """Return the part of the blocks that lie where the robot was before that are recognised; 1 if there are none."""
+    """Return the fraction of the blocks on an earlier visit that are recognised; 1 if there are none."""
     blocks = revisits(scans, nodes).tolist()
     return len(recognised(loops).intersection(blocks)) / len(blocks) if blocks else 1.0
 
 
 def unsupported(blocks: NDArray[np.int64], seen: set[int], begin: int) -> NDArray[np.int64] | None:
-    """Return the first blocks from `begin` on, of those that lie where the robot was, that are hardly recognised.
+    """Return the first stretch from block `begin` on of which hardly any block is recognised; None if there is none.
 
-    None if there are none.
+    Parameters
+    ----------
+    blocks : int64
+        Those on an earlier visit.
+    seen : set of int
+        Those that are recognised.
+    begin : int
     """
     blocks = blocks[blocks >= begin]
     found = np.array([int(block) in seen for block in blocks], np.int64)
@@ -110,21 +122,21 @@ def unsupported(blocks: NDArray[np.int64], seen: set[int], begin: int) -> NDArra
 
 
 def confirmed(scans: Scans, nodes: Floats, loops: Sequence[Loop], node: int) -> bool:
-    """Return whether places seen before a node were recognised after it: then the way past it is known."""
+    """Return whether enough blocks from before a node are recognised after it, so that the heading is right there."""
     across = [loop for loop in loops if max(loop.block, loop.place) >= node > min(loop.block, loop.place)]
     blocks = revisits(scans, nodes, node).tolist()
-    did = len(recognised(across).intersection(blocks))
-    return did >= CONFIRMING and 2 * did > len(blocks)
+    crossed = len(recognised(across).intersection(blocks))
+    return crossed >= CONFIRMING and 2 * crossed > len(blocks)
 
 
 def windows_of(blocks: NDArray[np.int64], count: int) -> NDArray[np.int64]:
-    """Return the windows of blocks, of which the drive has `count`."""
+    """Return the windows of blocks; the drive has `count` windows."""
     out = (blocks[:, None] * LENGTH + np.arange(LENGTH)).ravel()
     return out[out < count]
 
 
 def displaced(scans: Scans, nodes: Floats, stretch: NDArray[np.int64]) -> Floats | None:
-    """Return the nodes with a stretch where it fits best on the map of what was before; None if that is where it is."""
+    """Return the nodes with a stretch moved to its best pose on the map of earlier visits; None if it lies there."""
     progress = scans.windows.node_progress
     before = np.flatnonzero(progress < progress[stretch[0]] - APART)
     far = np.array([np.hypot(*(nodes[stretch, :2] - nodes[k, :2]).T).min() for k in before])
@@ -135,7 +147,7 @@ def displaced(scans: Scans, nodes: Floats, stretch: NDArray[np.int64]) -> Floats
     if around is None:
         return None
     shape = relative(nodes[middle], nodes[stretch])
-    best = _searched(scans.joint(stretch, shape), around)
+    best = _best_pose(scans.joint(stretch, shape), around)
     if np.hypot(best[0], best[1]) < MOVED:
         return None
     out = nodes.copy()
@@ -143,10 +155,10 @@ def displaced(scans: Scans, nodes: Floats, stretch: NDArray[np.int64]) -> Floats
     return out
 
 
-def _searched(joint: Scan, around: LocalMap) -> Floats:
-    """Return the best pose of a stretch around where it is."""
+def _best_pose(joint: Scan, around: LocalMap) -> Floats:
+    """Return the best pose of a stretch, relative to the present one, shape (3,)."""
     mixed = joint.readings[np.random.default_rng(0).permutation(len(joint.readings))]
-    few, more = (Scan(mixed[:asked], joint.weight) for asked in ASKED)
+    few, more = (Scan(mixed[:count], joint.weight) for count in EVALUATED)
     poses = grid_around(np.zeros(3), REACH, STEPS)
     poses = poses[np.argsort(-scores(few, around, poses), kind='stable')[:FOLLOWED]]
     best: Floats = poses[int(scores(more, around, poses).argmax())]
@@ -157,7 +169,7 @@ def _searched(joint: Scan, around: LocalMap) -> Floats:
 
 
 def loops_at(scans: Scans, nodes: Floats, stretch: NDArray[np.int64], usual: float) -> list[Loop]:
-    """Return the loops of the blocks of a stretch with what was before it, where the nodes are."""
+    """Return the loop closures of the blocks of a stretch with earlier visits, near the given nodes."""
     progress, places, out = scans.windows.node_progress, Places(scans, nodes), []
     before = np.arange(0, len(nodes), SHARED)
     before = before[progress[before] < progress[stretch[0]] - APART]

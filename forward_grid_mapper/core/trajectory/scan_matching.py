@@ -1,8 +1,8 @@
-"""Scan matching: the nodes one after the other, each where its readings fit the map of the last metres best.
+"""Scan matching: two windows after the other are matched with the map of the last metres.
 
-It takes no walls at right angles. A few readings from a few places fit nearly as well some degrees off, so the best
-pose alone would be led astray by chance. The mean over all poses, weighted by how well they fit, is off by less. Errors
-add up, but more slowly than those of odometry: what stands beside the robot for some metres holds its yaw.
+It does not need walls at right angles. A few readings fit nearly as well at a yaw that is off by some degrees, so the
+best pose alone has large random errors. The mean of all poses, weighted by their likelihood, has smaller ones. Errors
+accumulate, but more slowly than those of odometry, because objects beside the robot stay on the map for some metres.
 """
 
 from __future__ import annotations
@@ -20,38 +20,38 @@ from .poses import Floats, compose, relative
 from .scans import Scans
 
 BLOCK = 2
-"""Windows that are matched at once: each has too few readings."""
+"""Windows that are matched together, since one has too few readings."""
 
 BEHIND, ON_MAP = 8.0, 800
-"""Metres of progress before a block that its map is made of, and readings of it at the most."""
+"""Metres of progress before a block within which windows make its map, and most readings of the map."""
 
 FIRST = 6
-"""Windows that stay as odometry has them: the first map is made of them."""
+"""Windows that keep the poses of odometry: they make the first map."""
 
 ALONG = 0.03, 0.03
-"""σ of how far odometry is off, in any direction: metres at least, and metres a metre."""
+"""σ of the position error of odometry along each axis: metres, and metres for each metre of driving."""
 
 YAW_OF_TURN, LEAST_YAW = 0.05, math.radians(0.5)
-"""σ of the yaw of odometry: parts of a turn, and radians at least."""
+"""σ of the yaw error of odometry: fraction of the turn, and smallest value, radians."""
 
 MOST_OFF = 4.0
-"""Nats that being off counts at the most, each way: wheels slip."""
+"""Upper limit of the negative log prior of each component, nats: wheels slip."""
 
 STEPS = (0.1, 0.1, math.radians(2.0))
 REACH, SIGMAS, FARTHEST = 0.1, 3.0, 0.5
-"""How far poses are asked: metres either way, σ of the yaw, and radians at the most."""
+"""Half the size of the grid of poses: metres, σ of the yaw, and upper limit of this, radians."""
 
-ASKED = 60
-"""Readings that are asked at each pose."""
+EVALUATED = 60
+"""Readings that are evaluated at each pose."""
 
 
 class Trust(NamedTuple):
-    """How much readings are trusted, and odometry.
+    """The weights of readings and odometry.
 
     Attributes
     ----------
     counts : float
-        What the log-likelihood of a reading counts: readings of one place depend on each other.
+        Factor of the log-likelihood of a reading, below 1 because readings from one place are correlated.
     yaw : float
         σ of the yaw of odometry, radians a √metre.
     """
@@ -61,18 +61,18 @@ class Trust(NamedTuple):
 
 
 TRUSTS = (Trust(0.3, math.radians(4.0)), Trust(0.5, math.radians(5.5)))
-"""What is tried, in this order: chance leads each astray in other places."""
+"""The weights that are tried, in this order; each fails in other places."""
 
 
 def scan_matched(scans: Scans, trust: Trust, watch: Progress) -> Floats:
-    """Return the nodes of a drive, from the first one as odometry has it on, float64, shape (K, 3).
+    """Return the nodes of a drive by scan matching, shape (K, 3); the first one is that of odometry.
 
     Parameters
     ----------
     scans : Scans
     trust : Trust
     watch : callable
-        Receives how much is done, from 0 to 1.
+        Receives the fraction of the work that is done, from 0 to 1.
     """
     w = scans.windows
     odometry, nodes = w.node, w.node.copy()
@@ -85,7 +85,7 @@ def scan_matched(scans: Scans, trust: Trust, watch: Progress) -> Floats:
 
 
 def _off(scans: Scans, nodes: Floats, block: NDArray[np.int64], motion: Floats, trust: Trust) -> Floats:
-    """Return by how much the motion from the last node to a block is off, in the frame of that node, shape (3,)."""
+    """Return the error of odometry from the last node to a block, in the frame of that node, shape (3,)."""
     w, last = scans.windows, len(nodes) - 1
     behind = np.flatnonzero(w.node_progress[last + 1] - w.node_progress[: last + 1] < BEHIND)
     around = scans.map(behind, nodes[last], nodes, ON_MAP)
@@ -97,7 +97,7 @@ def _off(scans: Scans, nodes: Floats, block: NDArray[np.int64], motion: Floats, 
     reach = np.array([REACH, REACH, min(SIGMAS * sigma[2], FARTHEST)])
     poses = grid_around(np.zeros(3), reach, STEPS)
     joint = scans.joint(block, motion)
-    fits = trust.counts * scores(joint, around, poses, max(len(joint.readings) // ASKED, 1))
+    fits = trust.counts * scores(joint, around, poses, max(len(joint.readings) // EVALUATED, 1))
     value = fits - np.minimum(0.5 * (poses / sigma) ** 2, MOST_OFF).sum(1)
     weight = np.exp(value - value.max())
     out: Floats = weight @ poses / weight.sum()

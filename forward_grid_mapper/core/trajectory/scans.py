@@ -1,4 +1,4 @@
-"""The scans and local maps of a drive's windows, given the nodes."""
+"""Scans and local maps of the windows of a drive, for given nodes."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from .poses import Floats, compose, relative
 from .windows import Windows, corrected
 
 FEWEST_ON_MAP = 30
-"""Readings that a local map is made from at least."""
+"""Fewest readings that a local map is made from."""
 
 MOST_ON_MAP = 800
-"""Readings that it is made from at most, drawn from all: more take time, and hardly change the map."""
+"""Most readings that a local map is made from, drawn at random: more take time, and hardly change the map."""
 
 
 class Scans:
@@ -29,12 +29,13 @@ class Scans:
     ----------
     windows : Windows
     scan : list of Scan
-        The readings of each window in the frame of its node, in any order.
+        The readings of each window in the frame of its node, in random order.
     count : int64, shape (K,)
-        How many of them may be used; none of windows that are held out.
+        Number of readings that may be used; 0 for held-out windows.
     held_out : bool, shape (K,)
-    judged : dict
-        What `holding_out.predicted` found, since the same is asked several times.
+        Windows whose readings are only predicted.
+    predictions : dict
+        Cache of `holding_out.predicted`.
     """
 
     def __init__(
@@ -44,19 +45,19 @@ class Scans:
         first, resolution = windows.first, parameters.grid.resolution
         self.resolution = resolution
         self.held_out = held_out
-        self.judged: dict[tuple[bytes, bytes, float], float] = {}
+        self.predictions: dict[tuple[bytes, bytes, float], float] = {}
         sensors = compose(windows.robot, windows.mount)
         local = relative(np.repeat(windows.node, np.diff(first), axis=0), sensors)
         unknown = UNKNOWN * hit_probability(parameters.model, resolution)
         whole = make_scan(windows.readings, local, parameters.model, resolution, unknown)
-        # in any order, so that every n-th reading is not of the same few sensors
+        # in random order, so that every n-th reading is not of the same few sensors
         window = np.repeat(np.arange(len(windows)), np.diff(first))
         mixed = whole.readings[np.lexsort((np.random.default_rng(0).random(len(window)), window))]
         self.count = np.where(held_out, 0, np.diff(first))
         self.scan = [Scan(mixed[begin:end], whole.weight) for begin, end in itertools.pairwise(first.tolist())]
 
     def joint(self, members: NDArray[np.int64], poses: Floats) -> Scan:
-        """Return the readings of several windows as one scan, given their nodes' poses, shape (len(members), 3)."""
+        """Return the readings of several windows as one scan; `poses` of their nodes have the shape (members, 3)."""
         parts = []
         for k, pose in zip(members, poses, strict=True):
             if self.held_out[k]:
@@ -70,17 +71,18 @@ class Scans:
     def map(
         self, members: NDArray[np.int64], origin: Floats, nodes: Floats, most: int = MOST_ON_MAP
     ) -> LocalMap | None:
-        """Return the map of some windows in the frame `origin`; None where they have hardly any readings.
+        """Return the local map of some windows; None if they have fewer readings than `FEWEST_ON_MAP`.
 
         Parameters
         ----------
         members : int64
             Windows.
         origin : float64, shape (3,)
+            Frame of the map.
         nodes : float64, shape (n, 3)
-            Of the first n windows, all of `members` among them.
+            Of the first n windows; they include `members`.
         most : int
-            Readings that it is made from at most.
+            Most readings that it is made from.
         """
         if self.count[members].sum() < FEWEST_ON_MAP:
             return None
@@ -91,17 +93,11 @@ class Scans:
         return local_map(self._placed(which, nodes, origin), self._parameters, self._stop)
 
     def objective(self, nodes: Floats) -> float:
-        """Return J of the whole drive along nodes, shape (K, 3), nats.
-
-        Readings of windows that are held out have no say.
-        """
+        """Return J of the map of the whole drive, with nodes of shape (K, 3), nats; without held-out readings."""
         return self.explained(nodes)[0]
 
     def explained(self, nodes: Floats) -> tuple[float, Floats]:
-        """Return J of the whole drive along nodes, shape (K, 3), and what the readings of each window have of it.
-
-        Both are in nats; the second has shape (K,), and 0 for windows that are held out.
-        """
+        """Return `objective`, and what the readings of each window contribute to it, shape (K,), nats."""
         which = self._readings_of(np.arange(len(self.windows)))
         value, each = explained(self._placed(which, nodes, np.zeros(3)), self._parameters, self._stop)
         window = np.repeat(np.arange(len(self.windows)), np.diff(self.windows.first))[which]
@@ -113,7 +109,7 @@ class Scans:
         return np.concatenate([np.arange(first[k], first[k + 1]) for k in members if not self.held_out[k]])
 
     def _placed(self, which: NDArray[np.int64], nodes: Floats, origin: Floats) -> Readings:
-        """Return some readings where the nodes of the first windows have them, in the frame `origin`."""
+        """Return some readings, placed by the nodes of the first windows, in the frame `origin`."""
         w, known = self.windows, len(nodes)
         robot = corrected(w.progress[which], w.robot[which], w.node_progress[:known], w.node[:known], nodes)
         return at_poses(w.readings.select(which), relative(origin, compose(robot, w.mount[which])))

@@ -1,7 +1,7 @@
-"""Solving a drive: the pose graph of what straight walls say first, then with matches and places seen before.
+"""Solving a drive: the pose graph with yaws and distances of straight walls, then with matches and loop closures.
 
-Straight walls come first, for local maps follow a bend of the drive and say nothing against it. With their help the
-nodes are right to some centimetres over some metres, and local maps sharp.
+Walls come first because local maps are bent as the trajectory is, and matches then confirm the bend. With walls, nodes
+are accurate to some centimetres over some metres, and local maps are sharp.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from .heading import Heading
 from .holding_out import LEAST_SIGMAS, gain, predicted
-from .loops import Looked, Loop, find_loops, loops_of
+from .loops import Loop, SearchResults, find_loops, loops_of
 from .odometry_model import (
     CALIBRATION,
     CALIBRATION_SIGMA,
@@ -25,127 +25,127 @@ from .odometry_model import (
     sensitivity,
     with_yaw,
 )
-from .passes import BLOCK, Found, Progress, again, ahead, bent
+from .passes import BLOCK, Matches, Progress, deformation, match_preceding, match_surrounding
 from .pose_graph import Edges, Graph, Solution, Walls, Yaws, joined, no_edges, no_walls, no_yaws, solve
 from .poses import Floats, rms_after_alignment
-from .relocating import MORE, displaced, loops_at, recognised, revisits, unsupported, windows_of
+from .relocating import MORE_RECOGNISED, displaced, loops_at, recognised, revisits, unsupported, windows_of
 from .scans import Scans
 from .wall_distances import Distances
 from .walls import EVERY, SPAN
 from .windows import Odometry, Windows
 
 WALL_ROUNDS = 3
-"""Times that distances of walls are measured anew where the nodes have moved to."""
+"""Times that distances of walls are measured, each time from the nodes of the solution before."""
 
 SAMPLES = 40
-"""Deviations that are drawn to know how far places may be off."""
+"""Samples of the posterior that give the size of loop closure searches."""
 
-OF_MATCHES = 0.2
-"""What a match counts: the windows of a block are matched with one map, whose errors they share, and a map of what lies
-around is off as the block is."""
+MATCH_WEIGHT = 0.2
+"""Factor of the information of matches: the windows of a block share the errors of one map, and a map of what lies
+around has the errors of the block itself."""
 
-LARGEST_RESIDUAL, FIRST_OUT = 5.0 * OF_MATCHES, 0.5
-"""σ², in the mean over a loop, from which on it does not agree with the rest; and the part of the largest such mean
-from which on loops are taken out at once: what else is far off may be so because of these."""
+LARGEST_RESIDUAL, FIRST_OUT = 5.0 * MATCH_WEIGHT, 0.5
+"""Loop closures whose mean squared residual, σ², is larger than this are removed. In one step only those go that have
+more than this fraction of the largest: the others may be far off because of these."""
 
 SETTLED = 0.1
-"""Metres, in the root mean square, by which matching must have moved the nodes for it to be done again, and the nodes
-around a block or a place, relative to each other, for the block to be looked for there again: a cell."""
+"""Metres (rms), one cell. Matching is repeated if it moved the nodes by more. A block is searched at a place again if
+the nodes around either moved by more relative to each other."""
 
-UNSEEN, LEAST_YAW = 2.0, math.radians(1.0)
-"""Times that the yaw drifts more than walls say, and radians a √metre at least: an echo votes with all others of three
-metres, and what drifts within these is not seen. Wheels that slip now and then keep the yaw well in between."""
+NOISE_FACTOR, LEAST_YAW = 2.0, math.radians(1.0)
+"""Factor of the noise of the yaw that walls give, and its smallest value, radians a √metre. Votes average over three
+metres, so faster drift is not seen. With wheels that slip now and then, the yaw is accurate in between."""
 
-OF_YAWS = EVERY / SPAN
-"""What the loss of a yaw that votes measure counts: an echo votes at all places that are near, and counts once."""
+YAW_WEIGHT = EVERY / SPAN
+"""Factor of the loss of measured yaws: each echo votes at so many places, and should count once."""
 
-OF_WAYS = np.array([1.0, 1.0, 0.0, 0.0])
-"""The part of a calibration that is left where the yaw is known."""
+SCALE_AND_HEADING = np.array([1.0, 1.0, 0.0, 0.0])
+"""Selects the parts of a calibration that do not change the yaw, if this is measured."""
 
 
 class MatchSolver:
-    """What odometry and matches know about a drive, and its solutions.
+    """Solves a drive by odometry and matches.
 
     Parameters
     ----------
     windows : Windows
     scans : Scans
-    say : callable
-        Receives a stage, and returns what receives how much of it is done.
+    start_stage : callable
+        Receives the name of a stage, and returns the callable that receives its progress.
     motion : float64, shape (K − 1, 3)
-        From each node to the next one, in the frame of the first of the two.
+        Odometry from each node to the next one, in the frame of the first of the two.
     noise : float
-        Of its yaw, radians a √metre.
+        σ of its yaw, radians a √metre.
     change : float64, shape (K − 1, 3, C)
-        How `motion` changes with the calibration.
+        Derivative of `motion` with respect to the calibration.
     """
 
     def __init__(
         self,
         windows: Windows,
         scans: Scans,
-        say: Callable[[str], Progress],
+        start_stage: Callable[[str], Progress],
         motion: Floats,
         noise: float,
         change: Floats,
     ) -> None:
-        self._windows, self._scans, self._say, self._change = windows, scans, say, change
-        self._in_place: set[int] = set()
+        self._windows, self._scans, self._start_stage, self._change = windows, scans, start_stage, change
+        self._tried_stretches: set[int] = set()
         information = np.asarray(np.linalg.inv(covariances(windows, Noise(yaw=noise))), np.float64)
         count = np.arange(len(windows))
         self._steps = Edges(count[:-1], count[1:], motion, information)
         self._yaws = no_yaws()
 
     def with_matches(self, solution: Solution) -> tuple[Solution, list[Loop]]:
-        """Return what matches with local maps say as well, and the loops among them."""
-        known, loops = Looked(), list[Loop]()
-        for match, stage in ((ahead, 'matching'), (again, 'matching again')):
+        """Return the solution with matches and loop closures, starting from `solution`, and the loop closures."""
+        known, loops = SearchResults(), list[Loop]()
+        for match, stage in ((match_preceding, 'matching'), (match_surrounding, 'matching again')):
             before = solution.nodes
-            found = match(self._scans, solution.nodes, self._say(stage))
+            found = match(self._scans, solution.nodes, self._start_stage(stage))
             edges = _edges_of(found)
             walls = self._walls(solution.nodes, True)
-            both = joined(edges, *(_edges_of(loop.found) for loop in loops_of(known)))
+            both = joined(edges, *(_edges_of(loop.matches) for loop in loops_of(known)))
             solution = solve(self._graph(both, walls), solution.nodes, solution.calibration, SAMPLES)
-            watch, searched = self._say('places seen before'), solution.nodes
-            looked = find_loops(self._scans, searched, solution.samples, found.usual, watch, known)
+            watch, searched = self._start_stage('places seen before'), solution.nodes
+            results = find_loops(self._scans, searched, solution.samples, found.mean_score, watch, known)
             walls = self._walls(searched, True)
-            first, loops = self._with_loops(walls, edges, loops_of(looked), solution)
-            solution, loops = self._relocated(edges, loops, first, found.usual)
-            # maps from nodes that hardly moved are the same again
+            first, loops = self._with_loops(walls, edges, loops_of(results), solution)
+            solution, loops = self._with_stretches_relocated(edges, loops, first, found.mean_score)
+            # if nodes hardly moved, local maps and matches would be the same
             if rms_after_alignment(before, solution.nodes) < SETTLED:
                 break
-            # blocks that were carried to another place are to be looked for anew
-            known = self._unchanged(looked, searched, solution.nodes) if solution is first else Looked()
+            # blocks of a stretch that was moved must be searched again
+            known = self._unchanged(results, searched, solution.nodes) if solution is first else SearchResults()
         return solution, loops
 
-    def _relocated(
+    def _with_stretches_relocated(
         self, matches: Edges, loops: list[Loop], solution: Solution, usual: float
     ) -> tuple[Solution, list[Loop]]:
-        """Return the solution with stretches that fit where they are no more put where they belong."""
+        """Return the solution after moving stretches that lie in a wrong place to where they fit better."""
         begin = 0
         while True:
             blocks = unsupported(revisits(self._scans, solution.nodes), recognised(loops), begin)
             if blocks is None:
                 return solution, loops
             begin = int(blocks[len(blocks) // 2])
-            if int(blocks[0]) not in self._in_place:
-                self._say('places seen before')
-                self._in_place.add(int(blocks[0]))
-                solution, loops = self._elsewhere(blocks, matches, loops, solution, usual)
+            if int(blocks[0]) not in self._tried_stretches:
+                self._start_stage('places seen before')
+                self._tried_stretches.add(int(blocks[0]))
+                solution, loops = self._relocated(blocks, matches, loops, solution, usual)
 
-    def _elsewhere(
+    def _relocated(
         self, blocks: NDArray[np.int64], matches: Edges, loops: list[Loop], solution: Solution, usual: float
     ) -> tuple[Solution, list[Loop]]:
-        """Return the solution with some blocks in another place, if their readings are predicted better there."""
+        """Return the solution with a stretch moved to another place, if its readings are predicted better there."""
         scans, nodes = self._scans, solution.nodes
         stretch = windows_of(blocks, len(nodes))
         moved = displaced(scans, nodes, stretch)
         if moved is None:
             return solution, loops
         found, first = loops_at(scans, moved, stretch, usual), int(stretch[0])
-        if len(found) < len(recognised(loops).intersection(blocks.tolist())) + MORE:
+        if len(found) < len(recognised(loops).intersection(blocks.tolist())) + MORE_RECOGNISED:
             return solution, loops
-        # those with which the rest was led astray lead all that comes after it
+        # without the loop closures that tie what comes after the begin of the stretch to what lies before it
         across = [min(loop.block, loop.place) < first <= max(loop.block, loop.place) for loop in loops]
         rest = [loop for loop, out in zip(loops, across, strict=True) if not out]
         tried, kept = self._with_loops(self._walls(nodes, True), matches, [*rest, *found], solution)
@@ -154,12 +154,12 @@ class MatchSolver:
             return solution, loops
         return tried, kept
 
-    def _unchanged(self, looked: Looked, before: Floats, after: Floats) -> Looked:
-        """Return what would come out the same: where neither the map of the place nor the block was bent."""
-        at = np.unique(np.array([*looked], np.int64))
-        by = bent(self._windows.node_progress, before, after, at)
-        same = set(at[by < SETTLED].tolist())
-        return {key: loop for key, loop in looked.items() if same.issuperset(key)}
+    def _unchanged(self, results: SearchResults, before: Floats, after: Floats) -> SearchResults:
+        """Return the results that a new search would repeat, because neither block nor place changed its shape."""
+        at = np.unique(np.array([*results], np.int64))
+        deformed = deformation(self._windows.node_progress, before, after, at)
+        same = set(at[deformed < SETTLED].tolist())
+        return {key: loop for key, loop in results.items() if same.issuperset(key)}
 
     def _walls(self, nodes: Floats, strict: bool) -> Walls:
         return no_walls()
@@ -170,9 +170,9 @@ class MatchSolver:
     def _with_loops(
         self, walls: Walls, matches: Edges, loops: list[Loop], start: Solution
     ) -> tuple[Solution, list[Loop]]:
-        """Return the solution with those loops that agree with each other and with the rest."""
+        """Return the solution with the loop closures that agree with each other and with the rest, and these."""
         while True:
-            parts = [_edges_of(loop.found) for loop in loops]
+            parts = [_edges_of(loop.matches) for loop in loops]
             solution = solve(self._graph(joined(matches, *parts), walls), start.nodes, start.calibration)
             ends = len(matches.first) + np.cumsum([len(part.first) for part in parts], dtype=np.int64)
             each = np.split(solution.squared, ends - [len(part.first) for part in parts])[1:]
@@ -184,7 +184,7 @@ class MatchSolver:
 
 
 class Solver(MatchSolver):
-    """The same, and what walls say that stand at right angles.
+    """Solves a drive by odometry, matches, and walls at right angles.
 
     Parameters
     ----------
@@ -192,8 +192,8 @@ class Solver(MatchSolver):
     windows : Windows
     scans : Scans
     heading : Heading
-    say : callable
-        Receives a stage, and returns what receives how much of it is done.
+    start_stage : callable
+        Receives the name of a stage, and returns the callable that receives its progress.
     """
 
     def __init__(
@@ -202,17 +202,17 @@ class Solver(MatchSolver):
         windows: Windows,
         scans: Scans,
         heading: Heading,
-        say: Callable[[str], Progress],
+        start_stage: Callable[[str], Progress],
     ) -> None:
         self._odometry, self._heading = odometry, heading
         drifts = heading.drifts
         self.first_calibration = np.array([0.0, 0.0, drifts.bias, drifts.turn_scale])
         change = sensitivity(odometry, windows)
         motion = motions(odometry, windows) + change @ self.first_calibration
-        super().__init__(windows, scans, say, motion, max(LEAST_YAW, UNSEEN * drifts.noise), change)
+        super().__init__(windows, scans, start_stage, motion, max(LEAST_YAW, NOISE_FACTOR * drifts.noise), change)
         count = np.arange(len(windows))
         yaw = windows.node[heading.at, 2] + heading.measured
-        self._yaws = Yaws(heading.at, yaw, heading.information, OF_YAWS)
+        self._yaws = Yaws(heading.at, yaw, heading.information, YAW_WEIGHT)
         middles = (heading.at[1:] + heading.at[:-1]) / 2
         self._askew = heading.askew[np.searchsorted(middles, count)]
 
@@ -221,14 +221,14 @@ class Solver(MatchSolver):
         return self.first_calibration + solution.calibration
 
     def simple(self, calibration: Floats) -> Floats:
-        """Return the nodes of odometry with the heading of walls and a calibration, shape (K, 3)."""
+        """Return the nodes of odometry with the yaw of walls, and scale and heading of a calibration, shape (K, 3)."""
         w = self._windows
         turned = with_yaw(self._odometry, w.node_progress[self._heading.at], self._heading.correction)
-        return calibrated(turned, calibration * OF_WAYS).at(w.node_stamp)
+        return calibrated(turned, calibration * SCALE_AND_HEADING).at(w.node_stamp)
 
     def along_walls(self) -> Solution:
-        """Return what odometry and straight walls say."""
-        self._say('straight walls')
+        """Return the solution by odometry and straight walls, without matches."""
+        self._start_stage('straight walls')
         nodes, calibration = self.simple(np.zeros(len(CALIBRATION))), np.zeros(len(CALIBRATION))
         for k in range(WALL_ROUNDS):
             walls = self._walls(nodes, k == WALL_ROUNDS - 1)
@@ -240,7 +240,7 @@ class Solver(MatchSolver):
         return Distances(self._windows, self._scans.held_out, nodes, self._askew).walls(strict)
 
 
-def _edges_of(found: Found) -> Edges:
-    """Return matches as edges of the graph, for what they count."""
+def _edges_of(found: Matches) -> Edges:
+    """Return matches as edges of the graph, weighted by `MATCH_WEIGHT`."""
     edges = found.edges()
-    return edges._replace(information=OF_MATCHES * edges.information)
+    return edges._replace(information=MATCH_WEIGHT * edges.information)

@@ -1,10 +1,9 @@
-"""Straight walls as landmarks: how far nodes are from them, and which distances belong to one wall.
+"""Straight walls as landmarks: distances of nodes from them, and data association of distances and walls.
 
-An echo of range z from p touches a wall along n where n · p + z is the offset of the wall, and a cone hears the wall
-where n lies within it, wherever in the cone. So once the yaw is known the echoes of a metre of driving tell the
-distance of a wall along an axis to a centimetre or two. Distances that follow each other along the drive and put the
-wall in the same place are of one wall: it holds the drive straight, which local maps cannot, since a map that is bent
-as the drive is bent explains the readings just as well.
+An echo of range z from p touches a wall of normal n whose offset is n · p + z, if n is inside the cone. Once the yaw is
+known, the echoes of a metre of driving give the distance of a wall along an axis to a centimetre or two. Successive
+distances that put a wall in the same place belong to one wall. Such walls keep the trajectory straight. Local maps do
+not, since a map that is bent as the trajectory is explains the readings just as well.
 """
 
 from __future__ import annotations
@@ -23,62 +22,62 @@ BLOCK = 3
 """Windows whose echoes measure a distance together."""
 
 WIDTH = 0.06
-"""Metres that the echoes of one wall may differ by."""
+"""Metres by which offsets by the echoes of one wall may differ."""
 
 FEWEST = 3
-"""Echoes of a distance."""
+"""Fewest echoes of a distance."""
 
 LEAST_TRAVEL = 0.25
-"""Metres of progress that these must be apart: a corner is heard from one place as a wall is."""
+"""Metres of progress that these must span: from a single place, a corner cannot be told from a wall."""
 
 FARTHEST = 5.0
-"""Metres; echoes from farther are seldom of a wall."""
+"""Longest range that is used, metres; longer ones are seldom of a wall."""
 
 PEAKS = 2
-"""Distances of a block along one direction, at the most."""
+"""Most distances of a block along one direction."""
 
 MARGIN = math.radians(0.5)
-"""Radians that the yaw may be off."""
+"""Tolerance of the yaw when it is tested whether a normal is inside a cone, radians."""
 
 AHEAD, BESIDE = 0.3, math.radians(3.0)
-"""Radians from the yaw of the robot up to which a wall is ahead, and radians beside cones that its normal may then lie
-where none holds it, if no sensor looks straight ahead: sonars often look past it on both sides, a rough wall is heard
-all the same, and walls ahead tell the scale of odometry. With walls beside the robot as well, real drives are worse if
-a sensor looks straight to a side; if none does, `walls.beside` says how far they may lie."""
+"""If no sensor looks straight ahead, the normal of a wall within `AHEAD` radians of the yaw of the robot may lie up to
+`BESIDE` radians beside a cone: rough walls ahead are still detected, and they give the scale of odometry. For walls to
+the sides, this makes real drives worse if a sensor looks straight to a side; otherwise `walls.beside` has the angle."""
 
 GATE, GATE_OF_SCALE = (0.08, 0.06), (0.04, 0.02)
-"""Metres by which a wall may seem to have moved since it was last measured, and that a metre nearer or farther, where
-the scale of odometry counts: at first, and once the nodes are known better."""
+"""Gates of the data association, each for rough and for good estimates of the nodes: metres by which the offset of a
+wall may differ from the last one, and the same for each metre that the robot moved along the normal, because of the
+scale of odometry."""
 
 GATE_PER_METRE = 0.03
-"""The same for a metre of progress without measuring it."""
+"""The same for each metre of progress without a measurement of the wall."""
 
 STEP, LONGEST_GAP = 1.2, 3.7
-"""Metres of progress between blocks, and those after which a wall is another one."""
+"""Metres of progress between blocks; after so many without a measurement, a wall is a new one."""
 
 LEAST_SIGMA, FIRST_SIGMA = 0.015, 0.04
-"""σ of a distance at least, metres: cells and small things at the wall; and as long as the nodes are hardly known."""
+"""Smallest σ of a distance, metres, because of cells and small objects at the wall; and for rough nodes."""
 
 
 class Distances:
-    """Distances of nodes along the axes of the map, wall by wall not yet told apart.
+    """Measured distances of nodes from walls along the axes of the map, before data association.
 
     Parameters
     ----------
     windows : Windows
     held_out : bool, shape (K,)
-        Windows whose echoes do not count.
+        Windows whose echoes are not used.
     nodes : float64, shape (K, 3)
-        In a map whose walls lie along its axes.
+        In a map whose axes are parallel to the walls.
     askew : float64, shape (K,), optional
-        Radians by which the walls around each node are turned from that.
+        Angle of the walls around each node to the axes, radians.
 
     Attributes
     ----------
     node, direction : int64, shape (D,)
-        Node, and direction in right angles from the x axis, or from that as it is turned there.
+        Node, and direction of the normal: number of right angles from the x axis turned by `askew`.
     normal : float64, shape (D, 2)
-        The same as a unit vector.
+        The direction as a unit vector.
     distance, lever, yaw : float64, shape (D,)
         As in `pose_graph.Walls`.
     """
@@ -99,7 +98,7 @@ class Distances:
         self.normal = normals_of(self.direction, self._askew[self.node])
 
     def _measured(self, k: int) -> list[tuple[float, ...]]:
-        """Return the rows of the block that begins at window k."""
+        """Return the distances of the block that begins at window k: node, direction, distance, lever, yaw."""
         w = self._windows
         end = min(k + BLOCK, len(w))
         middle = k + (end - k) // 2
@@ -115,27 +114,27 @@ class Distances:
         for direction in range(4):
             angle = direction * math.pi / 2 + self._askew[middle]
             off = wrapped(sensor[:, 2] - angle)
-            asked, slant, sides = np.abs(off) <= half + MARGIN, np.zeros(len(off)), 0
-            if (asked & usable).sum() < FEWEST:
-                # the edge of the cone is the first to meet a wall whose normal lies beside it
+            in_cone, slant, sides = np.abs(off) <= half + MARGIN, np.zeros(len(off)), 0
+            if (in_cone & usable).sum() < FEWEST:
+                # the edge of the cone meets a wall whose normal lies beside it
                 ahead = self._looks_past and abs(wrapped(at[2] - angle)) < AHEAD
                 beside_it = np.where(off > 0.0, right, left)
                 far = np.maximum(beside_it, BESIDE if ahead else 0.0)
                 if far.any():
-                    asked, slant = np.abs(off) <= half + far, off - np.clip(off, -half, half)
-                    sides = _sides(slant[asked & (beside_it > 0.0)])
-            heard = asked & usable
+                    in_cone, slant = np.abs(off) <= half + far, off - np.clip(off, -half, half)
+                    sides = _sides(slant[in_cone & (beside_it > 0.0)])
+            heard = in_cone & usable
             arm, slant, ranges = sensor[heard, :2] - at[:2], slant[heard], z[heard]
             c, s = math.cos(angle), math.sin(angle)
             distance, lever = arm @ (c, s) + ranges * np.cos(slant), arm @ (s, -c) - ranges * np.sin(slant)
             for same in agreeing(distance, w.progress[of_block[heard]]):
-                # the frame of a door is heard on one side alone
+                # the frame of a door is detected by cones on one side only
                 if (slant[same] == 0.0).any() or _sides(slant[same]) >= sides:
                     rows.append((middle, direction, distance[same].mean(), lever[same].mean(), at[2]))
         return rows
 
     def tracked(self, strict: bool) -> NDArray[np.int64]:
-        """Return the number of the wall that each distance is of, shape (D,); `strict` where nodes are known well."""
+        """Return the number of the wall of each distance, shape (D,); `strict` is for good estimates of the nodes."""
         gate, of_scale = GATE[strict], GATE_OF_SCALE[strict]
         progress = self._windows.node_progress[self.node]
         robot = (self.normal * self._nodes[self.node, :2]).sum(1)
@@ -173,35 +172,35 @@ class Distances:
 
 
 def _sides(slant: Floats) -> int:
-    """Return on how many sides of cones, 0 to 2, a wall lies that they meet at these slants."""
+    """Return the number of signs among slants, 0 to 2: on how many sides of cones the wall lies."""
     return int((slant > 0.0).any()) + int((slant < 0.0).any())
 
 
 def normals_of(direction: NDArray[np.int64], askew: Floats) -> Floats:
-    """Return the unit vectors of directions in right angles, each turned by an angle in radians, shape (D, 2)."""
+    """Return the unit vectors of directions, in right angles, each turned by `askew` radians, shape (D, 2)."""
     x, y = np.array([(1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0)])[direction].T
     c, s = np.cos(askew), np.sin(askew)
     return np.stack([c * x - s * y, s * x + c * y], axis=1)
 
 
 def agreeing(distance: Floats, progress: Floats) -> list[NDArray[np.int64]]:
-    """Return the echoes, by number, of each distance on which enough of them agree, the most first."""
-    left, out = np.arange(len(distance)), []
+    """Return the indices of the echoes of each distance on which enough of them agree; the most echoes come first."""
+    remaining, out = np.arange(len(distance)), []
     for _ in range(PEAKS):
-        ordered = np.sort(distance[left])
-        together = np.searchsorted(ordered, ordered + WIDTH, side='right') - np.arange(len(ordered))
-        if together.max(initial=0) < FEWEST:
+        ordered = np.sort(distance[remaining])
+        counts = np.searchsorted(ordered, ordered + WIDTH, side='right') - np.arange(len(ordered))
+        if counts.max(initial=0) < FEWEST:
             break
-        begin = ordered[together.argmax()]
-        same = left[(distance[left] >= begin) & (distance[left] <= begin + WIDTH)]
-        left = left[np.abs(distance[left] - distance[same].mean()) >= WIDTH]
+        begin = ordered[counts.argmax()]
+        same = remaining[(distance[remaining] >= begin) & (distance[remaining] <= begin + WIDTH)]
+        remaining = remaining[np.abs(distance[remaining] - distance[same].mean()) >= WIDTH]
         if np.ptp(progress[same]) >= LEAST_TRAVEL:
             out.append(same)
     return out
 
 
 def noise_of(wall: NDArray[np.int64], place: Floats) -> float:
-    """Return the robust σ, metres, of where the distances of each wall put it, shapes (D,)."""
+    """Return the robust σ of the offsets of walls, metres, from the wall and the offset of each distance, (D,)."""
     off = []
     for number in np.flatnonzero(np.bincount(wall, minlength=1) > 2):
         mine = place[wall == number]

@@ -1,25 +1,24 @@
-"""The direction of walls beside the robot, from the echoes of a short piece of the drive.
+"""Votes for the direction of walls beside the robot, from the echoes of a short piece of the drive.
 
 An echo of range z, taken at p, touches the wall with normal n and distance d where n lies within the cone:
 
     n · p + z = d
 
-So over a few metres of driving the echoes of one wall agree in d for the right direction of n alone. For each direction
-the echoes vote for d; N votes in one bin agree by N (N − 1) pairs.
+Over a few metres of driving, the echoes of one wall agree in d only for the right direction of n. For each direction,
+a histogram of d is made (a Hough transform); N echoes in one bin count as N (N − 1) agreeing pairs.
 
-A post, a corner or the end of a wall is heard by one sensor after the other, and so long as it lies in one cone its
-echoes agree in d as well, for directions near the axis of that cone. But all of them touch the same point, so along the
-wall that they seem to touch, t · p for t at right angles to n, they are spread by the width of the cone at most. With
-φ half of its opening, the variance of a point that lies anywhere in it is (φ z)² / 3. Together with the width of the
-things that stand about, v = (φ z)² / 3 + `THING`, and pairs count
+Echoes of a post, a corner or the end of a wall also agree in d, for directions near the axis of the cone, as long as
+the object is in one cone. But they all come from the same point, so their spread along the supposed wall, t · p with t
+at right angles to n, is at most the width of the cone. With half angle φ, a point anywhere in the cone has the variance
+(φ z)² / 3. With the size of objects, v = (φ z)² / 3 + `THING`, and pairs count
 
     N' (N' − 1) · max(0, 1 − 2 mean(v) / var(t · p))          N' = N − λ − 2 √λ
 
-where λ echoes are in each bin if ranges are random: sensors do not vote for their own axes, whatever they hear.
+where λ is the number of echoes in each bin for random ranges. Otherwise sensors would vote for their own axes.
 
-The sonars of many robots look past the walls of a corridor on both sides: three that look ahead do, or eight at equal
-angles if none looks straight ahead. A rough wall is heard all the same, where the edge of the cone meets it first: with
-s the angle from the edge to n, an echo then has
+The sonars of many robots all look past the walls of a corridor: three that look ahead, or eight at equal angles of
+which none looks to a side. The edge of such a cone meets a rough wall at a slant, and the echo is still received: with
+s the angle from the edge to n,
 
     n · p + z cos s = d
 """
@@ -37,48 +36,49 @@ from .poses import Floats, compose, relative
 from .windows import Windows
 
 DIRECTIONS = 90
-"""Directions in a right angle, a degree each: walls at right angles vote together."""
+"""Directions, one for each degree of a right angle: walls at right angles to each other vote for the same one."""
 
 SPAN = 3.0
-"""Metres of travel whose echoes vote together."""
+"""Metres of progress whose echoes vote together."""
 
 EVERY = 1.2
-"""Metres between two votes."""
+"""Metres of progress between two places with votes."""
 
 BIN = 0.06
-"""Metres that the distances of echoes of one wall may differ by."""
+"""Size of the bins of d, metres."""
 
 BINS = 400
 
 FARTHEST = 3.5
-"""Metres; echoes from farther hear too much at once."""
+"""Longest range of an echo that votes, metres: farther away, too many objects are in the cone."""
 
 FEWEST = 9
-"""Echoes that it takes to vote."""
+"""Fewest echoes of a place with votes."""
 
 CHANCE = 2.0
-"""Standard deviations of the echoes that a bin has by chance, beyond their mean, that do not count."""
+"""Standard deviations of the number of echoes of a bin by chance that are subtracted, beside its mean."""
 
 POINT = 2.0
-"""Times the variance of a thing from where on echoes may be of a wall."""
+"""Echoes count if their variance along the wall is more than so many times that of an object."""
 
 THING = 0.5**2 / 12
-"""Square metres: the variance of places on a thing of half a metre, which has sides but is no wall."""
+"""Variance of points on an object of half a metre, m²: it has sides but is no wall."""
 
 TENTHS = 3600
-"""Tenths of a degree in a full turn; in whole numbers of them cones are compared, so that left mirrors right."""
+"""Tenths of a degree in a full turn; cones are compared in integers of this unit, so that left and right are treated
+the same."""
 
 BESIDE, COUNTS = math.radians(30.0), 0.5
-"""Radians beside a cone up to which the normal of a wall may lie, and what such an echo counts, if no sensor looks
-straight to a side. With one that does, votes are sharper without."""
+"""If no sensor looks straight to a side, the normal of a wall may lie up to so many radians beside a cone, and such an
+echo has this weight. With a sensor to a side, votes are sharper without such echoes."""
 
 WELL_INSIDE = 30
-"""Tenths of a degree from the edge of its cone at least at which a sensor holds what lies straight to a side: yaws
-waver."""
+"""A sensor looks straight to a side if this direction is at least so many tenths of a degree inside of its cone, since
+yaws vary."""
 
 USUAL = 0.05
-"""Part of the usual mean of a place's votes that is added for all directions: where hardly any echoes agree, those that
-do say little."""
+"""Fraction of the median number of votes that is added to all directions of a place: without it, places where hardly
+any echoes agree would weigh as much as others."""
 
 
 @kernel
@@ -91,7 +91,7 @@ def count_votes(echoes: Any, counts: Any, votes: Any) -> None:
         x, y, bearing, half angle and range of each echo, and how far beside its cone the normal may lie, to the right
         and to the left; metres and radians.
     counts : float64, shape (BINS, 4)
-        Workspace: of each bin the echoes, Σ and Σ of squares of where they lie along the wall, Σ of v.
+        Workspace: for each bin the number of echoes, the sum of t · p and of its squares, and the sum of v.
     votes : float64, shape (DIRECTIONS,)
         For directions of walls 0°, 1°, … modulo 90°.
     """
@@ -133,7 +133,7 @@ def count_votes(echoes: Any, counts: Any, votes: Any) -> None:
 def beside(bearing: Floats, half: Floats) -> Floats:
     """Return how far beside cones the normal of a wall may lie, to the right and to the left, shape (N, 2), radians.
 
-    It is as far as no cone reaches, and at most `BESIDE`; nothing if a sensor looks straight to a side of the robot.
+    It is the angle that no other cone covers, at most `BESIDE`; 0 if a sensor looks straight to a side of the robot.
 
     Parameters
     ----------
@@ -146,20 +146,20 @@ def beside(bearing: Floats, half: Floats) -> Floats:
     from_a_side = np.abs(np.abs((middle + TENTHS // 2) % TENTHS - TENTHS // 2) - TENTHS // 4)
     if (from_a_side <= wide - WELL_INSIDE).any():
         return np.zeros((len(bearing), 2))
-    # of a sensor that turns on the robot there are as many cones as readings
+    # a sensor that turns on the robot has as many cones as readings, so this is vectorised
     first, last = middle - wide, middle + wide
     changes = np.bincount(first % TENTHS, minlength=TENTHS) - np.bincount((last + 1) % TENTHS, minlength=TENTHS)
     held = np.cumsum(changes) + np.count_nonzero(first % TENTHS > (last + 1) % TENTHS) > 0
     far = np.arange(10, round(math.degrees(BESIDE) * 10.0) + 1, 10)
     out = np.empty((len(cones), 2))
     for k, edge in enumerate((first[:, None] - far, last[:, None] + far)):
-        # degree by degree from the edge on
+        # degrees from the edge on, until the first one that another cone covers
         out[:, k] = np.radians(np.logical_and.accumulate(~held[edge % TENTHS], axis=1).sum(1))
     return out[which]
 
 
 def wall_votes(windows: Windows, held_out: NDArray[np.bool_]) -> tuple[NDArray[np.int64], Floats]:
-    """Return at which nodes there are votes, and these in the frame of the node.
+    """Return the nodes at which there are votes, and the votes in the frame of the node.
 
     Parameters
     ----------
@@ -172,7 +172,7 @@ def wall_votes(windows: Windows, held_out: NDArray[np.bool_]) -> tuple[NDArray[n
     at : int64, shape (B,)
         Nodes.
     votes : float64, shape (B, DIRECTIONS)
-        Relative to their mean; 1 where nothing can be said, and nearer to 1 the less there is to vote.
+        Relative to their mean: 1 without information, and closer to 1 the fewer echoes agree.
     """
     w = windows
     steps = np.floor(w.node_progress / EVERY)

@@ -1,10 +1,10 @@
-"""The windows of a drive: pieces short enough for the shape that odometry gives them, each with a node in its middle.
+"""The windows of a drive: pieces so short that odometry is accurate within them, each with a node in its middle.
 
     u = travel / 0.4 m + |turn| / 90°
 
-counts how far odometry has drifted, more or less; a window is a whole step of u. Its *node* is the robot's pose in the
-middle of the step. The trajectory is a pose for each node; between nodes the correction of the odometry goes over
-linearly from one to the next.
+grows about as the errors of odometry do. A window is a step of 1 in u. Its *node* (keyframe) is the pose of the robot
+in the middle of the step. The trajectory is a pose for each node. Between nodes, the correction of the odometry is
+interpolated linearly.
 """
 
 from __future__ import annotations
@@ -19,28 +19,28 @@ from ..common.readings import Readings
 from .poses import Floats, compose, interpolated, relative
 
 TRAVEL = 0.4
-"""Metres of a window that does not turn."""
+"""Metres of a window in which the robot does not turn."""
 
 TURN = math.radians(90.0)
-"""Radians of a window that does not travel."""
+"""Radians of a window in which the robot turns on the spot."""
 
 TURN_AS_TRAVEL = 0.3
-"""Metres that a radian of turning counts where corrections go over from one node to the next."""
+"""Metres of progress for each radian of turning; corrections are interpolated over progress."""
 
 STILL = 0.01
-"""Metres, and radians, by which the robot must have moved for a sensor to say something new."""
+"""Metres, and radians: a reading is left out if the robot moved by less since the last one of the same sensor."""
 
 
 @dataclass(frozen=True)
 class Odometry:
-    """The poses that odometry gives.
+    """A path: poses of the robot with time stamps, as measured by odometry, or of a trajectory.
 
     Attributes
     ----------
     stamp : int64, shape (M,)
         Nanoseconds, increasing.
     pose : float64, shape (M, 3)
-        In the frame of odometry; metres, and radians without jumps of a full turn.
+        In the odometry frame, or that of the map; metres, and unwrapped radians.
     """
 
     stamp: NDArray[np.int64]
@@ -48,7 +48,7 @@ class Odometry:
 
     @classmethod
     def of(cls, stamp: NDArray[np.int64], pose: Floats) -> Odometry:
-        """Return the odometry with its poses in order of time and its yaw unwrapped."""
+        """Return the odometry with its poses sorted by time, one for each stamp, and its yaw unwrapped."""
         order = np.argsort(stamp, kind='stable')
         stamp, pose = np.asarray(stamp, np.int64)[order], np.array(pose, np.float64)[order]
         pose = pose.reshape(-1, 3)
@@ -78,34 +78,34 @@ class Odometry:
 
     @property
     def turn(self) -> Floats:
-        """Radians turned, either way, until each pose."""
+        """Radians turned until each pose; left and right turns add up."""
         return np.concatenate([[0.0], np.cumsum(np.abs(np.diff(self.pose[:, 2])))])
 
     @property
     def progress(self) -> Floats:
-        """Travel and turn until each pose, in metres."""
+        """Progress until each pose, metres: travel + `TURN_AS_TRAVEL` · turn."""
         out: Floats = self.travel + TURN_AS_TRAVEL * self.turn
         return out
 
 
 @dataclass(frozen=True)
 class Windows:
-    """A drive in windows. There are K nodes and N readings, those taken at standstill left out.
+    """A drive in windows: K nodes and N readings. Readings taken at standstill are left out.
 
     Attributes
     ----------
     readings : Readings
-        Of which only ranges and limits matter; poses are those of odometry.
+        Sorted by time. Only ranges and limits are used; their poses are those of odometry.
     robot : float64, shape (N, 3)
-        Pose of the robot at each reading, as odometry gives it.
+        Pose of the robot at each reading, by odometry.
     mount : float64, shape (N, 3)
         Pose of the sensor on the robot.
     progress : float64, shape (N,)
-        Travel and turn until each reading, in metres.
+        Of each reading, metres (`Odometry.progress`).
     first : int64, shape (K + 1,)
-        The readings of window k are `first[k]` to `first[k + 1]`.
+        The readings of window k are those from `first[k]` to `first[k + 1]` − 1.
     node : float64, shape (K, 3)
-        Odometry at each node.
+        Pose of each node, by odometry.
     node_progress : float64, shape (K,)
     node_stamp : int64, shape (K,)
         Nanoseconds.
@@ -128,12 +128,12 @@ class Windows:
         return len(self.node)
 
     def corrected(self, progress: Floats, odometry: Floats, nodes: Floats) -> Floats:
-        """Return poses of odometry, shape (N, 3), corrected as `nodes` say, shape (K, 3)."""
+        """Return poses of odometry, shape (N, 3), corrected so that the nodes are at `nodes`, shape (K, 3)."""
         return corrected(progress, odometry, self.node_progress, self.node, nodes)
 
 
 def corrected(progress: Floats, odometry: Floats, at: Floats, node: Floats, nodes: Floats) -> Floats:
-    """Return poses of odometry corrected so that those of the nodes become `nodes`.
+    """Return poses of odometry corrected so that the nodes are at `nodes`; linear between them.
 
     Parameters
     ----------
@@ -153,7 +153,7 @@ def corrected(progress: Floats, odometry: Floats, at: Floats, node: Floats, node
 
 
 def _still(odometry: Floats, sensor: NDArray[np.int32]) -> NDArray[np.bool_]:
-    """Return which readings were taken where the same sensor was read before, shape (N,)."""
+    """Return which readings were taken when the robot had not moved since an earlier one of the sensor, shape (N,)."""
     out = np.zeros(len(sensor), np.bool_)
     for number in np.unique(sensor):
         mine = np.flatnonzero(sensor == number)
@@ -168,14 +168,14 @@ def _still(odometry: Floats, sensor: NDArray[np.int32]) -> NDArray[np.bool_]:
 
 
 def cut(readings: Readings, odometry: Odometry) -> Windows:
-    """Return the windows of a drive; the last, unfinished one is part of the one before it.
+    """Return the windows of a drive; the last window includes the rest of the drive, which is shorter than a window.
 
     Parameters
     ----------
     readings : Readings
         Placed by this odometry, in any order.
     odometry : Odometry
-        Of all of the drive.
+        Of the whole drive.
     """
     readings = readings.select(np.argsort(readings.stamp, kind='stable'))
     robot = odometry.at(readings.stamp)
@@ -188,10 +188,10 @@ def cut(readings: Readings, odometry: Odometry) -> Windows:
     grows = np.diff(u) > 0
     came, went = np.concatenate([[True], grows]), np.concatenate([grows, [True]])
     half = np.arange(count) + 0.5
-    # u does not grow where the robot stands: a node just behind such a place is put there, where it was read from
+    # u does not grow while the robot stands; a node just after that gets a time within it, when readings were taken
     middle = np.interp(half, u[came], knots[came])
     again = np.concatenate([[False], np.diff(np.interp(middle, knots, u)) <= 0.0])
-    # unless another node is there
+    # unless the node before it is there already
     middle[again] = np.interp(half[again], u[came | went], knots[came | went])
     of_reading = np.clip(np.interp(seconds, knots, u).astype(np.int64), 0, count - 1)
     first = np.searchsorted(of_reading, np.arange(count + 1))

@@ -17,13 +17,13 @@ from forward_grid_mapper.core.evidence.evidence import Evidence
 from forward_grid_mapper.core.evidence.fixed_point import QUANTUM
 from forward_grid_mapper.core.maps.free_space import (
     UNIT,
-    count,
+    count_passes,
     direction_of,
     expected_passes,
     noticed_by,
     passes_by_direction,
 )
-from forward_grid_mapper.core.maps.post_processing import led_on, post_process
+from forward_grid_mapper.core.maps.post_processing import grown_through, post_process
 from forward_grid_mapper.core.maps.wall_extension import extend
 from forward_grid_mapper.core.runtime import threads
 from samples import plain_model, random_readings
@@ -81,7 +81,7 @@ def test_what_any_surface_would_have_noticed_is_that_of_the_twin(seed: int, angl
     passes[:, :2] *= 1000.0
     passed, whole, out = np.round(passes / UNIT).astype(np.int64), np.empty(50), np.empty(50)
     p_hit = rng.choice([0.05, 0.65, 0.98])
-    count(passed, noticed_by(angle), p_hit, whole, out)
+    count_passes(passed, noticed_by(angle), p_hit, whole, out)
     assert np.array_equal(whole, passed.sum(axis=0) * UNIT)
     expected = naive.noticing(passed * UNIT, p_hit, angle)
     finite = np.isfinite(expected)
@@ -122,9 +122,9 @@ def test_readings_of_one_direction_do_not_say_that_a_cell_is_free() -> None:
 def test_free_space_leads_on_through_what_readings_passed_alone() -> None:
     known, passed = np.zeros((3, 12), bool), np.ones((3, 12), bool)
     known[1, 2], passed[:, 7] = True, False
-    assert np.array_equal(led_on(known, passed, 3).any(axis=0), np.arange(12) <= 5)
-    assert np.array_equal(led_on(known, passed, 9).any(axis=0), np.arange(12) <= 6)
-    assert np.array_equal(led_on(known, passed, 0), known)
+    assert np.array_equal(grown_through(known, passed, 3).any(axis=0), np.arange(12) <= 5)
+    assert np.array_equal(grown_through(known, passed, 9).any(axis=0), np.arange(12) <= 6)
+    assert np.array_equal(grown_through(known, passed, 0), known)
 
 
 def test_tiles_hold_all_that_decides_about_a_cell() -> None:

@@ -10,11 +10,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import naive
-from forward_grid_mapper.core.common.constants import LEAST_EVIDENCE, LEAST_LOOK
+from forward_grid_mapper.core.common.constants import LEAST_EVIDENCE, LEAST_NOTICING
 from forward_grid_mapper.core.common.parameters import SearchParameters
 from forward_grid_mapper.core.maps import uncertainty
 from forward_grid_mapper.core.maps.free_space import Passes
-from forward_grid_mapper.core.maps.uncertainty import calibrated, marginals, repeated, uncertainty_map
+from forward_grid_mapper.core.maps.uncertainty import calibrated, discounted, marginals, uncertainty_map
 from samples import plain_search
 
 SHAPE = (7, 9)
@@ -44,7 +44,7 @@ def test_without_passes_evidence_mixes_with_the_prior() -> None:
 def test_readings_that_repeat_each_other_are_averaged_over_how_much_they_do(x: float) -> None:
     share = (np.arange(400_000) + 0.5) * 1e-4
     left = float((np.exp(-share * x) * np.exp(-share)).sum() * 1e-4)
-    assert repeated(np.array([-x, x])) == pytest.approx([math.log(left), -math.log(left)], abs=1e-6)
+    assert discounted(np.array([-x, x])) == pytest.approx([math.log(left), -math.log(left)], abs=1e-6)
 
 
 @pytest.mark.parametrize('block', [1, 20, 50_000])
@@ -81,7 +81,7 @@ def test_what_speaks_for_an_obstacle_makes_it_likelier(seed: int, more: float) -
 def test_nothing_is_said_where_no_reading_would_have_noticed_anything() -> None:
     ml = np.array([[1, 0, -1, -1, -1], [1, 0, -1, -1, -1]], np.int8)
     evidence = np.array([0.0, 0.0, -5.0, 0.9, 2.0, 0.0, 0.0, -5.0, -0.9, -2.0]) * LEAST_EVIDENCE
-    noticing = np.array([0.0, 0.0, 0.9, 5.0, 0.0, 0.0, 0.0, 1.1, 5.0, 0.0]) * LEAST_LOOK
+    noticing = np.array([0.0, 0.0, 0.9, 5.0, 0.0, 0.0, 0.0, 1.1, 5.0, 0.0]) * LEAST_NOTICING
     passes = Passes(np.full(10, 3.0), noticing)
     traversed = np.zeros(ml.shape, bool)
     traversed[0, 1] = True

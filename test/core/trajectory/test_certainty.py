@@ -8,7 +8,15 @@ import numpy as np
 import pytest
 
 from forward_grid_mapper.core.common.parameters import Parameters
-from forward_grid_mapper.core.trajectory.certainty import Told, after, certain, of_ways, of_yaw, thinned, top_of
+from forward_grid_mapper.core.trajectory.certainty import (
+    Estimate,
+    combined_calibration,
+    determined_calibration,
+    parabola_top,
+    thinned,
+    translation_errors,
+    yaw_errors,
+)
 from forward_grid_mapper.core.trajectory.odometry_model import CALIBRATION, calibrated
 from forward_grid_mapper.core.trajectory.outcome import replaced
 from forward_grid_mapper.core.trajectory.windows import Odometry
@@ -39,7 +47,7 @@ def test_stated_errors_of_the_yaw_agree_with_real_ones(tour: Recording) -> None:
         # what no calibration makes right: a random walk of 2 degrees a √metre
         walk = np.cumsum(rng.normal(0, math.radians(2.0), len(true.stamp)) * np.sqrt(np.diff(true.travel, prepend=0)))
         odometry = Odometry(true.stamp, measured.pose + np.stack([0 * walk, 0 * walk, walk], 1))
-        for name, (value, sigma) in of_yaw(odometry, true).items():
+        for name, (value, sigma) in yaw_errors(odometry, true).items():
             off[name].append((value - want[name]) / sigma)
     for name, z in off.items():
         assert 0.6 < np.sqrt(np.mean(np.square(z))) < 1.6, name
@@ -49,7 +57,7 @@ def test_nothing_is_told_of_a_short_drive(tour: Recording) -> None:
     whole = odometry_of(tour)
     last = int(np.searchsorted(whole.progress, 6.0))
     short = Odometry(whole.stamp[:last], whole.pose[:last])
-    assert of_yaw(short, short) == {}
+    assert yaw_errors(short, short) == {}
 
 
 def test_the_top_of_parabolas_is_found_with_its_error() -> None:
@@ -59,7 +67,7 @@ def test_the_top_of_parabolas_is_found_with_its_error() -> None:
         tops, curved = rng.normal(0.3, 0.8, 40), rng.uniform(0.5, 2.0, 40)
         low, middle, high = (-0.5 * curved * (x - tops) ** 2 for x in (-1.0, 0.0, 1.0))
         low[0] = np.nan
-        told = top_of(low, middle, high)
+        told = parabola_top(low, middle, high)
         assert told is not None
         wanted = (curved[1:] * tops[1:]).sum() / curved[1:].sum()
         assert told.value == pytest.approx(wanted)
@@ -69,10 +77,10 @@ def test_the_top_of_parabolas_is_found_with_its_error() -> None:
 
 def test_what_is_not_curved_has_no_top() -> None:
     flat = np.zeros(20)
-    assert top_of(flat, flat, flat) is None
-    assert top_of(flat + 1, flat, flat + 1) is None
-    assert top_of(flat - 9, flat, flat + 8.9) is None, 'it lies too far away'
-    assert top_of(flat[:5] - 1, flat[:5], flat[:5] - 1) is None
+    assert parabola_top(flat, flat, flat) is None
+    assert parabola_top(flat + 1, flat, flat + 1) is None
+    assert parabola_top(flat - 9, flat, flat + 8.9) is None, 'it lies too far away'
+    assert parabola_top(flat[:5] - 1, flat[:5], flat[:5] - 1) is None
 
 
 @pytest.mark.slow
@@ -81,7 +89,7 @@ def test_a_scale_is_told_or_nothing_is_said(tour: Recording) -> None:
     want = {'scale': 0.03, 'heading': -0.02}
     odometry = calibrated(true, -vector(**want))
     readings = replaced(tour.readings, true, odometry)
-    told = of_ways(readings, odometry, true, {}, Parameters(), STOP)
+    told = translation_errors(readings, odometry, true, {}, Parameters(), STOP)
     assert told
     for name, (value, sigma) in told.items():
         assert abs(value - want[name]) < 3 * math.hypot(sigma, 0.005), name
@@ -89,7 +97,7 @@ def test_a_scale_is_told_or_nothing_is_said(tour: Recording) -> None:
 
 def test_only_what_is_certain_is_handed_on(tour: Recording) -> None:
     true = odometry_of(tour)
-    told = certain(tour.readings, true, true, {}, Parameters(), STOP)
+    told = determined_calibration(tour.readings, true, true, {}, Parameters(), STOP)
     assert list(told) == [name for name in CALIBRATION if name in told]
     assert {'bias', 'turn_scale'} <= set(told)
     for value, sigma in told.values():
@@ -99,13 +107,13 @@ def test_only_what_is_certain_is_handed_on(tour: Recording) -> None:
 def test_calibrations_one_after_the_other_are_one(tour: Recording) -> None:
     odometry = odometry_of(tour)
     one = dict(zip(CALIBRATION, (0.03, 0.01, 0.02, -0.03), strict=True))
-    other = {name: Told(value, 0.001) for name, value in zip(CALIBRATION, (-0.01, 0.02, -0.01, 0.02), strict=True)}
-    both = after(one, other)
+    other = {name: Estimate(value, 0.001) for name, value in zip(CALIBRATION, (-0.01, 0.02, -0.01, 0.02), strict=True)}
+    both = combined_calibration(one, other)
     there = calibrated(calibrated(odometry, vector(**one)), vector(**{k: v.value for k, v in other.items()}))
     at_once = calibrated(odometry, vector(**{k: v.value for k, v in both.items()}))
     assert at_once.pose[:, 2] == pytest.approx(there.pose[:, 2], abs=0.01)
     assert at_once.pose[:, :2] == pytest.approx(there.pose[:, :2], abs=0.15)
-    assert after({}, other) == {name: pytest.approx(told) for name, told in other.items()}
+    assert combined_calibration({}, other) == {name: pytest.approx(told) for name, told in other.items()}
 
 
 def test_thinned_readings_are_of_all_sensors_and_times(tour: Recording) -> None:

@@ -266,7 +266,7 @@ def test_places_are_recognised_in_what_was_mapped_before(sample: Sample, monkeyp
     sensor = (there.sensor + 8) % 16
     returned = replace(there, stamp=end + pause + (end - there.stamp), sensor=sensor)
     returned = returned.select(np.argsort(returned.stamp, kind='stable'))
-    both = following._both(there, returned)
+    both = following._concatenated(there, returned)
     base = Correction(path, path)
     drifts = []
     for recognises in (True, False):
@@ -276,7 +276,7 @@ def test_places_are_recognised_in_what_was_mapped_before(sample: Sample, monkeyp
         follower.follow(both, whole)
         assert (follower.places > 3) == recognises
         # what is followed, whether it is in force or not
-        path_now = follower._now.trajectory
+        path_now = follower._followed.trajectory
         drifts.append(np.hypot(*(path_now.pose - whole.at(path_now.stamp))[:, :2].T).max())
     assert drifts[0] < 0.3
     assert drifts[0] < 0.7 * drifts[1]
@@ -298,7 +298,7 @@ def test_places_stay_where_they_are_when_the_tail_is_shifted(seed: int) -> None:
     measured = relative(old, node) + rng.normal(0.0, 0.05, 3)
     half = rng.normal(0.0, 1.0, (3, 3))
     edges = Edges(np.zeros(1, np.int64), np.array([30]), measured[None], (half @ half.T)[None])
-    moved = following._seen_from(edges, relative(new, old), 8)
+    moved = following._edges_from(edges, relative(new, old), 8)
 
     def counted(frame: np.ndarray, e: Edges) -> float:
         r = relative(frame, node) - e.pose[0]
@@ -308,14 +308,14 @@ def test_places_stay_where_they_are_when_the_tail_is_shifted(seed: int) -> None:
     assert counted(new, moved) == pytest.approx(counted(old, edges))
     assert (moved.first[0], moved.second[0]) == (0, 22)
     gone = edges._replace(second=np.array([8 + SETTLED - 1]))
-    assert not len(following._seen_from(gone, relative(new, old), 8).first), 'settled nodes need none'
+    assert not len(following._edges_from(gone, relative(new, old), 8).first), 'settled nodes need none'
     assert axes_at(0.0) == pytest.approx(np.eye(3))
 
 
 def test_odometry_from_a_window_on_has_the_same_windows(sample: Sample) -> None:
     for begin in (0, 1, 7, 20):
         rest = following._from_step(sample.odometry, begin)
-        whole, ours = following._steps(sample.odometry), following._steps(rest)
+        whole, ours = following._window_coordinate(sample.odometry), following._window_coordinate(rest)
         assert ours[-1] == pytest.approx(whole[-1] - begin)
         assert (np.diff(rest.stamp) >= 0).all()
         one = cut(sample.readings.select(sample.readings.stamp > rest.stamp[0]), rest)

@@ -204,7 +204,7 @@ def test_a_vote_is_a_likelihood(bent) -> None:
             left = int(place)
             row = votes[k]
             here = row[left] + (place - left) * (row[(left + 1) % DIRECTIONS] - row[left])
-            wanted = module.DOUBT + (1 - module.DOUBT) * here
+            wanted = module.UNIFORM_PART + (1 - module.UNIFORM_PART) * here
             assert chain.likelihood[k, 0, state] == pytest.approx(wanted)
 
 

@@ -264,7 +264,7 @@ def test_a_turn_is_a_jump_only_if_readings_fit_where_the_robot_stood_alone(
     x, y, yaw = odometry.pose[first].tolist()
     readings, odometry = begun_anew(readings, odometry, 0.5, (x, y, yaw + 1.2))
     where = {tuple(before.tolist()): stood, tuple(odometry.pose[first].tolist()): turned}
-    monkeypatch.setattr(jumping._Usual, 'fits', lambda self, around, begin, least: where[tuple(begin.tolist())])
+    monkeypatch.setattr(jumping._FitCheck, 'fits', lambda self, around, begin, least: where[tuple(begin.tolist())])
     nothing, stop = np.zeros(0, np.int64), np.zeros(1, np.uint8)
     found = jumping.with_doubtful(readings, odometry, nothing, Parameters(), stop)
     assert found.tolist() == ([first] if stood and not turned else [])

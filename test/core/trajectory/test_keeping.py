@@ -10,7 +10,7 @@ import pytest
 from forward_grid_mapper.core.common.errors import Cancelled
 from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.trajectory.correction import Correction
-from forward_grid_mapper.core.trajectory.keeping import kept
+from forward_grid_mapper.core.trajectory.keeping import keep_if_not_worse
 from forward_grid_mapper.core.trajectory.outcome import Refinement
 from forward_grid_mapper.core.trajectory.poses import compose, rms_after_alignment
 from forward_grid_mapper.core.trajectory.windows import Odometry
@@ -47,7 +47,7 @@ def sample() -> Sample:
 
 def outcome(sample: Sample, **changes: object) -> Refinement:
     values = {'before': sample.before, 'correction': sample.correction, 'refused': sample.refused, **changes}
-    return kept(**values, parameters=Parameters(), stop=np.zeros(1, np.uint8))  # type: ignore[arg-type]
+    return keep_if_not_worse(**values, parameters=Parameters(), stop=np.zeros(1, np.uint8))  # type: ignore[arg-type]
 
 
 def test_it_stays_and_goes_on(sample: Sample) -> None:
@@ -96,4 +96,4 @@ def test_poses_that_were_thinned_out_do_not_matter(sample: Sample) -> None:
 
 def test_it_can_be_cancelled(sample: Sample) -> None:
     with pytest.raises(Cancelled):
-        kept(sample.before, sample.correction, sample.refused, Parameters(), np.ones(1, np.uint8))
+        keep_if_not_worse(sample.before, sample.correction, sample.refused, Parameters(), np.ones(1, np.uint8))

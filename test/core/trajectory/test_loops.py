@@ -13,7 +13,7 @@ from forward_grid_mapper.core.trajectory import loops
 from forward_grid_mapper.core.trajectory.local_map import for_matching
 from forward_grid_mapper.core.trajectory.loops import AROUND, LENGTH, Loop, Places, find_loop, find_loops, loops_of
 from forward_grid_mapper.core.trajectory.matching import Match
-from forward_grid_mapper.core.trajectory.passes import Found, ahead
+from forward_grid_mapper.core.trajectory.passes import Matches, match_preceding
 from forward_grid_mapper.core.trajectory.pose_graph import residuals
 from forward_grid_mapper.core.trajectory.poses import Floats, compose, relative
 from forward_grid_mapper.core.trajectory.scans import Scans
@@ -39,7 +39,7 @@ def solver() -> Solver:
 
 def wrong_by(found: list[Loop], true: Floats) -> Floats:
     """Return by how many metres each loop misses the right place."""
-    return np.array([np.hypot(*np.median(residuals(true, loop.found.edges())[:, :2], axis=0)) for loop in found])
+    return np.array([np.hypot(*np.median(residuals(true, loop.matches.edges())[:, :2], axis=0)) for loop in found])
 
 
 def test_a_place_is_found_where_the_graph_does_not_expect_it(solver) -> None:
@@ -48,7 +48,7 @@ def test_a_place_is_found_where_the_graph_does_not_expect_it(solver) -> None:
     nodes = true + np.where(second[:, None], OFF, 0.0)
     samples = np.random.default_rng(0).standard_normal((40, 1, 3)) * (SIGMA, SIGMA, math.radians(1.0))
     samples = np.where(second[:, None], samples, 0.0)
-    usual = ahead(scans, true, lambda part: None).usual
+    usual = match_preceding(scans, true, lambda part: None).mean_score
     found = loops_of(find_loops(scans, nodes, samples, usual, lambda part: None))
     across = [loop for loop in found if second[loop.block] != second[loop.place]]
     assert len(across) >= 3
@@ -57,7 +57,7 @@ def test_a_place_is_found_where_the_graph_does_not_expect_it(solver) -> None:
 
 def loop(true: Floats, block: int, place: int, off: float, sigma: float = 0.02) -> Loop:
     """Return a loop that puts a block aside of where it is."""
-    found = Found()
+    found = Matches()
     information = np.diag([sigma**-2, sigma**-2, math.radians(1.0) ** -2])
     for k in range(block - LENGTH // 2, block + LENGTH // 2):
         pose = relative(true[place], true[k]) + np.array([off, off, 0.0])
@@ -70,7 +70,7 @@ def test_a_wrong_place_does_not_take_right_ones_with_it(solver) -> None:
     true, block = start.nodes, len(start.nodes) - 5
     right = [loop(true, block, place, 0.0) for place in (5, 9)]
     wrong = loop(true, block, 13, 0.7, 0.01)
-    solution, kept = solver._with_loops(solver._walls(true, True), Found().edges(), [*right, wrong], start)
+    solution, kept = solver._with_loops(solver._walls(true, True), Matches().edges(), [*right, wrong], start)
     assert [each.place for each in kept] == [each.place for each in right]
     assert np.hypot(*(solution.nodes - true)[:, :2].T).max() < 0.1
 
@@ -97,7 +97,7 @@ def gallery(bays: list[int]) -> Scans:
 def found_on_the_way_back(scans: Scans) -> list[Loop | None]:
     """Return what comes of looking for blocks far from the ends of the corridor, unsure by a metre along it."""
     nodes = scans.windows.node
-    usual = ahead(scans, nodes, lambda part: None).usual
+    usual = match_preceding(scans, nodes, lambda part: None).mean_score
     there = scans.windows.node_progress < 16.0
     out, places = [], Places(scans, nodes)
     for middle in np.flatnonzero(~there & (nodes[:, 0] > 7.0) & (nodes[:, 0] < 13.0))[::6]:
@@ -124,7 +124,7 @@ def test_the_same_place_is_taken_where_bays_are_at_distances_of_their_own() -> N
 def test_what_is_known_is_not_looked_for_again(solver, monkeypatch) -> None:
     scans, true = solver._scans, solver._windows.node
     samples = np.random.default_rng(0).standard_normal((40, len(true), 3)) * (0.1, 0.1, 0.01)
-    usual = ahead(scans, true, lambda part: None).usual
+    usual = match_preceding(scans, true, lambda part: None).mean_score
     known = find_loops(scans, true, samples, usual, lambda part: None)
     assert loops_of(known)
     # the whole is carried along, and its end is bent

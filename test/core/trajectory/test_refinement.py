@@ -15,11 +15,19 @@ from forward_grid_mapper.core.common.readings import Readings
 from forward_grid_mapper.core.mapping import Mapper
 from forward_grid_mapper.core.trajectory import refinement
 from forward_grid_mapper.core.trajectory.heading import NOISES, Drifts, Heading
-from forward_grid_mapper.core.trajectory.holding_out import FEWEST_BLOCKS, LATER, NEAR, Gain, came_back, gain, held_out
+from forward_grid_mapper.core.trajectory.holding_out import (
+    FEWEST_BLOCKS,
+    NEAR,
+    REVISIT_AFTER,
+    Gain,
+    gain,
+    has_revisits,
+    held_out,
+)
 from forward_grid_mapper.core.trajectory.hypotheses import Solved
 from forward_grid_mapper.core.trajectory.outcome import Refinement
 from forward_grid_mapper.core.trajectory.poses import compose, relative, rms_after_alignment
-from forward_grid_mapper.core.trajectory.refinement import Refiner, _said, unfit
+from forward_grid_mapper.core.trajectory.refinement import Refiner, _gain_words, unfit
 from forward_grid_mapper.core.trajectory.scans import Scans
 from forward_grid_mapper.core.trajectory.windows import Odometry, cut
 from forward_grid_mapper.simulation.drift import LEVELS, odometry_of, with_drift
@@ -56,9 +64,9 @@ def outcome(bent, stages) -> Refinement:
 def test_an_error_that_is_not_known_is_no_number() -> None:
     """As with a sweep each metre, where no block has readings enough to be compared."""
     nothing = np.full(20, np.nan)
-    assert 'too few readings' in _said(gain(nothing, nothing))
+    assert 'too few readings' in _gain_words(gain(nothing, nothing))
     rng = np.random.default_rng(0)
-    assert '± 0.' in _said(gain(rng.random(20), rng.random(20)))
+    assert '± 0.' in _gain_words(gain(rng.random(20), rng.random(20)))
 
 
 def test_drift_is_taken_out(tour, bent, outcome, stages) -> None:
@@ -79,21 +87,21 @@ def test_what_speaks_for_it_is_named(bent, monkeypatch, outcome) -> None:
     assert outcome.reason.startswith(('readings are predicted', 'that walls stand at right angles'))
     # no readings are predicted so much better, and nothing was seen before, so the walls have the word
     monkeypatch.setattr(refinement, 'LEAST_SIGMAS', 1e9)
-    monkeypatch.setattr(refinement, 'came_back', lambda *rest: False)
+    monkeypatch.setattr(refinement, 'has_revisits', lambda *rest: False)
     assert 'that walls stand at right angles is likelier by' in Refiner(Parameters()).run(*bent).reason
 
 
 @pytest.fixture
 def solved_once(monkeypatch) -> None:
     """Runs that are judged otherwise need not find the same trajectory again."""
-    solve, found = refinement.solved, []
+    solve, found = refinement.solve_hypotheses, []
 
     def once(*rest) -> Solved:
         if not found:
             found.append(solve(*rest))
         return found[0]
 
-    monkeypatch.setattr(refinement, 'solved', once)
+    monkeypatch.setattr(refinement, 'solve_hypotheses', once)
 
 
 def no_matches(*rest) -> None:
@@ -102,16 +110,16 @@ def no_matches(*rest) -> None:
 
 def test_places_seen_before_prove_what_nothing_nearby_does(tour, bent, monkeypatch, solved_once) -> None:
     # wheels that are right over metres predict what is near better than the yaws of walls
-    monkeypatch.setattr(refinement, 'matched', no_matches)
-    monkeypatch.setattr(refinement, 'over_the_drive', lambda *rest: Gain(-0.05, 0.01))
+    monkeypatch.setattr(refinement, 'match_drive', no_matches)
+    monkeypatch.setattr(refinement, 'gain_over_drive', lambda *rest: Gain(-0.05, 0.01))
     found, true = Refiner(Parameters()).run(*bent), odometry_of(tour).pose
     assert found.accepted
     assert found.reason.startswith('with places seen before, readings are predicted +')
     assert rms_after_alignment(found.trajectory.pose, true) < 0.2
     # the same without such places, and without walls that say that the yaw is off
-    monkeypatch.setattr(refinement, 'seen_again', lambda *rest: Gain(0.0, 0.01))
+    monkeypatch.setattr(refinement, 'gain_at_revisits', lambda *rest: Gain(0.0, 0.01))
     left = Refiner(Parameters()).run(*bent)
-    monkeypatch.setattr(refinement, 'LEAST_WITNESS', 1e9)
+    monkeypatch.setattr(refinement, 'LEAST_VOTE_GAIN', 1e9)
     for outcome in (left, Refiner(Parameters()).run(*bent)):
         assert not outcome.accepted
         assert 'not enough to tell' in outcome.reason
@@ -119,19 +127,19 @@ def test_places_seen_before_prove_what_nothing_nearby_does(tour, bent, monkeypat
 
 def test_walls_are_no_proof_where_places_seen_before_say_nothing(bent, monkeypatch, solved_once) -> None:
     # walls that stand askew tell a yaw that is off, and readings are predicted about as well
-    monkeypatch.setattr(refinement, 'matched', no_matches)
-    monkeypatch.setattr(refinement, 'over_the_drive', lambda *rest: Gain(0.001, 0.01))
-    monkeypatch.setattr(refinement, 'seen_again', lambda *rest: Gain(0.001, 0.01))
+    monkeypatch.setattr(refinement, 'match_drive', no_matches)
+    monkeypatch.setattr(refinement, 'gain_over_drive', lambda *rest: Gain(0.001, 0.01))
+    monkeypatch.setattr(refinement, 'gain_at_revisits', lambda *rest: Gain(0.001, 0.01))
     left = Refiner(Parameters()).run(*bent)
     assert not left.accepted
     assert left.reason.startswith('with places seen before, readings are predicted +')
     assert 'not enough to tell' in left.reason
     # where the robot came to no place twice, walls are proof, unless readings are predicted worse
-    monkeypatch.setattr(refinement, 'came_back', lambda *rest: False)
+    monkeypatch.setattr(refinement, 'has_revisits', lambda *rest: False)
     found = Refiner(Parameters()).run(*bent)
     assert found.accepted
     assert found.reason.startswith('that walls stand at right angles is likelier')
-    monkeypatch.setattr(refinement, 'seen_again', lambda *rest: Gain(-0.02, 0.01))
+    monkeypatch.setattr(refinement, 'gain_at_revisits', lambda *rest: Gain(-0.02, 0.01))
     worse = Refiner(Parameters()).run(*bent)
     assert not worse.accepted
     assert worse.reason.startswith('readings are predicted -')
@@ -148,11 +156,11 @@ def test_a_robot_that_came_back_is_told_from_one_that_did_not(way, rounds) -> No
     scans = Scans(windows, Parameters(), np.zeros(1, np.uint8), held_out(len(windows)))
     progress, again = windows.node_progress, 0
     for k in np.flatnonzero(scans.held_out):
-        others = [j for j in range(len(windows)) if abs(progress[j] - progress[k]) > LATER]
+        others = [j for j in range(len(windows)) if abs(progress[j] - progress[k]) > REVISIT_AFTER]
         again += any(math.dist(windows.node[k, :2], windows.node[j, :2]) < NEAR for j in others)
-    assert came_back(scans, windows.node) == (again >= FEWEST_BLOCKS) == (rounds == 2)
+    assert has_revisits(scans, windows.node) == (again >= FEWEST_BLOCKS) == (rounds == 2)
     far = np.arange(len(windows))[:, None] * np.array([5.0, 0.0, 0.0])
-    assert not came_back(scans, far)
+    assert not has_revisits(scans, far)
 
 
 def test_readings_go_along(bent, outcome) -> None:
@@ -175,7 +183,7 @@ def test_the_map_explains_more(bent, outcome) -> None:
 def test_exact_odometry_stays(tour, monkeypatch) -> None:
     odometry = odometry_of(tour)
     # walls stand at right angles along it, so no other way is tried
-    monkeypatch.setattr(refinement, 'matched', None)
+    monkeypatch.setattr(refinement, 'match_drive', None)
     left = Refiner(Parameters()).run(tour.readings, odometry)
     assert not left.accepted
     assert left.reason

@@ -13,10 +13,10 @@ from exact_tour import Tour, quietly, tour_with
 from forward_grid_mapper.core.trajectory import hypotheses, solving
 from forward_grid_mapper.core.trajectory.heading import DOUBTFUL, Heading, doubts, slight
 from forward_grid_mapper.core.trajectory.holding_out import Gain
-from forward_grid_mapper.core.trajectory.hypotheses import MOST_OPEN, solved
+from forward_grid_mapper.core.trajectory.hypotheses import MOST_DOUBTFUL, solve_hypotheses
 from forward_grid_mapper.core.trajectory.loops import APART, LENGTH, Loop
 from forward_grid_mapper.core.trajectory.matching import Match
-from forward_grid_mapper.core.trajectory.passes import Found, ahead
+from forward_grid_mapper.core.trajectory.passes import Matches, match_preceding
 from forward_grid_mapper.core.trajectory.pose_graph import solution_at
 from forward_grid_mapper.core.trajectory.poses import Floats, compose, relative
 from forward_grid_mapper.core.trajectory.relocating import (
@@ -59,7 +59,7 @@ def astray(tour: Tour) -> Floats:
 
 def found_at(tour: Tour, blocks: list[int], place: int) -> list[Loop]:
     """Return loops of some blocks, by their numbers, with a place."""
-    return [Loop(block * LENGTH + LENGTH // 2, place, Found()) for block in blocks]
+    return [Loop(block * LENGTH + LENGTH // 2, place, Matches()) for block in blocks]
 
 
 def test_a_stretch_is_found_farther_off_than_single_blocks_are_looked_for(there_and_back) -> None:
@@ -78,9 +78,9 @@ def test_a_stretch_is_found_farther_off_than_single_blocks_are_looked_for(there_
 def test_what_was_led_astray_is_put_where_it_belongs(there_and_back) -> None:
     true, first = there_and_back.windows.node, turning(there_and_back)
     solver = Solver(*there_and_back, quietly)
-    found = ahead(there_and_back.scans, true, lambda part: None)
+    found = match_preceding(there_and_back.scans, true, lambda part: None)
     wrong = solution_at(astray(there_and_back), 4)
-    solution, loops = solver._relocated(found.edges(), [], wrong, found.usual)
+    solution, loops = solver._with_stretches_relocated(found.edges(), [], wrong, found.mean_score)
     off = relative(solution.nodes[0], solution.nodes) - relative(true[0], true)
     assert np.hypot(off[:, 0], off[:, 1]).max() < 0.3
     assert all(loop.block >= first > loop.place for loop in loops)
@@ -98,7 +98,7 @@ def test_another_place_is_taken_only_if_readings_are_predicted_better(there_and_
     def loops_there(scans, nodes, stretch, usual) -> list[Loop]:
         out = []
         for block in stretch.reshape(-1, LENGTH):
-            found = Found()
+            found = Matches()
             for k in block:
                 found.add(0, int(k), Match(relative(nodes[0], nodes[k]), np.diag([1e4, 1e4, 1e3]), 50.0), 50)
             out.append(Loop(int(block[LENGTH // 2]), 0, found))
@@ -109,7 +109,7 @@ def test_another_place_is_taken_only_if_readings_are_predicted_better(there_and_
     solver, start = Solver(*there_and_back, quietly), solution_at(true, 4)
     blocks = revisits(there_and_back.scans, true)
     blocks = blocks[blocks * LENGTH > first][:RUN]
-    solution, loops = solver._elsewhere(blocks, Found().edges(), [], start, 1.0)
+    solution, loops = solver._relocated(blocks, Matches().edges(), [], start, 1.0)
     assert solution is start
     assert loops == []
 
@@ -117,7 +117,7 @@ def test_another_place_is_taken_only_if_readings_are_predicted_better(there_and_
 def test_what_is_in_its_place_stays(there_and_back) -> None:
     solver, true = Solver(*there_and_back, quietly), there_and_back.windows.node
     start = solution_at(true, 4)
-    solution, loops = solver._relocated(Found().edges(), [], start, 1.0)
+    solution, loops = solver._with_stretches_relocated(Matches().edges(), [], start, 1.0)
     assert solution is start
     assert loops == []
 
@@ -181,7 +181,7 @@ def test_a_right_angle_that_was_lost_is_found_again(there_and_back, lost) -> Non
     open_doubts = (1, 0.03), (node, 0.4)
     doubtful = replace(heading.turned(node, lost * math.pi / 2), certainty=0.52, doubts=open_doubts, slight=little)
     solver = solver_of(doubtful)
-    found = solved(scans, doubtful, solver, solver.along_walls(), solver_of)
+    found = solve_hypotheses(scans, doubtful, solver, solver.along_walls(), solver_of)
     assert found.certainty == pytest.approx(0.94)
     off = relative(found.solution.nodes[0], found.solution.nodes) - relative(true[0], true)
     assert np.hypot(off[:, 0], off[:, 1]).max() < 0.3
@@ -198,9 +198,9 @@ def test_without_a_revisit_a_doubt_stays(there_and_back) -> None:
         return solvers[-1]
 
     last = len(windows) - 2
-    doubtful = replace(heading, certainty=0.6, doubts=tuple((last - k, 0.1) for k in range(MOST_OPEN + 1)))
+    doubtful = replace(heading, certainty=0.6, doubts=tuple((last - k, 0.1) for k in range(MOST_DOUBTFUL + 1)))
     first = solver_of(doubtful)
-    found = solved(scans, doubtful, first, first.along_walls(), solver_of)
+    found = solve_hypotheses(scans, doubtful, first, first.along_walls(), solver_of)
     assert found.certainty == pytest.approx(0.6)
     # so many would take many solutions
     assert solvers == [first]
@@ -227,7 +227,7 @@ def test_right_angles_that_were_lost_are_asked_one_after_the_other(
         solution = solution_at(np.full((1, 3), first_lost(heading)), 4)
         return hypotheses.Solved(heading, solver, solution, solution, [], heading.certainty)
 
-    monkeypatch.setattr(hypotheses, '_matched', matched)
+    monkeypatch.setattr(hypotheses, '_solve_with', matched)
     monkeypatch.setattr(hypotheses, 'confirmed', lambda scans, nodes, loops, node: recognises and nodes[0, 0] > node)
     monkeypatch.setattr(hypotheses, 'predicted', lambda scans, nodes, blocks: nodes[0, :1])
     monkeypatch.setattr(hypotheses, 'gain', lambda before, after: Gain(float(after[0] - before[0]), 1.0))
@@ -236,7 +236,7 @@ def test_right_angles_that_were_lost_are_asked_one_after_the_other(
     for node in lost:
         heading = heading.turned(node, math.pi / 2)
     solver = SimpleNamespace(along_walls=lambda: None)
-    found = solved(scans, heading, solver, None, lambda other: solver)
+    found = solve_hypotheses(scans, heading, solver, None, lambda other: solver)
     assert found.heading.correction == pytest.approx(right.correction)
     # where nothing is recognised all are asked, and those known that are predicted better turned: of several of which
     # none is, two may make up for each other
@@ -254,11 +254,11 @@ def test_a_doubt_stays_where_no_solution_predicts_readings_better(there_and_back
         solution = solution_at(np.zeros((1, 3)), 4)
         return hypotheses.Solved(heading, solver, solution, solution, [], heading.certainty)
 
-    monkeypatch.setattr(hypotheses, '_matched', matched)
+    monkeypatch.setattr(hypotheses, '_solve_with', matched)
     monkeypatch.setattr(hypotheses, 'confirmed', lambda scans, nodes, loops, node: False)
     monkeypatch.setattr(hypotheses, 'predicted', lambda scans, nodes, blocks: np.zeros(9))
     heading, solver = replace(right, certainty=0.7, doubts=((30, 0.3),)), SimpleNamespace(along_walls=lambda: None)
-    found = solved(scans, heading, solver, None, lambda other: solver)
+    found = solve_hypotheses(scans, heading, solver, None, lambda other: solver)
     assert found.heading is heading and found.certainty == 0.7
 
 
@@ -273,13 +273,13 @@ def test_what_predicts_readings_best_as_it_is_is_known_if_it_is_the_only_doubt(
         solution = solution_at(np.full((1, 3), -off), 4)
         return hypotheses.Solved(heading, solver, solution, solution, [], heading.certainty)
 
-    monkeypatch.setattr(hypotheses, '_matched', matched)
+    monkeypatch.setattr(hypotheses, '_solve_with', matched)
     monkeypatch.setattr(hypotheses, 'confirmed', lambda scans, nodes, loops, node: False)
     monkeypatch.setattr(hypotheses, 'predicted', lambda scans, nodes, blocks: nodes[0, :1])
     monkeypatch.setattr(hypotheses, 'gain', lambda before, after: Gain(float(after[0] - before[0]), 0.1))
     heading = replace(right, certainty=0.7, doubts=tuple((node, 0.1) for node in turned_at))
     solver = SimpleNamespace(along_walls=lambda: None)
-    found = solved(scans, heading, solver, None, lambda other: solver)
+    found = solve_hypotheses(scans, heading, solver, None, lambda other: solver)
     assert found.heading.correction == pytest.approx(right.correction)
     assert found.certainty == pytest.approx(0.8 if len(turned_at) == 1 else 0.7)
 
@@ -294,10 +294,10 @@ def test_a_drive_and_its_mirror_image_are_turned_alike(there_and_back, monkeypat
         solution = solution_at(np.full((1, 3), {0: 0.0, 1: 5.0, -1: 6.0}[round(2 * turned / math.pi)]), 4)
         return hypotheses.Solved(heading, solver, solution, solution, [], heading.certainty)
 
-    monkeypatch.setattr(hypotheses, '_matched', matched)
+    monkeypatch.setattr(hypotheses, '_solve_with', matched)
     monkeypatch.setattr(hypotheses, 'confirmed', lambda scans, nodes, loops, node: nodes[0, 0] > 0.0)
     monkeypatch.setattr(hypotheses, 'predicted', lambda scans, nodes, blocks: nodes[0, :1])
     monkeypatch.setattr(hypotheses, 'gain', lambda before, after: Gain(float(after[0] - before[0]), 1.0))
     heading, solver = replace(right, certainty=0.7, doubts=((30, 0.3),)), SimpleNamespace(along_walls=lambda: None)
-    found = solved(scans, heading, solver, None, lambda other: solver)
+    found = solve_hypotheses(scans, heading, solver, None, lambda other: solver)
     assert found.solution.nodes[0, 0] == 6.0

@@ -13,9 +13,9 @@ from forward_grid_mapper.core.common.errors import Cancelled
 from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.mapping import Mapper
 from forward_grid_mapper.core.trajectory import any_angle, refinement, scan_matching
-from forward_grid_mapper.core.trajectory.any_angle import Matched
+from forward_grid_mapper.core.trajectory.any_angle import MatchedDrive
 from forward_grid_mapper.core.trajectory.holding_out import Gain, held_out
-from forward_grid_mapper.core.trajectory.judging import explained_better, over_the_drive, turned_right
+from forward_grid_mapper.core.trajectory.judging import gain_of_objective, gain_over_drive, turns_supported
 from forward_grid_mapper.core.trajectory.likelihood import scores
 from forward_grid_mapper.core.trajectory.local_map import for_matching
 from forward_grid_mapper.core.trajectory.outcome import Refinement
@@ -156,7 +156,7 @@ def test_the_mean_of_poses_against_plain_python(scans, matched) -> None:
         for y in (-0.1, 0.0, 0.1):
             for t in turns:
                 pose = np.array([[x, y, t]])
-                fit = float(scores(joint, around, pose, max(len(joint.readings) // scan_matching.ASKED, 1))[0])
+                fit = float(scores(joint, around, pose, max(len(joint.readings) // scan_matching.EVALUATED, 1))[0])
                 against = sum(min(0.5 * (v / s) ** 2, 4.0) for v, s in zip((x, y, t), sigmas, strict=True))
                 each.append((TRUST.counts * fit - against, pose[0]))
     best = max(value for value, _ in each)
@@ -199,8 +199,8 @@ def no_walls(self, windows, scans) -> tuple[None, float]:
 def test_what_readings_do_not_speak_for_is_left(bent, matched, monkeypatch) -> None:
     recording, odometry = bent
     monkeypatch.setattr(Refiner, '_heading', no_walls)
-    monkeypatch.setattr(refinement, 'matched', lambda *rest: Matched(matched, [], np.inf, 1.0))
-    monkeypatch.setattr(refinement, 'seen_again', lambda *rest: Gain(0.02, 0.01))
+    monkeypatch.setattr(refinement, 'match_drive', lambda *rest: MatchedDrive(matched, [], np.inf, 1.0))
+    monkeypatch.setattr(refinement, 'gain_at_revisits', lambda *rest: Gain(0.02, 0.01))
     left = Refiner(Parameters()).run(recording.readings, odometry)
     assert not left.accepted and left.trajectory is odometry
     assert left.reason == refinement.NO_WALLS + refinement.NOR_MATCHES
@@ -209,8 +209,8 @@ def test_what_readings_do_not_speak_for_is_left(bent, matched, monkeypatch) -> N
 def test_matching_alone_needs_poses_within_its_windows(bent, matched, monkeypatch) -> None:
     recording, odometry = bent
     monkeypatch.setattr(Refiner, '_heading', no_walls)
-    monkeypatch.setattr(refinement, 'matched', lambda *rest: Matched(matched, [], np.inf, 1.0))
-    monkeypatch.setattr(refinement, 'seen_again', lambda *rest: Gain(0.1, 0.01))
+    monkeypatch.setattr(refinement, 'match_drive', lambda *rest: MatchedDrive(matched, [], np.inf, 1.0))
+    monkeypatch.setattr(refinement, 'gain_at_revisits', lambda *rest: Gain(0.1, 0.01))
     assert Refiner(Parameters()).run(recording.readings, odometry).accepted
     # a pose every metre, as of a recording at 0.5 Hz
     kept = np.unique(np.searchsorted(odometry.travel, np.arange(0.0, odometry.travel[-1])))
@@ -284,7 +284,7 @@ def test_rounds_go_on_while_places_are_not_recognised_and_readings_explained_bet
     bent, scans, monkeypatch, said: list[tuple[float, float]], rounds: int
 ) -> None:
     trials = Trials(monkeypatch, said)
-    found = any_angle.matched(bent[1], scans, lambda stage: quietly)
+    found = any_angle.match_drive(bent[1], scans, lambda stage: quietly)
     assert found is not None
     assert len(trials.asked) == len(said)
     assert found.value == max(value for _, value in said)
@@ -295,13 +295,13 @@ def test_where_no_map_explains_readings_better_than_that_of_odometry_nothing_mor
     bent, scans, monkeypatch
 ) -> None:
     trials = Trials(monkeypatch, [(0.5, -1.0)])
-    assert any_angle.matched(bent[1], scans, lambda stage: quietly) is None
+    assert any_angle.match_drive(bent[1], scans, lambda stage: quietly) is None
     assert len(trials.asked) == 1
 
 
 def test_a_round_that_moves_nothing_is_the_last(bent, scans, monkeypatch) -> None:
     trials = Trials(monkeypatch, [(0.5, 1.0), (0.5, 2.0)], far=0.01)
-    assert any_angle.matched(bent[1], scans, lambda stage: quietly) is not None
+    assert any_angle.match_drive(bent[1], scans, lambda stage: quietly) is not None
     assert len(trials.asked) == len(TRUSTS)
 
 
@@ -310,9 +310,9 @@ def test_a_noise_of_odometry_that_is_told_is_the_one_that_is_taken(bent, scans, 
     trials = Trials(monkeypatch, [(0.5, 1.0 + k) for k in range(4)], far=0.0)
     monkeypatch.setattr(any_angle, 'scan_matched', lambda scans, trust, _: trusts.append(trust) or scans.windows.node)
     for noise in (0.0, 0.01):
-        any_angle.matched(bent[1], scans, lambda stage: quietly, noise)
+        any_angle.match_drive(bent[1], scans, lambda stage: quietly, noise)
     assert trusts == [*TRUSTS, *(trust._replace(yaw=0.01) for trust in TRUSTS)]
-    assert [noise for _, noise in trials.asked] == [any_angle.LEFT] * 2 + [0.01] * 2
+    assert [noise for _, noise in trials.asked] == [any_angle.REMAINING_YAW_NOISE] * 2 + [0.01] * 2
 
 
 def test_a_drive_is_explained_better_where_it_was_than_where_odometry_has_it(exact, bent, scans) -> None:
@@ -333,11 +333,11 @@ def test_a_drive_is_explained_by_the_map_of_its_readings_but_for_those_held_out(
 @pytest.mark.parametrize('again', [True, False])
 def test_places_seen_before_are_named_where_there_are_any(bent, scans, matched, monkeypatch, again: bool) -> None:
     recording, odometry = bent
-    monkeypatch.setattr(refinement, 'seen_again', lambda *rest: Gain(0.1, 0.01))
-    monkeypatch.setattr(refinement, 'explained_better', lambda *rest: Gain(0.1, 0.01))
-    told = Matched(matched, [], np.inf, 0.0)
-    monkeypatch.setattr(refinement, 'matched', lambda *rest: told)
-    monkeypatch.setattr(refinement, 'came_back', lambda *rest: again)
+    monkeypatch.setattr(refinement, 'gain_at_revisits', lambda *rest: Gain(0.1, 0.01))
+    monkeypatch.setattr(refinement, 'gain_of_objective', lambda *rest: Gain(0.1, 0.01))
+    told = MatchedDrive(matched, [], np.inf, 0.0)
+    monkeypatch.setattr(refinement, 'match_drive', lambda *rest: told)
+    monkeypatch.setattr(refinement, 'has_revisits', lambda *rest: again)
     drive_of = _Drive(recording.readings, odometry, scans.windows, scans)
     found = Refiner(Parameters())._at_any_angle(drive_of, by_walls(scans, recording, odometry), 0.15)
     assert not found.right_angles
@@ -363,9 +363,9 @@ def test_matches_alone_are_taken_over_walls_only_if_they_explain_readings_much_b
 ) -> None:
     recording, odometry = bent
     attempt, told = by_walls(scans, recording, odometry), []
-    monkeypatch.setattr(refinement, 'seen_again', lambda *rest: Gain(0.1, 0.01))
-    monkeypatch.setattr(refinement, 'explained_better', lambda *rest: told.append(rest[1:]) or Gain(sigmas, 1.0))
-    monkeypatch.setattr(refinement, 'matched', lambda *rest: Matched(matched, [], np.inf, 1.0))
+    monkeypatch.setattr(refinement, 'gain_at_revisits', lambda *rest: Gain(0.1, 0.01))
+    monkeypatch.setattr(refinement, 'gain_of_objective', lambda *rest: told.append(rest[1:]) or Gain(sigmas, 1.0))
+    monkeypatch.setattr(refinement, 'match_drive', lambda *rest: MatchedDrive(matched, [], np.inf, 1.0))
     found = Refiner(Parameters())._at_any_angle(
         _Drive(recording.readings, odometry, scans.windows, scans), attempt, 0.15
     )
@@ -379,16 +379,16 @@ def test_what_explains_readings_no_better_than_what_is_known_is_not_looked_for_l
     known = scans.windows.node + 1.0
     monkeypatch.setattr(Scans, 'objective', lambda s, nodes: 3.0 if nodes is known else objective(s, nodes))
     for sigmas, rounds in ((1.0, 0), (2.0, 1)):
-        monkeypatch.setattr(any_angle, 'over_the_drive', lambda *rest, by=sigmas: Gain(by, 1.0))
-        assert any_angle.matched(bent[1], scans, lambda stage: quietly, 0.0, known) is None
+        monkeypatch.setattr(any_angle, 'gain_over_drive', lambda *rest, by=sigmas: Gain(by, 1.0))
+        assert any_angle.match_drive(bent[1], scans, lambda stage: quietly, 0.0, known) is None
         assert len(trials.asked) == rounds
 
 
 def test_scan_matching_predicts_readings_better_than_corners_that_are_taken_for_square_ones(exact, scans) -> None:
     true = odometry_of(exact).at(scans.windows.node_stamp)
     start = scan_matched(scans, TRUST, quietly)
-    assert over_the_drive(scans, as_if_square(true, true), start, quietly).sigmas > any_angle.WORTH_A_TRIAL
-    assert over_the_drive(scans, true, start, quietly).sigmas < any_angle.WORTH_A_TRIAL
+    assert gain_over_drive(scans, as_if_square(true, true), start, quietly).sigmas > any_angle.WORTH_A_TRIAL
+    assert gain_over_drive(scans, true, start, quietly).sigmas < any_angle.WORTH_A_TRIAL
 
 
 def as_if_square(nodes: Floats, true: Floats) -> Floats:
@@ -404,15 +404,15 @@ def as_if_square(nodes: Floats, true: Floats) -> Floats:
 
 def test_a_trajectory_that_contradicts_itself_is_explained_worse_by_many_standard_errors(exact, bent, scans) -> None:
     true = odometry_of(exact).at(scans.windows.node_stamp)
-    told = explained_better(scans, scans.windows.node, true)
+    told = gain_of_objective(scans, scans.windows.node, true)
     blocks = -(-len(true) // 4)
     assert told.sigmas > 4.0
     assert told.mean * blocks == pytest.approx(scans.objective(true) - scans.objective(scans.windows.node))
-    again = explained_better(scans, true, scans.windows.node)
+    again = gain_of_objective(scans, true, scans.windows.node)
     assert again.sigmas == pytest.approx(-told.sigmas)
     # chance alone decides which of two that are as good has the larger J
     near = true + np.array([0.0, 0.0, 1e-3]) * np.sin(np.arange(len(true)))[:, None]
-    assert abs(explained_better(scans, true, near).sigmas) < 2.3
+    assert abs(gain_of_objective(scans, true, near).sigmas) < 2.3
 
 
 def test_what_windows_have_of_the_objective_is_all_of_it_but_the_prior(scans) -> None:
@@ -428,10 +428,10 @@ def test_what_windows_have_of_the_objective_is_all_of_it_but_the_prior(scans) ->
 def test_turns_that_odometry_does_not_have_are_told_from_those_of_drift(exact, bent, scans) -> None:
     true = odometry_of(exact).at(scans.windows.node_stamp)
     odometry = scans.windows.node
-    assert turned_right(scans, true)
-    assert not turned_right(scans, as_if_square(odometry, true))
+    assert turns_supported(scans, true)
+    assert not turns_supported(scans, as_if_square(odometry, true))
     # nothing is asked where odometry turns as the nodes do
-    assert turned_right(scans, odometry)
+    assert turns_supported(scans, odometry)
 
 
 def test_scan_matching_can_be_cancelled(bent, monkeypatch) -> None:

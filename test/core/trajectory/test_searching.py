@@ -14,9 +14,9 @@ from forward_grid_mapper.core.trajectory.local_map import UNKNOWN, LocalMap, loc
 from forward_grid_mapper.core.trajectory.matching import grid_around
 from forward_grid_mapper.core.trajectory.poses import Floats, compose, relative
 from forward_grid_mapper.core.trajectory.searching import (
-    ASKED,
     BLUR,
     COARSER,
+    EVALUATED,
     LARGE,
     STEPS,
     Searched,
@@ -60,7 +60,7 @@ def test_coarse_grids_are_asked_with_blurred_readings(places, monkeypatch) -> No
 def asked_all(scan: Scan, around: LocalMap, guess: Floats, sigma: Floats, reach: Floats) -> Searched:
     poses = grid_around(guess, reach, STEPS)
     prior = 0.5 * ((relative(guess, poses) / sigma) ** 2).sum(1)
-    return Searched(poses, scores(scan, around, poses, max(len(scan.readings) // ASKED, 1)), prior)
+    return Searched(poses, scores(scan, around, poses, max(len(scan.readings) // EVALUATED, 1)), prior)
 
 
 def second(found: Searched) -> float:

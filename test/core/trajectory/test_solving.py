@@ -12,7 +12,7 @@ from exact_tour import Tour, quietly, tour_with
 from forward_grid_mapper.core.trajectory.heading import Heading
 from forward_grid_mapper.core.trajectory.poses import Floats, wrapped
 from forward_grid_mapper.core.trajectory.scans import Scans
-from forward_grid_mapper.core.trajectory.solving import OF_YAWS, Solver
+from forward_grid_mapper.core.trajectory.solving import YAW_WEIGHT, Solver
 from forward_grid_mapper.core.trajectory.walls import SPAN
 from forward_grid_mapper.core.trajectory.windows import Odometry, Windows
 from forward_grid_mapper.simulation.sonar import front_array
@@ -47,8 +47,8 @@ def test_an_echo_counts_once(exact) -> None:
     inner = (windows.progress > SPAN) & (windows.progress < windows.node_progress[-1] - SPAN)
     at = windows.node_progress[found.at]
     places = (np.abs(windows.progress[inner, None] - at) <= SPAN / 2).sum(1)
-    assert places.mean() * OF_YAWS == pytest.approx(1.0, rel=0.1)
-    assert solver_of(exact, found)._yaws.part == OF_YAWS
+    assert places.mean() * YAW_WEIGHT == pytest.approx(1.0, rel=0.1)
+    assert solver_of(exact, found)._yaws.part == YAW_WEIGHT
 
 
 def test_walls_that_say_nothing_else_turn_nothing(exact) -> None:
