@@ -81,7 +81,7 @@ def declared_arguments():
             'use_respawn',
             default_value='false',
             choices=ON_OFF,
-            description='Whether to restart the mapper when it ends; set journal, so that it continues with its readings',
+            description='Whether to restart the mapper when it ends; set journal to keep its readings',
         ),
         DeclareLaunchArgument(
             'log_level',
