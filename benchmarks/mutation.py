@@ -157,7 +157,7 @@ def main() -> None:
     options = parser.parse_args()
     if shutil.which('cosmic-ray') is None:
         raise SystemExit('cosmic-ray is not on the path: pip install cosmic-ray')
-    print(f'{"module":34s}{"changes":>9s}{"tried":>9s}{"noticed":>9s}{"score":>8s}{"seconds":>9s}')
+    print(f'{"module":34s}{"changes":>9s}{"tried":>9s}{"detected":>9s}{"score":>8s}{"seconds":>9s}')
     total = tried = noticed = 0
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name) / 'checkout'

@@ -15,21 +15,21 @@ TRANSFORMS = [('/tf', 'tf'), ('/tf_static', 'tf_static')]
 RELIABILITY = ['', 'best_effort', 'reliable']
 SWITCH = ['', 'true', 'false', 'True', 'False']
 ON_OFF = SWITCH[1:]
-# Nav2 takes a cell for an obstacle from lethal_cost_threshold on, 100 by default, which a probability hardly ever is.
+# For Nav2 a cell is an obstacle from lethal_cost_threshold on, 100 by default; a probability hardly ever reaches it.
 OF_PROBABILITIES = (
-    'the map on topic map has probabilities: without lethal_cost_threshold: 65 Nav2 takes most walls for free space; '
-    'map:=ml_map needs no such setting'
+    'the map on topic map has probabilities: without lethal_cost_threshold: 65 Nav2 treats most walls as free space; '
+    'map:=ml_map does not need this setting'
 )
-# Parameters of the mapper that are launch arguments as well; one that is not given is as the parameter file has it.
+# Parameters of the mapper that are launch arguments as well; if one is not given, the parameter file decides.
 PARAMETERS = {
-    'range_topics': ('Topics of sensor_msgs/Range, separated by commas, where there are several', None),
+    'range_topics': ('Topics of sensor_msgs/Range, separated by commas, if there are several', None),
     'range_reliability': ('Quality of service of the Range subscriptions', RELIABILITY),
     'odom_reliability': ('Quality of service of the odometry subscription', RELIABILITY),
-    'map_frame': ('Frame of the maps where it is not the odometry frame, for example map when AMCL runs', None),
-    'refine_poses': ('Whether run_em takes the drift out of odometry, in frame map', SWITCH),
-    'online': ('Whether the maximum likelihood map and the uncertainty map follow every reading', SWITCH),
-    'autostart': ('Whether the mapper starts by itself; if not, a lifecycle manager has to start it', SWITCH),
-    'journal': ('Folder of the journal, which gives accepted readings back after a restart', None),
+    'map_frame': ('Frame of the maps if it is not the odometry frame, for example map if AMCL is running', None),
+    'refine_poses': ('Whether run_em corrects the drift of odometry; the maps are then in frame map', SWITCH),
+    'online': ('Whether the maximum likelihood map and the uncertainty map are updated with every reading', SWITCH),
+    'autostart': ('Whether the mapper activates itself; if not, a lifecycle manager has to do it', SWITCH),
+    'journal': ('Folder of the journal, which restores accepted readings after a restart', None),
 }
 
 
@@ -50,23 +50,23 @@ def declared_arguments():
             default_value='',
             choices=SWITCH,
             description='Take the time from /clock, as in simulation or when a bag is replayed with --clock '
-            '(empty: as in params_file, or as SetParameter has it)',
+            '(empty: from params_file or SetParameter)',
         ),
         DeclareLaunchArgument(
             'sonar',
             default_value='sonar',
-            description='Topic of sensor_msgs/Range; for several give range_topics, and then this says nothing',
+            description='Topic of sensor_msgs/Range; for several topics set range_topics, then this one is ignored',
         ),
         DeclareLaunchArgument(
             'odom',
             default_value='odom',
-            description='Topic of nav_msgs/Odometry; where params_file has another odom_topic, this says nothing',
+            description='Topic of nav_msgs/Odometry; ignored if params_file has another odom_topic',
         ),
         *(
             DeclareLaunchArgument(
                 name,
                 default_value='',
-                description=f'{text} (empty: as in params_file)',
+                description=f'{text} (empty: from params_file)',
                 **({'choices': choices} if choices else {}),
             )
             for name, (text, choices) in PARAMETERS.items()
@@ -75,19 +75,19 @@ def declared_arguments():
             'map',
             default_value='',
             choices=['', *MAPS],
-            description='Publish this map on topic map, for Nav2, instead of on the topic of its own name',
+            description='Publish this map on topic map, for Nav2, instead of its own topic',
         ),
         DeclareLaunchArgument(
             'use_respawn',
             default_value='false',
             choices=ON_OFF,
-            description='Whether to start the mapper again when it ends; give it a journal, so that it goes on',
+            description='Whether to restart the mapper when it ends; set journal to keep its readings',
         ),
         DeclareLaunchArgument(
             'log_level',
             default_value='info',
             choices=['debug', 'info', 'warn', 'error', 'fatal'],
-            description='Least severity of what the mapper logs',
+            description='Lowest severity of the log messages of the mapper',
         ),
         DeclareLaunchArgument(
             'rviz', default_value='false', choices=ON_OFF, description='Whether to start RViz (rviz2)'

@@ -57,7 +57,7 @@ def _constants_markdown() -> list[str]:
     lines = [
         '## Constants of the model',
         '',
-        'These are no parameters. *Plain* is the value with `plain_model`, that of the paper; lengths of gaps, walls '
+        'These cannot be set. *Plain* is the value with `plain_model`, the value of the paper. Lengths of gaps, walls '
         'and margins are in `core/common/constants.py`.',
         '',
         '| constant | default | plain | unit | meaning |',
@@ -75,16 +75,16 @@ def _bounds_markdown(parameters: Parameters) -> list[str]:
     resolution = parameters.grid.resolution
     bounds = reading_bounds(parameters.model, resolution, BOUNDS_RANGE)
     return [
-        f'With the defaults, in cells of {resolution:g} m and up to {BOUNDS_RANGE:g} m, one reading says at most '
-        'so many nats of the objective (positive: for an obstacle):',
+        f'Largest evidence of one reading with the defaults, for cells of {resolution:g} m and ranges up to '
+        f'{BOUNDS_RANGE:g} m, in nats of the objective (positive: for an obstacle):',
         '',
-        '| reading | about | nats |',
+        '| reading | evidence on | nats |',
         '|---|---|---|',
         f'| echo | the cell at its range | {bounds.echo_for:+.2f} |',
-        f'| echo from beyond | one cell on its way | {bounds.echo_against_cell:+.2f} |',
-        f'| echo from beyond | all cells on its way together | {bounds.echo_against_wall:+.2f} |',
-        f'| no echo | one cell on its way | {bounds.silence_against_cell:+.2f} |',
-        f'| no echo | all cells on its way together | {bounds.silence_against_wall:+.2f} |',
+        f'| echo at a longer range | one cell in front of it | {bounds.echo_against_cell:+.2f} |',
+        f'| echo at a longer range | all cells in front of it together | {bounds.echo_against_wall:+.2f} |',
+        f'| no echo | one cell of the cone | {bounds.silence_against_cell:+.2f} |',
+        f'| no echo | all cells of the cone together | {bounds.silence_against_wall:+.2f} |',
     ]
 
 
