@@ -52,7 +52,9 @@ class AssociationParameters:
         'are too near.',
         choices=('discard', 'no_echo'),
     )
-    field_of_view: float = param(0.0, "Full cone angle to use instead of the messages'; 0 uses theirs.", 'rad', 0.0, 3.1)
+    field_of_view: float = param(
+        0.0, "Full cone angle to use instead of the messages'; 0 uses theirs.", 'rad', 0.0, 3.1
+    )
     max_range: float = param(0.0, "Largest range to use instead of the messages'; 0 uses theirs.", 'm', 0.0, 1000.0)
     max_jump: float = param(
         1000.0,
@@ -118,7 +120,9 @@ class ModelParameters:
         0.01,
         0.98,
     )
-    p_rand: float = param(0.4, 'Probability that a reading is a random measurement, independent of the map.', 'probability', 1e-4, 0.95)
+    p_rand: float = param(
+        0.4, 'Probability that a reading is a random measurement, independent of the map.', 'probability', 1e-4, 0.95
+    )
     p_lost: float = param(
         0.52,
         'Probability that the echo is lost, independent of the map, for example by reflection off smooth walls; 0 is '
@@ -278,7 +282,7 @@ class NodeParameters:
     )
     map_frame: str = param(
         '',
-        "Frame of the maps, if it is not that of odometry. The transform between the two comes from TF; with "
+        'Frame of the maps, if it is not that of odometry. The transform between the two comes from TF; with '
         "refine_poses this node publishes it, and the default frame is 'map'.",
         read_only=True,
     )

@@ -111,6 +111,7 @@ class Search:
         traversed: NDArray[np.bool_] | None = None,
         window: Window | None = None,
         hold: bool = False,
+        shifts: bool = True,
     ) -> None:
         """Start from the map that `evidence` has.
 
@@ -124,8 +125,10 @@ class Search:
             First row, last one plus one, and columns likewise, of the cells where moves begin; by default all.
         hold : bool
             Whether all cells outside of the window stay as they are; otherwise moves may reach out of it.
+        shifts : bool
+            Whether occupied cells may move to neighbours. Without these moves the search takes about half of the time.
         """
-        self.evidence, self._parameters = evidence, parameters
+        self.evidence, self._parameters, self._shifts = evidence, parameters, shifts
         height, width = evidence.grid.shape
         self._window = window or (0, height, 0, width)
         traversed = np.zeros(evidence.grid.size, np.bool_) if traversed is None else traversed
@@ -219,7 +222,7 @@ class Search:
         """Make moves of all kinds until nothing gains; return whether that was reached."""
         walls = self._prior is self._of_walls and has_walls(self._parameters)
         while self._more():
-            if self._update_in_sequence(watch) or self._shift(watch):
+            if self._update_in_sequence(watch) or (self._shifts and self._shift(watch)):
                 continue
             if walls and (self._close_gaps(watch) or self._remove_short_walls(watch)):
                 continue
