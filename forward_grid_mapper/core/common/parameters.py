@@ -52,7 +52,9 @@ class AssociationParameters:
         'are too near.',
         choices=('discard', 'no_echo'),
     )
-    field_of_view: float = param(0.0, "Full cone angle to use instead of the messages'; 0 uses theirs.", 'rad', 0.0, 3.1)
+    field_of_view: float = param(
+        0.0, "Full cone angle to use instead of the messages'; 0 uses theirs.", 'rad', 0.0, 3.1
+    )
     max_range: float = param(0.0, "Largest range to use instead of the messages'; 0 uses theirs.", 'm', 0.0, 1000.0)
     max_jump: float = param(
         1000.0,
@@ -118,7 +120,9 @@ class ModelParameters:
         0.01,
         0.98,
     )
-    p_rand: float = param(0.4, 'Probability that a reading is a random measurement, independent of the map.', 'probability', 1e-4, 0.95)
+    p_rand: float = param(
+        0.4, 'Probability that a reading is a random measurement, independent of the map.', 'probability', 1e-4, 0.95
+    )
     p_lost: float = param(
         0.52,
         'Probability that the echo is lost, independent of the map, for example by reflection off smooth walls; 0 is '
@@ -162,8 +166,8 @@ class ModelParameters:
     def __post_init__(self) -> None:
         if self.p_rand + self.p_lost > 0.99:
             raise ParameterError(
-                f'p_rand = {self.p_rand:g} and p_lost = {self.p_lost:g} leave nothing for the map to account for; '
-                f'their sum must not exceed 0.99'
+                f'p_rand = {self.p_rand:g} and p_lost = {self.p_lost:g} leave no probability for the map; their sum '
+                'must not exceed 0.99'
             )
 
 
@@ -209,7 +213,7 @@ class SearchParameters:
     threads: int = param(0, 'Threads of a search, 0 for one per core; the maps do not depend on it.', 'threads', 0, 256)
     max_memory: int = param(
         4000,
-        'Memory for pairs of cells and readings; beyond it they are computed again each time: the same maps, but slower.',
+        'Memory for pairs of cells and readings; beyond it they are computed again each time: the same maps, slower.',
         'MB',
         0,
         1_000_000,
@@ -278,7 +282,7 @@ class NodeParameters:
     )
     map_frame: str = param(
         '',
-        "Frame of the maps, if it is not that of odometry. The transform between the two comes from TF; with "
+        'Frame of the maps, if it is not that of odometry. The transform between the two comes from TF; with '
         "refine_poses this node publishes it, and the default frame is 'map'.",
         read_only=True,
     )
@@ -363,7 +367,7 @@ class Parameters:
         for name, value in constants.items():
             kind = type(_CONSTANTS[name].default)
             if type(value) is not kind or not math.isfinite(value):
-                raise ParameterError(f'{name}: {value!r} is no finite {kind.__name__}')
+                raise ParameterError(f'{name}: {value!r} is not a finite {kind.__name__}')
         # what no longer is there was none that a user chose for this version
         others = {name: value for name, value in values.items() if name not in constants and name not in DEPRECATED}
         return cls.from_flat(others).varied(constants)

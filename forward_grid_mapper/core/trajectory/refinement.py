@@ -61,14 +61,14 @@ LEAST_CERTAINTY = 0.9
 LEAST_MOVED = 0.15
 """Metres that odometry must be off, in the root mean square: about the error of what takes its place."""
 
-NOT_ENOUGH = ': not enough to tell that odometry is off'
+NOT_ENOUGH = ': this does not show that odometry is wrong'
 
 NO_WALLS = (
-    'echoes do not agree on directions of walls: it takes walls at right angles to each other beside the robot, and '
-    'odometry whose yaw holds for a few metres'
+    'the echoes do not agree on directions of walls: this needs walls at right angles to each other beside the robot, '
+    'and odometry with an accurate yaw over a few metres'
 )
 
-NOR_MATCHES = '; matches alone tell no better trajectory'
+NOR_MATCHES = '; scan matching alone gives no better trajectory'
 
 Watch = Callable[[str, float], None]
 """Receives what is going on, and how much of it is done, from 0 to 1."""
@@ -128,7 +128,7 @@ class Refiner:
             return with_outliers(found, readings, odometry, len(odometry.stamp) - len(sound.stamp))
         jumped_to = jumps(odometry)
         if len(jumped_to) > MOST_JUMPS:
-            reason = f'odometry jumps {len(jumped_to)} times: it is no wheel odometry, or messages are missing'
+            reason = f'odometry jumps {len(jumped_to)} times: it is not wheel odometry, or messages are missing'
             return Refinement(False, reason, readings, odometry, {})
         jumped_to = with_doubtful(readings, odometry, jumped_to, self._parameters, self._stop)
         if not len(jumped_to):
@@ -206,11 +206,14 @@ class Refiner:
             if not again and not witnessed:
                 return unproven
             better = seen_again(scans, windows.node, nodes)
-            said = f'with places seen before, {_said(better)}' if again else _said(better)
+            said = f'with recognised places, {_said(better)}' if again else _said(better)
             if better.sigmas < (LEAST_SIGMAS if again else LEAST_SIGMAS_WITH_WALLS):
                 return left(said + NOT_ENOUGH, better)._replace(sure=stands)
             if not again:
-                said = f'that walls stand at right angles is likelier by {witness:.0f} nats than with odometry; {said}'
+                said = (
+                    f'with walls at right angles, the readings are more likely by {witness:.0f} nats than with '
+                    f'odometry; {said}'
+                )
         loops = found.loops if nodes is found.solution.nodes else []
         if nodes is found.solution.nodes:
             named = dict(zip(CALIBRATION, solver.calibration_of(found.solution).tolist(), strict=True))
@@ -242,13 +245,13 @@ class Refiner:
         moved, turned = differences(odometry, trajectory)
         if better.sigmas < LEAST_SIGMAS or moved < least_moved:
             return _stays(by_walls.refinement)
-        again = 'with places seen before, ' if came_back(scans, nodes) else ''
+        again = 'with recognised places, ' if came_back(scans, nodes) else ''
         named = dict.fromkeys(CALIBRATION, 0.0) | {
             name: told.value for name, told in of_yaw(odometry, trajectory).items() if told.sigma <= MOST[name]
         }
         return Refinement(
             True,
-            f'walls are not taken to stand at right angles; {again}{_said(better)}{_doubt(found.part)}',
+            f'walls are not assumed to be at right angles; {again}{_said(better)}{_doubt(found.part)}',
             replaced(readings, odometry, trajectory),
             trajectory,
             named,
@@ -288,10 +291,10 @@ class Refiner:
 def without_times(readings: Readings, odometry: Odometry) -> str:
     """Return why odometry does not tell where each reading was taken; empty if it does."""
     if not len(odometry.stamp):
-        return 'the poses of odometry are not at hand, as in a journal'
+        return 'there are no poses of odometry, as in a journal'
     early, late = readings.stamp.min(initial=odometry.stamp[0]), readings.stamp.max(initial=odometry.stamp[-1])
     if early < odometry.stamp[0] or late > odometry.stamp[-1]:
-        return "there are readings of a time that has no odometry, as where odometry's clock jumped"
+        return "there are readings at times without odometry, as after a jump of odometry's clock"
     return ''
 
 
@@ -301,25 +304,26 @@ def unfit(readings: Readings, odometry: Odometry) -> str:
         return reason
     if len(odometry.stamp) < 2 or odometry.travel[-1] < SHORTEST:
         return (
-            f'the drive is {odometry.travel[-1]:.1f} m long; from {SHORTEST:g} m on odometry drifts enough to be told'
+            f'the drive is {odometry.travel[-1]:.1f} m long; the drift of odometry can be measured from {SHORTEST:g} '
+            'm on'
         )
     if len(readings) < FEWEST_READINGS:
-        return f'there are {len(readings)} readings; it takes {FEWEST_READINGS}'
+        return f'there are {len(readings)} readings; at least {FEWEST_READINGS} are needed'
     if readings.echo.mean() < LEAST_ECHOES:
         return f'only {readings.echo.mean():.0%} of the readings have an echo'
     if len(np.unique(readings.sensor)) < LEAST_SENSORS:
-        return 'there is one sensor only, which cannot tell a turn from a step aside'
+        return 'there is only one sensor, which cannot distinguish a rotation from a sideways translation'
     return ''
 
 
 def too_little_words(moved: float) -> str:
     """Return why a drive stays that is off by so little, metres."""
-    return f'odometry is off by {moved:.2f} m, which is no more than sonar can tell'
+    return f'odometry is off by {moved:.2f} m, which is not more than the accuracy of sonar'
 
 
 def lost_words(certainty: float) -> str:
     """Return why a drive stays whose heading is this certain."""
-    return f'the heading was lost somewhere: that it is not off by a right angle is only {certainty:.0%} certain'
+    return f'the heading was lost: the probability that it is not wrong by a right angle is only {certainty:.0%}'
 
 
 def refined(odometry: Odometry, windows: Windows, nodes: Floats) -> Odometry:
@@ -344,9 +348,7 @@ def _lost(drive: _Drive, certainty: float) -> _Attempt:
 
 def _said(better: Gain) -> str:
     if not np.isfinite(better.error):
-        return (
-            'there are too few readings on maps of others to tell whether they are predicted better than with odometry'
-        )
+        return 'too few readings overlap with maps of other readings to compare the prediction with that of odometry'
     return f'readings are predicted {better.mean:+.3f} ± {better.error:.3f} nats a reading better than with odometry'
 
 
@@ -354,7 +356,7 @@ def _doubt(part: float) -> str:
     """Return what is to be said where this part of the blocks at places seen before is recognised."""
     if part >= LEAST_RECOGNISED:
         return ''
-    return f'; {part:.0%} of the way through places seen before is recognised: the drive may be bent as a whole'
+    return f'; {part:.0%} of the path through places seen before is recognised: the drive may be bent as a whole'
 
 
 def _named(watch: Watch, name: str, stage: str, part: float) -> None:
