@@ -18,13 +18,13 @@ from .commands import completion, signals
 COMMANDS = {
     'mapper': ('node.main', 'the ROS 2 node: map while driving'),
     'process_bag': ('commands.process_bag', 'map a recorded drive'),
-    'explain': ('commands.explain', 'say why a cell of a map is what it is'),
+    'explain': ('commands.explain', 'explain why a cell of a map is occupied or free'),
     'learn': ('commands.learn', 'learn the sensor model from a recorded drive'),
     'replay_bag': ('commands.replay_bag', 'play a recorded drive to the node'),
     'simulate': ('commands.simulate', 'record a drive through a small world with a known map'),
     'experiment': ('commands.experiment', "repeat the paper's experiments: a table and a figure"),
-    'warm_up': ('commands.warm_up', 'compile all kernels once, for a node that starts fast'),
-    'demo': ('commands.demo', 'simulate, map, score: the whole way in one command'),
+    'warm_up': ('commands.warm_up', 'compile all kernels once, so that the node starts fast'),
+    'demo': ('commands.demo', 'simulate, map and score in one command'),
 }
 """Module and help of each command."""
 
@@ -148,7 +148,7 @@ def _main() -> int:
     name = Path(sys.argv[0]).name
     program = 'python3 -m forward_grid_mapper' if name == '__main__.py' else name
     lines = '\n'.join(f'  {command:12s} {text}' for command, (_, text) in COMMANDS.items())
-    usage = f'usage: {program} COMMAND …\n\n{lines}\n\nCOMMAND --help tells more.'
+    usage = f'usage: {program} COMMAND …\n\n{lines}\n\nCOMMAND --help shows its options.'
     if given in ('-h', '--help'):
         print(usage)
         return 0

@@ -53,8 +53,8 @@ def stamps(name: str, values: ArrayLike, length: int | None = None) -> NDArray[n
         step = float(np.spacing(np.abs(given).max()))
         if step > COARSEST:
             raise InputError(
-                f'{name} has the type {given.dtype}, whose numbers of this size are {step:.3g} s apart; give float64, '
-                f'or subtract the first stamp before the type is changed'
+                f'{name} has the type {given.dtype}, in which numbers of this size are {step:.3g} s apart; use '
+                'float64, or subtract the first stamp before the conversion'
             )
     return np.round(seconds * NANOSECONDS).astype(np.int64)
 
@@ -90,8 +90,8 @@ def twofold(odometry: list[OdometryMessage]) -> list[str]:
     if not count:
         return []
     return [
-        f'{count} stamps have two poses that differ, by up to {far:.2f} m and {math.degrees(turned):.0f}°: are they of '
-        f'two robots, or of two sources? Give those of one'
+        f'{count} stamps have two different poses, which differ by up to {far:.2f} m and {math.degrees(turned):.0f}°: '
+        'are they from two robots, or from two sources? Use those of one'
     ]
 
 
@@ -126,7 +126,9 @@ def _nanoseconds(name: str, times: NDArray[Any]) -> NDArray[np.int64]:
             raise ValueError
         return times.astype(f'{times.dtype.kind}8[ns]').astype(np.int64)
     except (TypeError, ValueError, OverflowError):
-        raise InputError(f'{name} has the type {times.dtype}, which gives no stamps; give seconds as float64') from None
+        raise InputError(
+            f'{name} has the type {times.dtype}, which is not a type of stamps; use seconds as float64'
+        ) from None
 
 
 def _shaped(name: str, array: NDArray[Any], length: int | None) -> NDArray[Any]:

@@ -60,9 +60,9 @@ class Sonar:
             finite = all(map(math.isfinite, (self.x, self.y, self.yaw, self.max_range, self.min_range, self.pitch)))
             self.field_of_view / 1.0
         except TypeError as error:
-            raise InputError(f'{self}: a number is wanted: {error}') from None
+            raise InputError(f'{self}: not a number: {error}') from None
         if abs(self.yaw) > TURN:
-            raise InputError(f'yaw = {self.yaw:g} rad is more than a turn; did you mean radians({self.yaw:g})?')
+            raise InputError(f'yaw = {self.yaw:g} rad is more than a full turn; did you mean radians({self.yaw:g})?')
         if math.hypot(self.x, self.y) > FARTHEST:
             raise InputError(
                 f'x = {self.x:g} m and y = {self.y:g} m are more than {FARTHEST:g} m from the middle of the robot; '
@@ -76,9 +76,11 @@ class Sonar:
             raise InputError(f'{self}: pose and limits must be finite')
         if not 0.0 < self.field_of_view < math.pi:
             degrees = f'; did you mean radians({self.field_of_view:g})?' if 0 < self.field_of_view < 180 else ''
-            raise InputError(f'field_of_view = {self.field_of_view:g} is no angle between 0 and pi rad{degrees}')
+            raise InputError(f'field_of_view = {self.field_of_view:g} is not an angle between 0 and pi rad{degrees}')
         if not 0.0 <= self.min_range < self.max_range:
-            raise InputError(f'min_range = {self.min_range:g} m and max_range = {self.max_range:g} m leave no range')
+            raise InputError(
+                f'min_range = {self.min_range:g} m and max_range = {self.max_range:g} m leave no valid range'
+            )
 
 
 @dataclass(frozen=True)
@@ -188,7 +190,7 @@ def make_maps(
     if unknown := sorted(set(names) - set(sensors)):
         raise InputError(f'no sensor is called {", ".join(unknown[:6])}; there are: {", ".join(sorted(sensors))}')
     if not odometry or not len(values):
-        raise InputError(f'there are {len(odometry)} poses and {len(values)} ranges; it takes some of both')
+        raise InputError(f'there are {len(odometry)} poses and {len(values)} ranges; both are needed')
     mounted: dict[str, Pose2] = {name: Mount(s.x, s.y, s.yaw, -s.pitch) for name, s in sensors.items()}
     associator = PoseAssociator(lambda base, frame, stamp: mounted.get(frame), chosen, patient=True)
     live = LogOddsMapOfAll(associator, chosen)
@@ -231,7 +233,7 @@ def _of_the_node(parameters: Parameters) -> list[str]:
     """Return a warning about parameters that have no effect here."""
     values = parameters.flat()
     names = [row.name for row in TABLE if row.group == 'node' and values[row.name] != row.default]
-    return [f'only the node has these parameters, and they are ignored: {", ".join(names)}'] if names else []
+    return [f'these parameters are only for the node and are ignored: {", ".join(names)}'] if names else []
 
 
 def _told_of_poses(associator: PoseAssociator) -> list[str]:

@@ -39,8 +39,8 @@ class Topics(NamedTuple):
             return []
         every = ' '.join(map(quoted, (*self.range_topics, *self.left_out)))
         return [
-            f'the ranges of {", ".join(self.left_out)} are left out, since {self.odom_topic} is of another namespace; '
-            f'if one robot has them all, give `--range-topics {every}`'
+            f'the ranges of {", ".join(self.left_out)} are left out because {self.odom_topic} is in another '
+            f'namespace; if all of them belong to one robot, add `--range-topics {every}`'
         ]
 
 
@@ -85,8 +85,8 @@ def choose_topics(
     ]
     if not found:
         raise BagError(
-            f'The bag has no nav_msgs/Odometry messages, which give the poses of the robot.{_moving(contents, kinds)} '
-            f'{_listing(contents)}'
+            'The bag has no nav_msgs/Odometry messages, which contain the poses of the '
+            f'robot.{_moving(contents, kinds)} {_listing(contents)}'
         )
     if len(found) > 1:
         lines = (
@@ -112,8 +112,8 @@ def choose_range_topics(contents: Contents, range_topics: Sequence[str] | None) 
         ranges = tuple(dict.fromkeys(_named(contents, topic, (RANGE,), '--range-topics') for topic in range_topics))
     if not ranges:
         raise BagError(
-            f'The bag has no sensor_msgs/Range messages to map from; LaserScan, PointCloud and others are not read: '
-            f'publish each reading of a sonar as a Range. {_listing(contents)}'
+            'The bag has no sensor_msgs/Range messages. LaserScan, PointCloud and other types are not read: publish '
+            f'each reading of a sonar as a Range. {_listing(contents)}'
         )
     return ranges
 
@@ -134,7 +134,7 @@ def _moving(contents: Contents, kinds: Sequence[str]) -> str:
     topics = _of_type(contents, TF_MESSAGE)
     if not topics or TF_MESSAGE not in kinds:
         return ''
-    return f' `--odom-topic {topics[0]}` takes those of {BASE_FRAMES[0]} from its transforms.'
+    return f' `--odom-topic {topics[0]}` uses the poses of {BASE_FRAMES[0]} from the transforms of the bag.'
 
 
 def _of_type(contents: Contents, msgtype: str) -> list[str]:

@@ -209,12 +209,12 @@ def _is_plain(file: Path) -> bool:
 def _open_file(file: Path) -> Source:
     if not file.is_file():
         # a pipe would be waited for, a device may have no end
-        raise BagError(f'{file} is no regular file; give a bag folder or a .mcap, .db3 or .bag file.')
+        raise BagError(f'{file} is not a regular file; give a bag folder or a .mcap, .db3 or .bag file.')
     magic = _magic(file)
     suffix, scanner = next((kind for key, kind in _KINDS.items() if magic.startswith(key)), ('', None))
     if scanner is None:
         if not magic:
-            raise BagError(f'{file} is empty (0 bytes); the recording has nothing to read.')
+            raise BagError(f'{file} is empty (0 bytes); nothing was recorded.')
         if magic.startswith(_ZSTD_MAGIC):
             raise BagError(f'{file} is compressed; unpack it with `zstd -d {quoted(file)}` or open its bag folder.')
         raise BagError(f'{file} is not a bag: it is neither an MCAP, nor a sqlite3, nor a ROS 1 bag file.')

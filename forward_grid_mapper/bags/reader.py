@@ -82,7 +82,7 @@ class Bag:
         if reasons is None:
             return None
         name = self.path.name or self.path.resolve().name
-        return f'{name} is damaged or cut off ({reasons}); what was intact was read; {repair_hint(self.path)}.'
+        return f'{name} is damaged or cut off ({reasons}); the intact part was read; {repair_hint(self.path)}.'
 
     def topics(self) -> dict[str, tuple[str, int]]:
         """Return (message type, number of messages) by topic; several types are joined by ' | '."""
@@ -174,8 +174,8 @@ class Bag:
                 yield joined(parts)
         if not decoded and self.truncated:
             raise BagError(
-                f'{self.path} is damaged or cut off ({self._reasons()}) and nothing of the chosen topics can be read; '
-                f'{repair_hint(self.path)}.'
+                f'{self.path} is damaged or cut off ({self._reasons()}) and no message of the chosen topics can be '
+                f'read; {repair_hint(self.path)}.'
             )
         if progress:
             progress(done, max(done, total))

@@ -122,8 +122,8 @@ class Sqlite3Scan(Scan):
         options = 'mode=ro' if has_log(self._path) else 'mode=ro&immutable=1'
         if has_log(self._path) and not _may_index_log(self._path):
             raise BagError(
-                f'{self._path} has messages in a log beside it, {self._path.name}-wal, which can be read only in a '
-                f'folder that can be written; copy the bag to one, with all its files.'
+                f'{self._path} has messages in a log next to it, {self._path.name}-wal, which can only be read in a '
+                'writable folder; copy the bag to one, with all its files.'
             )
         # a path of any bytes, which SQLite unquotes
         database = sqlite3.connect(f'file:{quote(os.fsencode(self._path.resolve()))}?{options}', uri=True)
@@ -174,7 +174,7 @@ def _refuse_what_is_no_table(database: sqlite3.Connection) -> None:
 
 def _reason(error: BaseException) -> str:
     if isinstance(error, sqlite3.OperationalError) and 'interrupted' in str(error):
-        return 'reading it takes more work than a sound file of its size needs'
+        return 'reading it takes more work than an intact file of its size'
     return one_line(error)
 
 

@@ -81,8 +81,8 @@ class StaticTransforms:
             known = self._parents.get(child)
             if known is not None and not (known[0] == parent and np.allclose(known[1], transform, atol=SAME)):
                 self.contradicted[child] = (
-                    f'{self._topics.get(child, self._topic)} and {other._topic} give different poses of {child!r}; '
-                    f'that of {other._topic} is taken. If it is the one of another robot, give --sensor'
+                    f'{self._topics.get(child, self._topic)} and {other._topic} contain different poses of {child!r}; '
+                    f'that of {other._topic} is used. If it belongs to another robot, set --sensor'
                 )
             self._parents[child] = parent, transform
             self._topics[child] = other._topic
@@ -130,7 +130,8 @@ class StaticTransforms:
             side = 'up' if pose[2, 0] > 0 else 'down'
             raise SteepSensorError(
                 f'Sensor {sensor_frame!r} looks {side}, more than {math.degrees(STEEPEST):.0f}° out of the plane of '
-                f'{base_frame!r}; fix its transform (the beam goes along x), or leave the sensor out.'
+                f'{base_frame!r}; fix its transform (the x axis is the direction of the beam), or leave out the '
+                'sensor.'
             )
         return mount
 

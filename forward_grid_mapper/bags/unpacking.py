@@ -91,7 +91,7 @@ def open_unpacked(file: Path, open_file: Callable[[Path], Source]) -> Source:
         Naming the file, if it is damaged, or unpacks to more than is admitted.
     """
     if not file.is_file():
-        raise BagError(f'{file} is no regular file; give a bag folder or a .mcap, .db3 or .bag file.')
+        raise BagError(f'{file} is not a regular file; give a bag folder or a .mcap, .db3 or .bag file.')
     folder = _temporary_folder(file)
     try:
         unpacked = folder / file.stem
@@ -142,6 +142,6 @@ def _unpack(packed: Path, unpacked: Path) -> None:
 
 def _no_space(packed: Path, free: int) -> NoSpaceError:
     return NoSpaceError(
-        f'{packed} is compressed, and what it holds does not fit {tempfile.gettempdir()}, where {megabytes(free)} were '
-        f'free; set TMPDIR to a folder on a disk with more space.'
+        f'{packed} is compressed, and its content does not fit into {tempfile.gettempdir()}, where {megabytes(free)} '
+        'were free; set TMPDIR to a folder on a disk with more space.'
     )

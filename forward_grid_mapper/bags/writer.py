@@ -59,7 +59,7 @@ class BagWriter:
 
     def __init__(self, path: str | Path, format: str = 'mcap') -> None:
         if format not in FORMATS:
-            raise OutputError(f'There is no bag format {format!r}; take one of {", ".join(FORMATS)}.')
+            raise OutputError(f'There is no bag format {format!r}; use one of {", ".join(FORMATS)}.')
         self.path = Path(path)
         self._format = format
         self._ros1 = format == 'ros1'

@@ -22,7 +22,7 @@ from ..core.runtime.compiling import compiling
 from ..core.search.search import Progress
 from .signals import Cancelled, Interruptible, cancelled_line
 
-COMPILES = '(compiling kernels, which takes half a minute once)'
+COMPILES = '(compiling kernels; this takes half a minute and is done once)'
 
 PATIENCE = 1.0
 """Seconds of work before progress is shown."""
@@ -52,7 +52,7 @@ def run(
     except MapperError as error:
         problem = str(error)
     except MemoryError:
-        problem = 'the memory is not enough for so large a map; raise resolution, or lower max_cells or max_range'
+        problem = 'there is not enough memory for a map of this size; raise resolution, or lower max_cells or max_range'
     except BrokenPipeError:
         # the reader of our output went away, as `head` does
         _still_printing()

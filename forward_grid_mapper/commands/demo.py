@@ -30,8 +30,10 @@ def parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
     made = argparse.ArgumentParser(
         COMMAND,
-        description="The main job for real: simulates the paper's drive past an open door into a bag, starts the node, "
-        'replays the bag to it over DDS, runs EM, saves the maps, and scores them against the truth.',
+        description=(
+            "Run the whole pipeline: simulates the paper's drive past an open door into a bag, starts the node, "
+            'replays the bag to it over DDS, runs EM, saves the maps, and scores them against the truth.'
+        ),
         epilog='example: demo --world corridor -o seen',
     )
     made.add_argument('-o', '--output', type=output_name, metavar='DIR', help='new folder (default: demo_output)')
@@ -39,7 +41,7 @@ def parser() -> argparse.ArgumentParser:
     made.add_argument('--seen', type=int, metavar='N', help='door: sweeps in front of it (default 3)')
     made.add_argument('--rate', type=float, default=10.0, metavar='R', help='speed of the replay (default 10)')
     made.add_argument('--offline', action='store_true', help='map the bag with process_bag instead, without ROS')
-    made.add_argument('--seed', type=int, default=0, help='of the noise (default 0)')
+    made.add_argument('--seed', type=int, default=0, help='seed of the noise (default 0)')
     add_show_option(made, 'the picture')
     add_mapping_options(made)
     return made
@@ -82,7 +84,7 @@ def through_node(folder: Path, bag: Path, recording: Recording, options: argpars
         node.call('reset')
         ticker.say(f'replaying the bag to the node, {options.rate:g} times as fast as it was recorded')
         node.run('replay_bag', str(bag), '--rate', str(options.rate), '--quiet')
-        ticker.say('running EM; at the first start its code is compiled first, which takes about a minute')
+        ticker.say('running EM; the first start also compiles its code, which takes about a minute')
         answer = node.call('run_em')
         ticker.say('saving the maps')
         node.call('save_maps')
@@ -148,9 +150,9 @@ def demo(options: argparse.Namespace) -> int:
         with output_errors(folder):
             (folder / 'scores.txt').write_text(table + '\n', encoding='utf-8')
     print(f'EM {"offline" if options.offline else "in the node"}: {summary}\n\n{table}\n')
-    print('F1, precision and recall are of walls; false dots are occupied cells in free space: docs/quality.md')
-    print('a door is as wide as its free cells: its frame may take a cell on each side\n')
-    print(f'the picture is {output / "demo.png"}; the maps as for Nav2 and their report are in {output / "maps"}')
+    print('F1, precision and recall are for wall cells; false dots are occupied cells in free space: docs/quality.md')
+    print('the width of a door is that of its free cells: its frame may cover a cell on each side\n')
+    print(f'the picture is {output / "demo.png"}; the maps for Nav2 and their report are in {output / "maps"}')
     if options.show:
         show(output / 'demo.png')
     return 0

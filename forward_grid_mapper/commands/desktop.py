@@ -21,7 +21,7 @@ def show(path: Path) -> None:
                 return
             except OSError as error:
                 print(f'{opener} does not start: {error}', file=sys.stderr)
-    print(f'no desktop was found to show it; open {where.as_uri()} in a browser', file=sys.stderr)
+    print(f'no desktop was found; open {where.as_uri()} in a browser', file=sys.stderr)
 
 
 def _opener() -> str | None:

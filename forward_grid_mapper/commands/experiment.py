@@ -31,16 +31,20 @@ def parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
     made = argparse.ArgumentParser(
         COMMAND,
-        description="Repeat one of the paper's figures in simulation: prints a table and writes a figure. The "
-        'standard map is given the best gains for the very experiment; the forward map has the parameters below.',
+        description=(
+            "Repeat one of the paper's figures in simulation: prints a table and writes a figure. The standard map "
+            'has the best gains for each experiment; the forward map has the parameters below.'
+        ),
         epilog='example: experiment passer-by --seeds 1 -o fig5',
     )
     made.add_argument(
         'which',
         choices=('density', *MAPS, 'drift'),
-        help='Fig. 3: the density of a range; Fig. 4: a door seen n times; Fig. 5: two doors on either side, and a '
-        "person who walks by; Fig. 6: a long corridor; drift: wheel odometry that drifts, with the paper's corridor "
-        'and a building of ours',
+        help=(
+            'Fig. 3: the density of a range; Fig. 4: a door seen n times; Fig. 5: two doors on either side, and a '
+            "person who walks by; Fig. 6: a long corridor; drift: wheel odometry that drifts, in the paper's corridor "
+            'and in a building'
+        ),
     )
     made.add_argument('-o', '--output', type=output_name, metavar='DIR', help='new folder (default: experiment_WHICH)')
     made.add_argument(

@@ -63,5 +63,5 @@ def density_table(curve: Curve, parameters: Parameters) -> str:
         lines.append(f'{"echo lost":28s}{MAX_RANGE:8.2f}{p[-1]:14.3f}{model.p_lost:9.3f}')
     lines.append(f'{"chance, everywhere":28s}{"":8s}{p.min():14.3f}{model.p_rand:9.3f}')
     lines.append('')
-    lines.append(f'The obstacle beside the cone, at {BESIDE[0]:.1f} m, leaves no trace.')
+    lines.append(f'The obstacle beside the cone, at {BESIDE[0]:.1f} m, has no effect.')
     return '\n'.join(lines)

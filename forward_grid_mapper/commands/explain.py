@@ -40,8 +40,10 @@ def parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
     made = argparse.ArgumentParser(
         COMMAND,
-        description='Say why a cell of the maximum likelihood map is what it is: which readings speak for an obstacle '
-        'there and which against it, by how much, and what would change it.',
+        description=(
+            'Explain the state of a cell of the maximum likelihood map: the readings for and against an obstacle '
+            'there, their evidence, and what would change the cell.'
+        ),
         epilog='example: explain MY_BAG_maps 1.75 -0.4',
     )
     made.add_argument('maps', metavar='MAPS', help=f'folder that process_bag or save_maps wrote, or its {ARCHIVE}')
@@ -148,7 +150,9 @@ def explanation(maps: MapArchive, readings: Readings, found: CellEvidence, shown
             said = f'reading {one}' if mask.sum() == 1 else f'readings {several}'
             yield f'    {_nats(found.nats[mask].sum()):>7}  {int(mask.sum())} {said}: {who}'
     if state == 1:
-        yield f'  {_nats(found.wall)} nats for the cell with its occupied neighbours, which share their readings'
+        yield (
+            f'  {_nats(found.wall)} nats for the cell together with its occupied neighbours, which share their readings'
+        )
     yield f'  {_what_decides(maps, found, state)}'
     if shown and count:
         yield ''
@@ -189,35 +193,37 @@ def _what_decides(maps: MapArchive, found: CellEvidence, state: int) -> str:
     """Say in one sentence what made the cell what it is, and what would make it something else."""
     total = found.data + found.prior
     if found.traversed:
-        return 'a sensor was moved over it, so it is free whatever the readings say'
+        return 'a sensor traversed it, so it is free, independent of the readings'
     if not len(found.readings):
-        return 'no reading says anything of it'
+        return 'no reading gives evidence on it'
     if state < 0:
         blocked, count = int(found.through_wall.sum()), len(found.readings)
         behind = (
-            f'a wall stands in the way of {"all" if blocked == count else blocked} of these readings, and what they '
-            f'say does not count: sound that a wall mirrors seems to come from behind it'
+            f'a wall blocks {"all" if blocked == count else blocked} of these readings, and their evidence is not '
+            'used: an echo that a wall reflects seems to come from behind it'
         )
         if blocked == count:
             return behind
         few = (
-            f'too little is known: fewer than {maps.parameters.search.least_passed:g} readings are expected to have '
-            f'passed through it, or none that would have noticed a wall there, and nothing makes it occupied'
+            f'there is not enough evidence: fewer than {maps.parameters.search.least_passed:g} readings are expected '
+            'to have passed through it, or none that could have detected a wall there, and no evidence makes it '
+            'occupied'
         )
         return f'{few}; {behind}' if blocked else few
     if (total > 0) != (state == 1):
         return (
-            'by itself it would be the other way: it belongs to a wall that is closed, extended or removed as a whole'
+            'its own evidence is for the opposite state: it belongs to a wall that is closed, extended or removed as '
+            'a whole'
         )
     against = found.nats[(found.nats < 0) if state == 1 else (found.nats > 0)]
     typical = float(np.abs(against).max(initial=0.0))
     other = STATES[1 - state]
     if typical >= LEAST_TYPICAL:
         more = math.ceil(abs(total) / typical)
-        kind = f'the one that speaks most for {other}'
+        kind = f'the one with the most evidence for {other}'
         readings = 'reading' if more == 1 else 'readings'
         return f'to be {other} it takes {abs(total):.1f} nats more: {more} more {readings} like {kind}'
-    none = f'so far no single reading speaks for it with {LEAST_TYPICAL:g} nats or more'
+    none = f'so far no single reading gives evidence for it of {LEAST_TYPICAL:g} nats or more'
     return f'to be {other} it takes {abs(total):.1f} nats more; {none}'
 
 

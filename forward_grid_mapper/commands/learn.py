@@ -38,7 +38,7 @@ from .options import (
 COMMAND = 'learn'
 
 NOT_JUDGED = (
-    'no readings were held out to judge the learned values by (--keep-going): compare the maps with and without them'
+    'no readings were held out to test the learned values (--keep-going): compare the maps with and without them'
 )
 
 
@@ -46,9 +46,11 @@ def parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
     made = BagParser(
         COMMAND,
-        description='Learn p_hit, p_rand, p_lost and sigma from recorded drives, in turn with the map: prints each '
-        'value with its standard error, and warns of values that lose smooth walls or rest on few readings. Look at '
-        'the maps of process_bag before you drive by them.',
+        description=(
+            'Learn p_hit, p_rand, p_lost and sigma from recorded drives, in alternation with the map: prints each '
+            'value with its standard error, and warns of values that lose smooth walls or depend on few readings. '
+            'Look at the maps of process_bag before you use the values on a robot.'
+        ),
         epilog='example: learn MY_BAG -o learned.yaml',
     )
     made.add_bags('one or more: ROS 2 bag folder, single .mcap or .db3 file, ROS 1 .bag, journal, or folder of bags')
@@ -62,12 +64,16 @@ def parser() -> argparse.ArgumentParser:
     add_bag_options(made)
     add_part_options(made)
     made.add_argument(
-        '--rounds', type=int, default=5, metavar='N', help='at most so many rounds of map and updates (default 5)'
+        '--rounds',
+        type=int,
+        default=5,
+        metavar='N',
+        help='largest number of rounds, each a map and an update of the values (default 5)',
     )
     made.add_argument(
         '--keep-going',
         action='store_true',
-        help='hand out the values although their map has lost walls, and without asking held-out readings',
+        help='write the values even if their map has lost walls, and without a test on held-out readings',
     )
     made.add_argument('-q', '--quiet', action='store_true', help='print nothing but warnings and errors')
     add_json_option(made)
@@ -132,7 +138,7 @@ def learn(options: argparse.Namespace) -> int:
                 print(f'\nthe parameters are in {output}; compare the maps with and without them:')
                 print(f'  {_mapping(options, output)}')
             else:
-                print(f'\nthe parameters are in {output}: nothing was learned, so they are those from the start')
+                print(f'\nthe parameters are in {output}: nothing was learned, so they are the initial values')
     return 0
 
 

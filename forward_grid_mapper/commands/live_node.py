@@ -161,4 +161,4 @@ class LiveNode:
 
     def _last_words(self) -> str:
         lines = self._log.read_text(errors='replace').splitlines() if self._log.exists() else []
-        return 'its last words: ' + ' | '.join(lines[-3:]) if lines else 'it said nothing'
+        return 'its last words: ' + ' | '.join(lines[-3:]) if lines else 'it printed nothing'

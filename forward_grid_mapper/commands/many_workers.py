@@ -58,14 +58,18 @@ def add_worker_options(parser: argparse.ArgumentParser) -> None:
         '--memory-per-worker',
         type=float,
         metavar='GB',
-        help=f'what a worker may take; beyond, it is ended and its tile begun anew (default {MEMORY:g})',
+        help=(
+            f'memory of a worker; a worker that exceeds it is ended, and its tile is started again (default {MEMORY:g})'
+        ),
     )
     group.add_argument(
         '--work',
         type=output_name,
         metavar='DIR',
-        help='where readings and tiles are kept until all is done, on a disk that all workers share; an interrupted '
-        'job goes on from there (default: beside the results)',
+        help=(
+            'folder of readings and tiles until the job is done, on a disk that all workers share; an interrupted job '
+            'continues from there (default: next to the results)'
+        ),
     )
 
 
@@ -112,7 +116,7 @@ def with_workers(
             with Cluster(options.workers or 1, options.scheduler, memory) as cluster:
                 if not options.quiet:
                     told = f', the dashboard is at {cluster.dashboard}' if cluster.dashboard else ''
-                    going_on = ', and going on with what was done before' if again else ''
+                    going_on = ', continuing the previous work' if again else ''
                     print(f'mapping in tiles of {size:g} m in {readable(work.path)}{going_on}{told}', file=sys.stderr)
                 job = Job(work, _for_worker(of_all, cluster.memory or memory), size, versions())
                 found = ScaledMapper(cluster, job, ticker.say).run(recordings, [*repeated, *meant.skipped, *ignored])
@@ -123,7 +127,7 @@ def with_workers(
             if not work.placed:
                 shutil.rmtree(work.root, ignore_errors=True)
                 raise
-            kept = f'what was done is kept in {readable(work.path)}; the same command goes on there'
+            kept = f'finished work is kept in {readable(work.path)}; the same command continues from there'
             if isinstance(error, Cancelled):
                 error.left = f'no results were written, {kept}'
             else:
@@ -149,9 +153,11 @@ def _check(options: argparse.Namespace) -> None:
     if options.workers is not None and options.workers > (most := max(WORKERS_A_CORE * cores(), 8)):
         raise ParameterError(f'--workers {options.workers}: this machine has {cores()} cores; give at most {most}')
     if options.workers is not None and options.scheduler is not None:
-        raise ParameterError('--scheduler has workers of its own; leave out --workers')
+        raise ParameterError('--scheduler has its own workers; leave out --workers')
     if options.scheduler is not None and not re.fullmatch(r'(tcp|tls|ws|wss|ucx)://[^\s/]+:\d+', options.scheduler):
-        raise ParameterError(f'--scheduler {options.scheduler!r} is no address of a scheduler: give tcp://HOST:8786')
+        raise ParameterError(
+            f'--scheduler {options.scheduler!r} is not the address of a scheduler: give tcp://HOST:8786'
+        )
     memory = options.memory_per_worker
     if memory is not None and not (math.isfinite(memory) and memory >= LEAST_MEMORY):
         raise ParameterError(f'--memory-per-worker {memory:g}: give gigabytes, {LEAST_MEMORY:g} or more')

@@ -145,14 +145,14 @@ def add_bag_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--poses',
         metavar='FILE',
-        help="take the robot's poses from a TUM or CSV file in place of the bag's odometry; stamps in seconds",
+        help="take the robot's poses from a TUM or CSV file instead of the odometry in the bag; stamps in seconds",
     )
     parser.add_argument(
         '--sensor',
         action='append',
         default=[],
         metavar='FRAME=X,Y,YAW',
-        help='pose of a sensor on the robot in metres and radians (or 90deg); wins over /tf_static; may be repeated',
+        help='pose of a sensor on the robot in metres and radians (or 90deg); overrides /tf_static; may be repeated',
     )
 
 
@@ -185,7 +185,7 @@ def chosen_poses(options: argparse.Namespace) -> GivenPoses | None:
     if options.poses is None:
         return None
     if options.odom_topic:
-        raise ParameterError('--poses is given in place of odometry; leave out --odom-topic')
+        raise ParameterError('--poses replaces odometry; leave out --odom-topic')
     return read_given_poses(options.poses)
 
 
@@ -196,10 +196,14 @@ def add_part_options(parser: argparse.ArgumentParser) -> None:
         type=float,
         default=0.0,
         metavar='S',
-        help='map what was measured from so many seconds after the first message of each drive (default 0)',
+        help='start of the mapped part, in seconds after the first message of each drive (default 0)',
     )
     parser.add_argument(
-        '--duration', type=float, default=math.inf, metavar='S', help='map so many seconds of each drive (default: all)'
+        '--duration',
+        type=float,
+        default=math.inf,
+        metavar='S',
+        help='length of the mapped part of each drive, in seconds (default: all)',
     )
 
 
@@ -221,7 +225,7 @@ def chosen_part(options: argparse.Namespace) -> Part:
 def add_mapping_options(parser: argparse.ArgumentParser) -> None:
     """Add `--params`, `--set`, `--dump-config` and `--list-parameters`."""
     group = parser.add_argument_group('parameters')
-    group.add_argument('--params', metavar='FILE', help='parameter YAML, the same file that the node takes')
+    group.add_argument('--params', metavar='FILE', help='parameter YAML, the same file as for the node')
     group.add_argument(
         '--set',
         action='append',
@@ -230,10 +234,10 @@ def add_mapping_options(parser: argparse.ArgumentParser) -> None:
         help='set one parameter, after --params; may be repeated (--list-parameters shows all); angles in radians, or '
         'as 40deg',
     )
+    group.add_argument('--dump-config', action='store_true', help='print the parameters of this call as YAML, and exit')
     group.add_argument(
-        '--dump-config', action='store_true', help='show every parameter as this call would use it, as YAML, and exit'
+        '--list-parameters', action=ListParameters, help='print all parameters with their defaults as YAML, and exit'
     )
-    group.add_argument('--list-parameters', action=ListParameters, help='show every parameter as YAML and exit')
 
 
 class ListParameters(argparse.Action):
@@ -280,7 +284,9 @@ def chosen_parameters(options: argparse.Namespace) -> Chosen:
     settings = dict(parse_setting(text) for text in options.set)
     for name in settings:
         if name not in DEPRECATED and find(name).group == 'node':
-            raise ParameterError(f'--set {name}: only the node has this parameter; topics have options of their own')
+            raise ParameterError(
+                f'--set {name}: this parameter is only for the node; use the options of this command for topics'
+            )
     warnings = [text] if (text := _ignored(values, options.params)) else []
     parameters = Parameters.from_flat({**values, **settings})
     if options.dump_config:
@@ -296,4 +302,4 @@ def _ignored(values: Mapping[str, Any], source: str) -> str:
     if not names:
         return ''
     listed = [f'{name} ({INSTEAD[name]})' if name in INSTEAD else name for name in names]
-    return f'{readable(source)}: of the parameters that only the node has these are ignored: {", ".join(listed)}'
+    return f'{readable(source)}: these parameters are only for the node and are ignored: {", ".join(listed)}'

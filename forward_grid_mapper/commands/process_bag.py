@@ -77,13 +77,15 @@ def parser() -> argparse.ArgumentParser:
         type=int,
         default=0,
         metavar='ROUNDS',
-        help='learn p_hit, p_rand, p_lost and sigma in that many rounds; p_hit comes out too high, check the maps',
+        help='learn p_hit, p_rand, p_lost and sigma in this number of rounds; p_hit is biased upward, check the maps',
     )
     made.add_argument(
         '--refine-poses',
         action='store_true',
-        help="take the drift out of wheel odometry: find the trajectory together with the map; kept as odometry's "
-        'where readings that were held out do not speak for it',
+        help=(
+            'correct the drift of wheel odometry: estimate the trajectory together with the map; odometry is kept if '
+            'held-out readings do not support the trajectory'
+        ),
     )
     made.add_argument(
         '--odometry-calibration',
@@ -94,13 +96,11 @@ def parser() -> argparse.ArgumentParser:
         '--tiles',
         type=float,
         metavar='M',
-        help='map in tiles of that edge in metres, one after the other; 20 or more for sonars that reach 5 m',
+        help='map in tiles with this edge length in metres, one after the other; 20 or more for sonars of 5 m range',
     )
     add_worker_options(made)
     made.add_argument('--bag', dest='write_bag', action='store_true', help='also write the maps as a bag (mcap)')
-    made.add_argument(
-        '--rerun', action='store_true', help='also write the drive for the viewer Rerun, which plays it (drive.rrd)'
-    )
+    made.add_argument('--rerun', action='store_true', help='also write the drive for the viewer Rerun (drive.rrd)')
     made.add_argument('-q', '--quiet', action='store_true', help='print nothing but warnings, errors and the folder')
     add_json_option(made)
     add_show_option(made, 'the report')
@@ -116,9 +116,11 @@ def process(options: argparse.Namespace) -> int:
         raise ParameterError('--learn: the number of rounds must not be negative')
     part, poses = chosen_part(options), chosen_poses(options)
     if options.tiles is not None and not (math.isfinite(options.tiles) and options.tiles >= SMALLEST_TILE):
-        raise ParameterError(f'--tiles {options.tiles:g}: give the edge of a tile in metres, {SMALLEST_TILE:g} or more')
+        raise ParameterError(
+            f'--tiles {options.tiles:g}: give the edge length of a tile in metres, {SMALLEST_TILE:g} or more'
+        )
     if parameters.association.odometry_noise and not options.refine_poses:
-        ignored.append('odometry_noise has an effect with --refine-poses alone, which is not given')
+        ignored.append('odometry_noise has an effect only with --refine-poses, which is not given')
     if options.workers is not None or options.scheduler is not None:
         return with_workers(options, parameters, extrinsics, ignored, part, f'{_stem(options.bags)}_maps', tell)
     if options.work is not None or options.memory_per_worker is not None:
@@ -229,8 +231,8 @@ def _learned(maps: MapSet) -> str:
     m = maps.parameters.model
     return (
         f'learned p_hit {m.p_hit:.3f}, p_rand {m.p_rand:.3f}, p_lost {m.p_lost:.3f}, sigma {m.sigma:.3f} m together '
-        f'with the map: p_hit is biased upward this way, and smooth walls may be lost; compare with a run '
-        f'without --learn; the command learn says how sure they are, and stops before walls are lost'
+        'with the map: p_hit is biased upward, and smooth walls may be lost; compare with a run without --learn; the '
+        'command learn also gives standard errors, and stops before walls are lost'
     )
 
 

@@ -30,15 +30,25 @@ def parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
     made = BagParser(
         COMMAND,
-        description="Replay a recorded drive to the mapper: publishes a bag's Range, Odometry and static transforms, "
-        'with their own stamps and in their order, once somebody listens to all of them. What follows --ros-args goes '
-        'to ROS.',
+        description=(
+            "Replay a recorded drive to the mapper: publishes a bag's Range, Odometry and static transforms, with the "
+            'recorded stamps and in the recorded order, when every topic has a subscriber. Arguments after --ros-args '
+            'are for ROS.'
+        ),
         epilog='example: replay_bag MY_BAG --rate 2 --clock',
     )
     made.add_bag('ROS 2 bag folder, single .mcap or .db3 file, or ROS 1 .bag')
-    made.add_argument('--rate', type=_positive, default=1.0, metavar='R', help='times as fast as recorded (default 1)')
     made.add_argument(
-        '--loop', nargs='?', type=_times, const=0, default=1, metavar='N', help='play N times; without N until stopped'
+        '--rate', type=_positive, default=1.0, metavar='R', help='speed relative to the recording (default 1)'
+    )
+    made.add_argument(
+        '--loop',
+        nargs='?',
+        type=_times,
+        const=0,
+        default=1,
+        metavar='N',
+        help='play N times; without N, until it is stopped',
     )
     made.add_argument(
         '--clock',
@@ -46,7 +56,7 @@ def parser() -> argparse.ArgumentParser:
         type=_positive,
         const=40.0,
         metavar='HZ',
-        help="publish the bag's time on /clock, between messages too at HZ of wall time (default 40)",
+        help='publish the time of the bag on /clock, also between messages, at HZ of wall time (default 40)',
     )
     add_topic_options(made)
     made.add_argument(
@@ -57,11 +67,15 @@ def parser() -> argparse.ArgumentParser:
         type=_number,
         default=30.0,
         metavar='S',
-        help='how long to wait for subscribers of every topic before giving up (default 30); 0 begins at once',
+        help='longest wait for subscribers of every topic (default 30); 0 begins at once',
     )
     quality = made.add_mutually_exclusive_group()
-    quality.add_argument('--reliable', action='store_true', default=True, help='for every kind of subscriber (default)')
-    quality.add_argument('--best-effort', dest='reliable', action='store_false', help='as sensor drivers publish')
+    quality.add_argument(
+        '--reliable', action='store_true', default=True, help='reliable, for every kind of subscriber (default)'
+    )
+    quality.add_argument(
+        '--best-effort', dest='reliable', action='store_false', help='best effort, like sensor drivers'
+    )
     made.add_argument('-q', '--quiet', action='store_true', help='print nothing but errors')
     return made
 
@@ -111,8 +125,8 @@ def _static(messages: Mapping[str, Iterable[Any]], quiet: bool) -> dict[str, lis
     except (MapperError, *MISFITS) as error:
         if not quiet:
             _print_warning(
-                f'static transforms are not replayed ({error}); give the mapper the poses of the sensors as '
-                f'parameters sensors.FRAME.pose: [x, y, yaw]'
+                f'static transforms are not replayed ({error}); set the poses of the sensors in the parameters of the '
+                'mapper: sensors.FRAME.pose: [x, y, yaw]'
             )
         return {}
 
@@ -124,7 +138,7 @@ def _warn(bag: Bag, player: Player) -> None:
     for topic, count in (player.unusable + Counter(bag.undecodable)).items():
         _print_warning(skipped(count, topic))
     if player.jumps:
-        _print_warning(f'the stamps went back or left a gap {counted(player.jumps, "time")}, which was not waited for')
+        _print_warning(f'the stamps jumped back or had a gap {counted(player.jumps, "time")}, which was skipped')
 
 
 def _print_warning(text: str) -> None:
@@ -134,7 +148,7 @@ def _print_warning(text: str) -> None:
 def _positive(text: str) -> float:
     value = _number(text)
     if not value:
-        raise argparse.ArgumentTypeError(f'{text!r} is not more than 0')
+        raise argparse.ArgumentTypeError(f'{text!r} is not above 0')
     return value
 
 
@@ -144,7 +158,7 @@ def _number(text: str) -> float:
     except ValueError:
         value = math.nan
     if not 0 <= value < math.inf:
-        raise argparse.ArgumentTypeError(f'{text!r} is not a number from 0 up (the bag goes before the options)')
+        raise argparse.ArgumentTypeError(f'{text!r} is not a number of at least 0 (the bag goes before the options)')
     return value
 
 

@@ -69,23 +69,25 @@ def parser() -> argparse.ArgumentParser:
         '-o', '--output', type=output_name, required=True, metavar='DIR', help='new folder for the recording'
     )
     made.add_argument('--seen', type=int, metavar='N', help='door: sweeps taken in front of it (default 3)')
-    made.add_argument('--passes', type=int, metavar='N', help='corridor: times along it (default 1)')
+    made.add_argument('--passes', type=int, metavar='N', help='corridor: number of passes (default 1)')
     made.add_argument('--drives', type=int, metavar='N', help='campus: drives (default 4)')
     made.add_argument('--buildings', type=int, metavar='N', help='campus: buildings (default 4)')
     made.add_argument('--readings', type=int, metavar='N', help='campus: readings of each drive (default 40000)')
-    made.add_argument('--jobs', type=int, metavar='N', help='campus: drives made at once (default: as many as cores)')
-    made.add_argument('--noise-free', action='store_true', help='no random readings, no noise, nobody walking')
+    made.add_argument(
+        '--jobs', type=int, metavar='N', help='campus: drives simulated in parallel (default: one for each core)'
+    )
+    made.add_argument('--noise-free', action='store_true', help='no random readings, no noise, no person')
     made.add_argument(
         '--drift',
         choices=tuple(LEVELS),
-        help='let odometry drift: low, middle, high, or as wheels of old robots do (default: it is exact)',
+        help='drift of odometry: low, middle, high, or like the wheels of an old robot (default: no drift)',
     )
     made.add_argument('--sonars', choices=sorted(SONARS), default='ring', help='ring of 24 or front array of 8')
     made.add_argument(
         '--topics', choices=('one', 'each'), default='one', help='all sonars on /sonar, or one topic each'
     )
     made.add_argument('--format', choices=sorted(FORMATS), default='mcap', help='bag format (default mcap)')
-    made.add_argument('--seed', type=int, default=0, help='of the noise (default 0)')
+    made.add_argument('--seed', type=int, default=0, help='seed of the noise (default 0)')
     made.add_argument('-q', '--quiet', action='store_true', help='print nothing but errors')
     return made
 
@@ -127,7 +129,7 @@ def record(world: str, seen: int, passes: int, noise_free: bool, seed: int, sona
         return corridor_drive(seed, passes, noise, not noise_free, sonars)
     except MemoryError as error:
         option = '--seen' if world == 'door' else '--passes'
-        raise MapperError(f'the memory is not enough for so long a drive; lower {option}') from error
+        raise MapperError(f'there is not enough memory for a drive of this length; lower {option}') from error
 
 
 def write_bag(path: Path, recording: Recording, format: str, each: bool) -> None:
@@ -235,8 +237,8 @@ def _enough_memory() -> Iterator[None]:
         yield
     except MemoryError as error:
         raise MapperError(
-            'the memory is not enough for so large a campus, or for so long drives through it; lower --buildings or '
-            '--readings, or make fewer drives at once (--jobs)'
+            'there is not enough memory for this campus and its drives; lower --buildings or --readings, or simulate '
+            'fewer drives in parallel (--jobs)'
         ) from error
 
 
@@ -255,8 +257,8 @@ def at_once(work: Callable[[int], T], numbers: Iterable[int], jobs: int) -> Iter
                 yield future.result()
         except BrokenProcessPool as error:
             raise ClusterError(
-                'a process that made drives was ended, most likely since the memory was not enough; make fewer drives '
-                'at once (--jobs), or shorter ones (--readings)'
+                'a process that simulated drives was ended, most likely because of too little memory; simulate fewer '
+                'drives in parallel (--jobs), or shorter ones (--readings)'
             ) from error
         except BaseException:
             # nobody wants the drives that are being made

@@ -114,17 +114,17 @@ def only_if_validated(
         return found
     seen = cross_validated(readings, parameters, rounds, watch)
     if seen is None:
-        short = f'the drive is shorter than {FOLDS * BLOCK:.0f} s: no readings could be held out to judge the values by'
+        short = f'the drive is shorter than {FOLDS * BLOCK:.0f} s: no readings could be held out to test the values'
         return dataclasses.replace(found, warnings=(*found.warnings, short))
     if seen.better:
         return dataclasses.replace(found, cross_validation=seen)
     at_first, at_learned = seen.gains
     why = (
-        f'the learned values are refused, and the values from the start are kept: the map of the learned values does '
-        f'not predict readings that were held out better than the map of the values from the start. Its gain, with the '
-        f'standard error, is {at_first:+.3f} ± {seen.error_at_first:.3f} nats a reading by the first model and '
-        f'{at_learned:+.3f} ± {seen.error_at_learned:.3f} by the learned one; both must be larger than {SURE:g} '
-        f'standard error. --keep-going writes the learned values all the same'
+        'the learned values are refused, and the initial values are kept: the map of the learned values does not '
+        'predict held-out readings better than the map of the initial values. Its gain, with the standard error, is '
+        f'{at_first:+.3f} ± {seen.error_at_first:.3f} nats a reading by the initial model and {at_learned:+.3f} ± '
+        f'{seen.error_at_learned:.3f} by the learned one; both must be larger than {SURE:g} standard error. '
+        '--keep-going writes the learned values in any case'
     )
     return dataclasses.replace(
         found,

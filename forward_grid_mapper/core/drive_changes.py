@@ -111,9 +111,9 @@ def change_warnings(maps: MapSet, names: Sequence[str]) -> list[str]:
     """Return a warning for the places that drives contradict, `NAMED` of them at the most; empty if there is none."""
     found = changes(maps, len(names)) if len(names) > 1 else []
     told = [
-        f'something stood at x = {change.x:.1f} m, y = {change.y:.1f} m during {names[change.drive]} ({change.echoes} '
-        f'echoes) and not during other drives ({change.passed} readings of theirs go on): was a door shut, or '
-        f'something moved? The map shows the place free'
+        f'there was an obstacle at x = {change.x:.1f} m, y = {change.y:.1f} m during {names[change.drive]} '
+        f'({change.echoes} echoes) and not during other drives ({change.passed} readings of theirs pass): was a door '
+        'shut, or an object moved? The map is free there'
         for change in found[:NAMED]
     ]
     if len(found) > NAMED:

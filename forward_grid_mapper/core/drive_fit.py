@@ -66,7 +66,7 @@ def fit_warnings(maps: MapSet, names: Sequence[str]) -> list[str]:
     if len(odd) == len(names):
         who = f'the drives {listed}{more} do not fit each other'
     return [
-        f'{who}: by itself, each explains its readings better by so many nats a reading. Is its odometry in the same '
-        f'frame as that of the others (an odometry of wheels begins anew at every start), or was the place rearranged? '
-        f'Localise all drives in one map, or map such a drive alone'
+        f'{who}: a map of each such drive alone explains its readings better, by this number of nats a reading. Is '
+        'its odometry in the same frame as that of the others (wheel odometry starts at zero at every start), or was '
+        'the place rearranged? Localise all drives in one map, or map such a drive alone'
     ]

@@ -276,30 +276,30 @@ def _quality_warnings(rounds: list[Round], accepted: int, converged: bool) -> li
         rise = last.model.p_hit - start.model.p_hit
         climbed = f'p_hit rose from {start.model.p_hit:.2f} to {last.model.p_hit:.2f}, and ' if rise > 0 else ''
         basin = (
-            'this is how smooth walls get lost: their silence outweighs their echoes as soon as p_hit is large'
+            'smooth walls are lost in this way: with a large p_hit, their missing echoes outweigh their echoes'
             if rise > 0
-            else 'their echoes are now taken for random measurements'
+            else 'their echoes are now explained as random measurements'
         )
         if accepted:
             kept = f'those of round {accepted} are kept'
         else:
-            kept = 'the values from the start are kept, and nothing was learned'
+            kept = 'the initial values are kept, and nothing was learned'
         warnings.append(
-            f'round {len(rounds) - 1} loses walls: {climbed}{last.lost_length:.1f} m of wall in '
-            f'{len(last.lost)} stretches that the first map shows are gone, the longest from ({x0:.1f}, {y0:.1f}) to '
-            f'({x1:.1f}, {y1:.1f}); {echoes} of their echoes count as random measurements now, and of all echoes '
-            f'{last.unexplained} instead of {start.unexplained}; {basin}; '
-            + ('they are written all the same' if accepted == len(rounds) - 1 else f'its values are refused, {kept}')
+            f'round {len(rounds) - 1} loses walls: {climbed}{last.lost_length:.1f} m of wall in {len(last.lost)} '
+            f'segments of the first map are lost, the longest from ({x0:.1f}, {y0:.1f}) to ({x1:.1f}, {y1:.1f}); '
+            f'{echoes} of their echoes count as random measurements now, and of all echoes {last.unexplained} instead '
+            f'of {start.unexplained}; {basin}; '
+            + ('they are written in any case' if accepted == len(rounds) - 1 else f'its values are refused, {kept}')
         )
     for number, this in enumerate(rounds):
         drop = this.log_likelihood_before - this.log_likelihood
         if drop > LIKELIHOOD_DROP * this.readings:
             warnings.append(
                 f'round {number}: the search ended in a map that is {drop:.0f} nats less likely than the one before, '
-                f'at the same values; it ended in another local maximum'
+                'at the same values; it is in another local maximum'
             )
     if accepted and not converged and accepted == len(rounds) - 1:
-        warnings.append(f'the values had not come to rest after {counted(accepted, "round")}; try more with --rounds')
+        warnings.append(f'the values had not converged after {counted(accepted, "round")}; try more rounds (--rounds)')
     return warnings
 
 
@@ -310,10 +310,10 @@ def _weak(found: dict[str, Estimate], model: ModelParameters) -> list[str]:
         if estimate.bound and not (name == 'p_lost' and model.p_lost == 0):
             warnings.append(f'{name} = {estimate.value:.3g} has no standard error: {estimate.bound}')
         if estimate.readings < FEW_READINGS and not (name == 'p_lost' and model.p_lost == 0):
-            warnings.append(f'only {estimate.readings:.0f} readings inform {name}; take it as a guess')
+            warnings.append(f'only {estimate.readings:.0f} readings inform {name}; it is only a rough estimate')
     if found and model.p_rand > MUCH_CHANCE:
         warnings.append(
-            f'p_rand = {model.p_rand:.2f} is more than a sonar makes up by itself: look for a broken sensor, a wrong '
-            f'sensor pose, odometry that drifts, or people about the robot'
+            f'p_rand = {model.p_rand:.2f} is more than the random measurements of a working sonar: look for a broken '
+            'sensor, a wrong sensor pose, odometry that drifts, or people around the robot'
         )
     return warnings

@@ -24,12 +24,12 @@ MOST = {'scale': 0.5, 'turn_scale': 0.5, 'bias': math.radians(30.0), 'heading': 
 """The largest figures that a file may have, either way: more is no calibration but another robot."""
 
 HOW = {
-    'scale': 'multiply every way that is measured, or the radius of both wheels, by this',
-    'turn_scale': 'multiply every turn that is measured by this, or divide the distance of the wheels by it',
-    'bias': 'degrees to add to the yaw for each metre driven forwards (to the left is positive); of a robot with two '
-    'wheels, b metres apart, the right one is larger than the left one by this times b times 0.0175',
-    'heading': 'degrees to the left of its heading at which the robot drives; the odometry frame, or '
-    'the mounting of the sensors on it, is turned by so much',
+    'scale': 'factor for every measured distance, or for the radius of both wheels',
+    'turn_scale': 'factor for every measured turn, or divisor of the wheel separation',
+    'bias': 'degrees to add to the yaw for each metre driven forwards (to the left is positive); for a robot with two '
+    'wheels b metres apart, the right one is larger than the left one by the fraction of this times b times 0.0175',
+    'heading': 'direction of travel, in degrees to the left of the heading; the odometry frame, or the mounting of '
+    'the sensors, is rotated by this angle',
 }
 
 
@@ -38,14 +38,15 @@ def calibration_text(told: Mapping[str, Estimate], drive: str) -> str:
     if not told:
         return ''
     lines = [
-        f'# Calibration of the wheel odometry of {_plain(drive)}, as told by its sonar readings.',
-        '# Each figure has its standard deviation. They fit this drive: measure a straight line and a full turn before',
-        '# you change a wheel. process_bag applies them to other drives of this robot with --odometry-calibration.',
+        f'# Calibration of the wheel odometry of {_plain(drive)}, estimated from its sonar readings.',
+        '# Each value has its standard deviation. The values are for this drive: measure a straight line and a full',
+        '# turn before you change a wheel. process_bag applies them to other drives of this robot with',
+        '# --odometry-calibration.',
     ]
     for name, key in NAMES.items():
         lines.append('')
         if name not in told:
-            lines.append(f'# {key}: not known; this drive does not tell it')
+            lines.append(f'# {key}: not known; this drive does not determine it')
             continue
         value, sigma = _shown(name, *told[name])
         lines += [f'# {HOW[name]}', f'{key}: {value:.4f}  # ± {sigma:.4f}']
@@ -68,18 +69,18 @@ def load_calibration(path: Path | str) -> dict[str, float]:
     except (UnicodeDecodeError, yaml.YAMLError, RecursionError, ValueError) as error:
         raise ParameterError(f'{path} is not valid YAML: {error}') from error
     if not isinstance(document, dict) or not document:
-        raise ParameterError(f'{path} holds no calibration, such as "travel_factor: 1.012"')
+        raise ParameterError(f'{path} contains no calibration, such as "travel_factor: 1.012"')
     names = {key: name for name, key in NAMES.items()}
     found = {}
     for key, value in document.items():
         if key not in names:
-            raise ParameterError(f'{path}: {key!r} is none of {", ".join(names)}')
+            raise ParameterError(f'{path}: {key!r} is not one of {", ".join(names)}')
         name = names[key]
         if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
             raise ParameterError(f'{path}: {key} is {value!r}, not a finite number')
         figure = value - 1.0 if key.endswith('factor') else math.radians(value)
         if abs(figure) > MOST[name]:
-            raise ParameterError(f'{path}: {key} is {value:g}, which no calibration of wheels is')
+            raise ParameterError(f'{path}: {key} is {value:g}, which is not possible for a calibration of wheels')
         found[name] = figure
     return found
 

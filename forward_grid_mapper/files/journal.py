@@ -204,17 +204,19 @@ class Journal:
                 self.put(found, (contents.map_frame, contents.base_frame))
                 self._wait_for(lambda: self._bytes <= MOST_PENDING // 2)
         except BagError as error:
-            self._notice(f'{error}; the journal goes on in {self.path.name}')
+            self._notice(f'{error}; the journal continues in {self.path.name}')
         self.put(None, (contents.map_frame, contents.base_frame), contents.path)
         for text in filter(None, (contents.note, contents.harm)):
-            self._notice(f'{source}: {text}; the journal goes on in {self.path.name}')
+            self._notice(f'{source}: {text}; the journal continues in {self.path.name}')
 
     def put(self, readings: Readings | None, frames: tuple[str, str], path: Iterable[tuple[float, float]] = ()) -> None:
         """Append readings, new points of the robot's path, and the map and base frame if they are new."""
         count = 0 if readings is None else len(readings)
         if self._bytes > MOST_PENDING:
             if not self.lost:
-                self._warn(f'journal {self.path}: too much waits to be written; readings are lost from here on')
+                self._warn(
+                    f'journal {self.path}: too many readings wait to be written; new readings are lost from now on'
+                )
             self.lost += count
             return
         rows = self._head(readings, frames)
@@ -359,7 +361,7 @@ class Journal:
 
     def _lose(self, drive: Drive, why: str) -> None:
         """Take note that the file of a drive is not what it was."""
-        self._notice(f'journal {drive.path}: {why}; a new file begins with what is in memory')
+        self._notice(f'journal {drive.path}: {why}; the readings in memory are written to a new file')
         with self._wake:
             if drive is self._drive:
                 drive.gone = True
@@ -371,7 +373,7 @@ class Journal:
         """Report a write that failed, and wait before the next try; return whether to give up."""
         trouble = _words(error)
         if trouble != self.trouble:
-            self._warn(f'journal {self.path} cannot be written: {trouble}; mapping goes on without it')
+            self._warn(f'journal {self.path} cannot be written: {trouble}; mapping continues without it')
         with self._wake:
             self.trouble = trouble
             self._wake.notify_all()

@@ -130,7 +130,7 @@ class FolderLock:
             os.close(file)
             if isinstance(error, BlockingIOError):
                 raise OutputError(
-                    f'{self._folder} is the journal of another node that runs; give each its own'
+                    f'{self._folder} is in use by another node; set a different journal for each'
                 ) from None
             raise
         return file
@@ -269,7 +269,7 @@ class DriveWriter:
             except BagError as error:
                 raise GoneError(drive, str(error)) from error
             if self._next() < drive.next:
-                raise GoneError(drive, 'it holds less than was written to it')
+                raise GoneError(drive, 'it contains less than was written to it')
         assert self._database is not None
         unbounded(self._database)
 
@@ -318,7 +318,7 @@ class DriveWriter:
             # kept in the file; all who open it later use a log
             database.execute('PRAGMA journal_mode=WAL')
         if any(path.exists() for path in partial[1:]):
-            raise OSError(errno.EIO, 'a new file could not be made whole')
+            raise OSError(errno.EIO, 'a new file could not be completed')
         while os.path.lexists(drive.path):
             drive.path = following(drive.path)
         partial[0].rename(drive.path)
@@ -346,4 +346,4 @@ class DriveWriter:
             if not os.path.samestat(before, now):
                 raise GoneError(self.drive, f'{path.name} was replaced by another file')
             if now.st_size < before.st_size:
-                raise GoneError(self.drive, f'{path.name} was cut off')
+                raise GoneError(self.drive, f'{path.name} was truncated')

@@ -225,14 +225,14 @@ def _wrong(rows: NDArray[np.void], sensors: Mapping[int, str]) -> Iterator[tuple
     """
     z, z_max = rows['z'], rows['z_max']
     on_earth = (np.abs(rows['x']) < FARTHEST) & (np.abs(rows['y']) < FARTHEST) & np.isfinite(rows['yaw'])
-    yield 'their pose is not finite or not on Earth', ~on_earth
+    yield 'their pose is not finite or impossibly far away', ~on_earth
     yield 'their range is not between 0 and the largest range', ~((z > 0) & (z <= z_max) & (z_max < np.inf))
     yield (
         'their field of view is not between 0 and 180 degrees',
         ~((rows['half_angle'] > 0) & (rows['half_angle'] < np.pi / 2)),
     )
     yield 'their standard deviation is negative or not finite', ~((rows['sigma'] >= 0) & (rows['sigma'] < np.inf))
-    yield 'their stamp cannot be', ~((rows['stamp'] > -LATEST) & (rows['stamp'] < LATEST))
+    yield 'their stamp is not possible', ~((rows['stamp'] > -LATEST) & (rows['stamp'] < LATEST))
     yield 'their sensor has no name', ~np.isin(rows['sensor'], np.fromiter(sensors, np.int64, len(sensors)))
 
 

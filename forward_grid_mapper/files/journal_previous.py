@@ -63,7 +63,7 @@ def _rows(file: BinaryIO, contents: Contents) -> Iterator[NDArray[np.void]]:
         elif kind == PATH:
             contents.add_path(payload)
         else:
-            contents.fault('it has blocks that are none of a journal')
+            contents.fault('it has blocks that are not part of a journal')
 
 
 def _take_frames(payload: bytes, contents: Contents) -> None:

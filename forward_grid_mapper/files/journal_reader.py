@@ -182,7 +182,7 @@ def check(database: sqlite3.Connection, path: Path) -> None:
     query = 'SELECT type, name, tbl_name, sql FROM sqlite_master LIMIT ?'
     found = set(database.execute(query, (len(TABLES) + 1,)).fetchall())
     if found != {('table', name, name, sql) for name, sql in TABLES.items()}:
-        raise BagError(f'{path} has other tables than a journal, and is not read')
+        raise BagError(f'{path} has other tables than a journal, so it is not read')
 
 
 def readings(database: sqlite3.Connection, size: int, contents: Contents) -> Iterator[Readings]:
@@ -201,7 +201,7 @@ def readings(database: sqlite3.Connection, size: int, contents: Contents) -> Ite
             contents.add_path(points)
             contents.next_points = number + 1
     except (sqlite3.Error, MemoryError, _DamagedError) as error:
-        contents.fault(f'what it holds besides readings cannot be read: {one_line(error)}')
+        contents.fault(f'its data other than readings cannot be read: {one_line(error)}')
     yield from in_chunks(_blocks(table, contents), contents)
 
 
@@ -209,9 +209,9 @@ def _blocks(table: _Table, contents: Contents) -> Iterator[NDArray[np.void]]:
     try:
         for number, data in table.rows('readings', 'rows'):
             if number < contents.next:
-                raise _DamagedError('some of its readings would be there twice')
+                raise _DamagedError('some of its readings are duplicates')
             if not isinstance(data, bytes) or not data or len(data) % ROW.itemsize:
-                contents.fault('some of its blocks hold no readings')
+                contents.fault('some of its blocks contain no readings')
                 contents.next = number + 1
                 continue
             rows = np.frombuffer(data, ROW)
@@ -251,14 +251,14 @@ class _Table:
                 last = row[0]
                 self._left -= sum(len(value) for value in row[1:] if value is not None)
                 if self._left < 0:
-                    raise _DamagedError('its rows hold more than the file has')
+                    raise _DamagedError('its rows contain more than the file')
                 yield row
 
 
 def one_line(error: BaseException) -> str:
     """Return what SQLite says, in words."""
     text = ' '.join(str(error).split()) or type(error).__name__
-    return 'it is damaged: to read it takes more steps than it has bytes' if text == 'interrupted' else text
+    return 'it is damaged: reading it takes more steps than it has bytes' if text == 'interrupted' else text
 
 
 @contextmanager
@@ -360,8 +360,8 @@ def _copy(source: Path, target: Path) -> int:
             return copied
         if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
             raise BagError(
-                f'{source} is being written, and {target.parent.parent} has no space for the copy that is read; free '
-                f'some, or name another folder in TMPDIR'
+                f'{source} is being written, and {target.parent.parent} has no space for a copy of it, which is '
+                'needed for reading; free some space, or set TMPDIR to another folder'
             ) from error
         raise
     return copied

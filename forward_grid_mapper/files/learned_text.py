@@ -21,9 +21,9 @@ _WIDTH = 100
 
 _HOW = (
     'Standard errors: observed information of the readings given the map, and the scatter of 30 blocks of time where '
-    'that is larger; 95 % intervals. Both are conditional on the map: that the map was made from the same readings is '
-    'not in them. Such a map fits its readings too well: p_rand and sigma come out too low or, with a prior that '
-    'makes cells expensive, p_hit too high, by many standard errors.'
+    'that is larger; 95 % intervals. Both are conditional on the map: they do not include that the map was made from '
+    'the same readings. Such a map fits its readings too well: p_rand and sigma are too low or, with a prior that '
+    'makes occupied cells expensive, p_hit is too high, by many standard errors.'
 )
 
 
@@ -88,7 +88,7 @@ def _values(learned: Learned) -> Iterator[str]:
             f'  Held-out readings, nats each that the map of the learned values gains: {at_first:+.3f} ± '
             f'{seen.error_at_first:.3f} at'
         )
-        yield f'  the values from the start, {at_learned:+.3f} ± {seen.error_at_learned:.3f} at the learned ones'
+        yield f'  the initial values, {at_learned:+.3f} ± {seen.error_at_learned:.3f} at the learned ones'
     yield textwrap.fill(_HOW, _WIDTH, initial_indent='  ', subsequent_indent='  ')
 
 
@@ -126,7 +126,7 @@ def parameter_file_text(
     if learned.accepted:
         lines = [f'# Learned{where}, together with the map:']
     else:
-        lines = [f'# Nothing was learned{where}; these are the values from the start:']
+        lines = [f'# Nothing was learned{where}; these are the initial values:']
     for name in LEARNED:
         estimate = learned.estimates.get(name)
         value = getattr(learned.parameters.model, name)

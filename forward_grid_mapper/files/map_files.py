@@ -150,7 +150,7 @@ def _grid_at(path: Path, resolution: float, x: float, y: float, yaw: float, shap
     if not resolution > 0.0 or not np.isfinite([x, y, resolution]).all():
         raise InputError(f'{path}: resolution and origin must be finite numbers, the resolution above zero')
     if abs(yaw) > 1e-9:
-        raise InputError(f'{path}: the map is turned by {yaw:g} rad; only maps along the axes are read')
+        raise InputError(f'{path}: the map is rotated by {yaw:g} rad; only maps without rotation are read')
     column, row = round(x / resolution), round(y / resolution)
     if max(abs(x / resolution - column), abs(y / resolution - row)) > 0.01:
         raise InputError(f'{path}: the origin ({x:g}, {y:g}) is not a multiple of the resolution {resolution:g}')

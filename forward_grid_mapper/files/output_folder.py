@@ -64,7 +64,7 @@ def unwritable(folder: Path | str) -> str:
     there = next(parent for parent in (path, *path.parents) if os.access(parent, os.F_OK))
     if not there.is_dir():
         return f'{readable(there)} is not a folder'
-    return '' if os.access(there, os.W_OK | os.X_OK) else f'{readable(there)} may not be written to'
+    return '' if os.access(there, os.W_OK | os.X_OK) else f'{readable(there)} is not writable'
 
 
 @contextmanager
@@ -161,7 +161,7 @@ def _is_empty_folder(path: Path) -> bool:
     if not path.is_dir():
         raise OutputError(f'{path} is a file; choose another folder with -o')
     if any(path.iterdir()):
-        raise OutputError(f'{path} exists and is not empty; choose another with -o, or remove it first')
+        raise OutputError(f'{path} exists and is not empty; choose another folder with -o, or remove it first')
     return True
 
 
@@ -192,7 +192,7 @@ def _output_error(path: Path, error: OSError) -> OutputError:
         return OutputError(f'{path}: a part of this path is a file, not a folder; choose another folder')
     if error.errno in (errno.ENOTEMPTY, errno.EEXIST):
         # another run took the name while this one worked
-        return OutputError(f'{path} exists by now, perhaps of another run; choose another folder')
+        return OutputError(f'{path} has been created meanwhile, perhaps by another run; choose another folder')
     if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
         return OutputError(f'{path}: no permission to write there; choose another folder')
     return OutputError(f'{path} cannot be written: {error.strerror or error}')

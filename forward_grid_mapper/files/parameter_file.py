@@ -119,7 +119,7 @@ def parse_sensor(text: str) -> tuple[str, Pose2]:
     if not frame or not all(map(math.isfinite, (x, y, yaw))):
         raise ParameterError(
             f'{text!r} is not of the form frame=x,y,yaw, such as sonar_left=0.1,0.15,1.57 or '
-            'sonar_left=0.1,0.15,90deg: three numbers with points and no other unit than deg'
+            'sonar_left=0.1,0.15,90deg: three numbers with decimal points, and no unit other than deg'
         )
     if not degrees and TURN < abs(yaw) <= 360.0:
         raise ParameterError(f'{text!r}: a yaw of {yaw:g} rad is more than a full turn; is it {frame}={numbers}deg?')
@@ -156,20 +156,21 @@ _Loader.add_implicit_resolver(
 def _sections(document: Any) -> list[dict[str, Any]]:
     """Return the parameter mappings of a file, the more specific ones last."""
     if not isinstance(document, dict):
-        raise ParameterError('it must hold names with values, such as "p_hit: 0.6"')
+        raise ParameterError('it must contain names with values, such as "p_hit: 0.6"')
     found = {name: section or {} for name, section in _ros_sections(document, '')}
     if not found:
         return [document]
     if stray := list(_outside(document)):
         raise ParameterError(
-            f'{", ".join(stray[:6])}: no node reads what is outside of ros__parameters; put it into one of '
-            f'the sections {", ".join(found)}'
+            f'{", ".join(stray[:6])}: a node reads only the values below ros__parameters; put them into one of the '
+            f'sections {", ".join(found)}'
         )
     wildcards = [s for name, s in found.items() if name.strip('/') in ('*', '**')]
     own = [name for name in found if name.rpartition('/')[2] == NODE_NAME]
     if len(own) > 1:
         raise ParameterError(
-            f'it has {NODE_NAME} in several namespaces ({", ".join(own)}); give a file with the section of one of them'
+            f'it has {NODE_NAME} in several namespaces ({", ".join(own)}); give a file with the section of only one '
+            'of them'
         )
     if chosen := wildcards + [found[name] for name in own]:
         return chosen
@@ -177,8 +178,8 @@ def _sections(document: Any) -> list[dict[str, Any]]:
         raise ParameterError(f'it has no section for {NODE_NAME} or /**; there are: {", ".join(found)}')
     ((name, only),) = found.items()
     if difflib.get_close_matches(name.rpartition('/')[2], [NODE_NAME], cutoff=LIKE):
-        raise ParameterError(f'the section {name} is of another node; did you mean {NODE_NAME}?')
-    LOG.warning('parameters of %s are taken, which a node with the name %s does not read', name, NODE_NAME)
+        raise ParameterError(f'the section {name} is for another node; did you mean {NODE_NAME}?')
+    LOG.warning('parameters of %s are used, which a node with the name %s does not read', name, NODE_NAME)
     return [only]
 
 
@@ -208,7 +209,7 @@ def _outside(document: dict[Any, Any], prefix: str = '') -> Iterator[str]:
 
 def _flatten(section: Any, prefix: str = '') -> Iterator[tuple[str, Any]]:
     if not isinstance(section, dict):
-        raise ParameterError('ros__parameters must hold names with values, such as "p_hit: 0.6"')
+        raise ParameterError('ros__parameters must contain names with values, such as "p_hit: 0.6"')
     seen = set()
     for key, value in section.items():
         name = f'{prefix}{key}'
@@ -225,7 +226,7 @@ def _merge(flat: dict[str, Any], section: dict[str, Any]) -> None:
     frames: dict[str, str] = {}
     for name in section:
         if (mount := _MOUNT.fullmatch(name)) and (twin := frames.setdefault(_frame_of(mount), name)) != name:
-            raise ParameterError(f'{twin} and {name} are poses of one sensor; give one of them')
+            raise ParameterError(f'{twin} and {name} are poses of the same sensor; give one of them')
     for name in list(flat):
         if (mount := _MOUNT.fullmatch(name)) and _frame_of(mount) in frames:
             del flat[name]
@@ -242,7 +243,9 @@ def _sort_out(flat: dict[str, Any]) -> ParameterFile:
         if extrinsic := _MOUNT.fullmatch(name):
             result.extrinsics[extrinsic['frame']] = mount_from(name, value)
             if len({isinstance(number, int) for number in value}) > 1:
-                LOG.warning('%s: write each number of %s with a point; ROS refuses lists of both kinds', name, value)
+                LOG.warning(
+                    '%s: write each number of %s with a decimal point; ROS refuses lists of mixed types', name, value
+                )
         elif _ROS_OWN.fullmatch(name):
             result.node[name] = value
         elif name.partition('.')[0] in ('sensors', 'sensor'):

@@ -52,7 +52,7 @@ def read_pgm(path: Path) -> NDArray[np.float64]:
         raise InputError(f'{path} is not a PGM image (P5 or P2); convert it, for example with ImageMagick')
     width, height, top = (int(v) for v in header.groups()[1:])
     if not 0 < top < 65536 or not width * height:
-        raise InputError(f'{path}: a PGM image of {width} x {height} pixels and {top} grey levels makes no sense')
+        raise InputError(f'{path}: a PGM image of {width} x {height} pixels and {top} grey levels is not possible')
     try:
         if header[1] == b'P5':
             kind = np.dtype('u1' if top < 256 else '>u2')
@@ -62,4 +62,4 @@ def read_pgm(path: Path) -> NDArray[np.float64]:
             values = np.array(text[: width * height], np.int64)
         return values.reshape(height, width) / top
     except ValueError as error:
-        raise InputError(f'{path} is damaged or cut short: {width} x {height} pixels were announced') from error
+        raise InputError(f'{path} is damaged or cut short: {width} x {height} pixels were expected') from error

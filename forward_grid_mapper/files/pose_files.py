@@ -109,7 +109,7 @@ def poses_from_csv(path: Path | str) -> Poses:
         if yaw is None:
             yaw = _yaw(path, number, [found[name] for name in QUATERNION])
         elif abs(yaw) > MOST_YAW and 'yaw' in found:
-            raise InputError(f'{path}, line {number}: yaw {yaw:g} rad; if these are degrees, call the column yaw_deg')
+            raise InputError(f'{path}, line {number}: yaw {yaw:g} rad; if these are degrees, name the column yaw_deg')
         poses.append((found['x'], found['y'], yaw))
         stamps.append(found.get('stamp', found.get('stamp_ns', math.nan)))
     return np.array(stamps, np.float64), np.array(poses, np.float64).reshape(-1, 3)
@@ -130,7 +130,7 @@ def _columns(path: Path | str, header: Sequence[str]) -> dict[str, int]:
     if 'yaw' in found or 'yaw_deg' in found:
         return {name: column for name, column in found.items() if name not in QUATERNION}
     if missing := [name for name in QUATERNION if name not in found]:
-        raise InputError(f'{path} has no column {missing[0]}, without which a quaternion says nothing')
+        raise InputError(f'{path} has no column {missing[0]}, without which the quaternion is incomplete')
     return found
 
 

@@ -66,8 +66,8 @@ def deaf(readings: Readings) -> Iterator[str]:
     """Yield a warning where no sensor hears anything; where only one does not, its health tells."""
     if len(readings) >= ENOUGH and not readings.echo.any():
         yield (
-            f'none of {len(readings)} readings has an echo: do the sensors work, is max_range the one of their data '
-            f'sheet in metres, and does the driver publish ranges in metres? The maps show free space alone'
+            f'none of {len(readings)} readings has an echo: do the sensors work, is max_range that of their data '
+            'sheet in metres, and does the driver publish ranges in metres? The maps show only free space'
         )
 
 
@@ -77,8 +77,8 @@ def quality_warning(maps: MapSet) -> str:
     if count < ENOUGH or unexplained <= TOO_MANY * count:
         return ''
     return (
-        f'{unexplained} of {count} readings are most likely random measurements: the map does not fit what was '
-        f'measured; are the poses of the sensors, odometry, the field of view and changed parameters right?'
+        f'{unexplained} of {count} readings are most likely random measurements: the map does not fit the readings; '
+        'are the poses of the sensors, odometry, the field of view and changed parameters right?'
     )
 
 
@@ -87,6 +87,6 @@ def thinned(used: int, accepted: int) -> str:
     if used >= accepted:
         return ''
     return (
-        f'EM maps from {used} of {accepted} readings (max_readings): where a sensor looked often from one place in one '
-        f'direction, the oldest went'
+        f'EM used {used} of {accepted} readings (max_readings): the oldest were removed where a sensor measured often '
+        'from one place in one direction'
     )

@@ -74,7 +74,7 @@ def read_readings(path: Path | str, maps: MapArchive) -> ReadingArchive:
             sound = all(np.isfinite(column).all() for column in columns.values())
     except FileNotFoundError as error:
         raise InputError(
-            f'{path} does not exist; make the maps anew, and without --workers or --scheduler, which write no readings'
+            f'{path} does not exist; make the maps again, without --workers and --scheduler, which write no readings'
         ) from error
     except Exception as error:  # zipfile, zlib and numpy have many kinds for damaged bytes
         raise InputError(f'{path} is not an archive of readings, or is damaged: {error}') from error
@@ -85,7 +85,7 @@ def read_readings(path: Path | str, maps: MapArchive) -> ReadingArchive:
         or x.shape != maps.grid.shape
         or not (0 <= readings.sensor.min(initial=0) <= readings.sensor.max(initial=0) < len(names))
     ):
-        raise InputError(f'{path} is not of the maps beside it')
+        raise InputError(f'{path} does not belong to the maps next to it')
     known = ((x != 0) | (y != 0)).astype(np.uint8)
     found = known_normals(known, x, y, maps.parameters.model.max_incidence_angle) if known.any() else no_normals()
     return ReadingArchive(readings, found)

@@ -83,8 +83,8 @@ def _became(found: dict[str, Any]) -> str:
     places = found.get('places_recognised') or 0
     return (
         f'refined: odometry{calibrated} was off by {found["odometry_off_m"]:.2f} m and '
-        f'{found["odometry_off_deg"]:.1f}° in the root mean square, both paths laid over each other; '
-        f'{places} {"place" if places == 1 else "places"} recognised; '
+        f'{found["odometry_off_deg"]:.1f}° (root mean square, both paths aligned); {places} '
+        f'{"place" if places == 1 else "places"} recognised; '
         + '; '.join(filter(None, [found['reason'], found.get('fitted')]))
     )
 
@@ -92,7 +92,7 @@ def _became(found: dict[str, Any]) -> str:
 def _wheels(found: dict[str, Any]) -> str:
     words = found.get('odometry') or ''
     some = found.get('told') is None or found['told']
-    return f'{words}; it is what fits this drive: measure before you set it' if words and some else words
+    return f'{words}; these values are for this drive: measure before you set them' if words and some else words
 
 
 def _counts(data: dict[str, Any]) -> Iterator[str]:
@@ -196,14 +196,14 @@ def _result(data: dict[str, Any]) -> Iterator[str]:
         yield from _line('Log-likelihood', f'{likelihood:,.1f} nats{mean}')
     if (objective := result.get('objective')) is not None:
         searched = statistics.get('searched_objective')
-        before = '' if searched is None else f'; {searched:,.1f} nats where the search ended, before post-processing'
+        before = '' if searched is None else f'; {searched:,.1f} nats at the end of the search, before post-processing'
         yield from _line('Objective', f'{objective:,.1f} nats{before}')
     if (unexplained := result.get('unexplained')) is not None:
         share = _share(unexplained, readings)
         are = 'is most likely a random measurement' if unexplained == 1 else 'are most likely random measurements'
         sought = any(source.get('trajectory') for source in (data.get('input') or {}, *(data.get('drives') or [])))
         many = unexplained > _MANY * (readings or math.inf) and not sought
-        hint = ': many, as where odometry drifts (refine_poses)' if many else ''
+        hint = ': many, as with odometry that drifts (refine_poses)' if many else ''
         yield from _line('Random', f'{counted(unexplained, "reading", ",")} ({share}) {are}{hint}')
     work = [f'{statistics[key]:,} {key}' for key in ('pairs', 'iterations', 'flips', 'shifts') if statistics.get(key)]
     if (converged := statistics.get('converged')) is not None:

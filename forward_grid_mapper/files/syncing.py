@@ -57,4 +57,4 @@ class Syncer:
         except OSError as error:
             if error.strerror != self._trouble:
                 self._trouble = error.strerror or str(error)
-                self._warn(f'the disk does not keep what is written to it: {self._trouble}')
+                self._warn(f'the disk does not sync written data: {self._trouble}')

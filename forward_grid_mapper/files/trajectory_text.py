@@ -79,19 +79,19 @@ def told_words(told: Mapping[str, Estimate]) -> str:
     for name, (value, sigma) in told.items():
         said = calibration_words({name: value}) if abs(value) > sigma else ''
         if not said:
-            said = f'{_EXACT[name]} within what can be told'
+            said = f'{_EXACT[name]} within the accuracy'
         error = math.degrees(sigma) if name in ('bias', 'heading') else 100 * sigma
         words.append(f'{said} (± {error:.1f}{"°" if name in ("bias", "heading") else " %"})')
     if unknown := [_ASKED[name] for name in CALIBRATION if name not in told]:
-        words.append(f'the drive does not tell {" or ".join(unknown)}')
+        words.append(f'the drive does not show {" or ".join(unknown)}')
     return '; '.join(words)
 
 
 _EXACT = {
-    'scale': 'distances are measured right',
+    'scale': 'distances are measured correctly',
     'heading': 'the robot drives along its heading',
-    'bias': 'going straight is measured as going straight',
-    'turn_scale': 'turns are measured right',
+    'bias': 'straight driving is measured correctly',
+    'turn_scale': 'turns are measured correctly',
 }
 _ASKED = {
     'scale': 'whether distances are measured too long',

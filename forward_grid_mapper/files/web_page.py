@@ -99,11 +99,9 @@ def write_page(
         raise OutputError(f'a page shows at most {MOST_CELLS:,} cells, the map has {maps.grid.size:,}')
     page = page_data(maps, report, path_xy, odometry_xy, reference)
     count = len(maps.readings)
-    hint = (
-        'Point at a cell to see what is known of it. Click it to see which readings speak for an obstacle or against.'
-    )
+    hint = 'Point at a cell to see its state and evidence. Click it to list the readings for and against an obstacle.'
     if count > MOST_READINGS:
-        hint = f'{count:,} readings are too many for a page: forward_grid_mapper explain tells what they say.'
+        hint = f'{count:,} readings are too many for a page: use forward_grid_mapper explain to list them.'
     warnings = ''.join(f'<li>{html.escape(str(text))}</li>' for text in report.get('warnings') or ())
     parts = {
         'title': html.escape(title),

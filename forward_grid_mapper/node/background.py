@@ -176,7 +176,7 @@ class Worker:
         try:
             task.failed(why)
         except BaseException as another:
-            self.trouble = f'{why}; and nobody could be told: {another!r}'
+            self.trouble = f'{why}; and this could not be reported: {another!r}'
 
 
 class Inbox:

@@ -51,13 +51,13 @@ class OdometryClock:
         self._next = now + LASTING
         if back > 0:
             self._warn(
-                f'the clock jumped back ({self._seen[0]} times so far): readings that waited were dropped, and so was '
-                'the odometry of the drive, which refine_poses needs; the map is kept'
+                f'the clock jumped back ({self._seen[0]} times so far): waiting readings were dropped, and so was the '
+                'odometry of the drive, which refine_poses needs; the map is kept'
             )
         else:
             self._warn(
                 f'the stamp of an odometry message was more than a second ahead of the others ({self._seen[1]} times '
-                'so far): the message is left out'
+                'so far): this message is ignored'
             )
 
     def forget(self) -> None:
@@ -135,8 +135,8 @@ class SensorClocks:
             most = max(lags, key=lambda frame: lags[frame])
             others = f' (and {counted(len(lags) - 1, "sensor")} more)' if len(lags) > 1 else ''
             texts.append(
-                f'the stamps of {most}{others} are {lags[most] / NANOSECONDS:.1f} s {side} those of odometry: where '
-                'a clock is wrong, its readings are placed wrongly; synchronise the clocks (NTP, PTP)'
+                f'the stamps of {most}{others} are {lags[most] / NANOSECONDS:.1f} s {side} those of odometry: if a '
+                'clock is wrong, its readings are mapped with wrong poses; synchronise the clocks (NTP, PTP)'
             )
             if lags.keys() - self._told:
                 self._told |= lags.keys()

@@ -43,14 +43,14 @@ def of_arguments(left: Sequence[str]) -> str:
         if given and name in parameters:
             return f'{name} is a parameter: --ros-args -p {word}'
         if given and (name in TOPICS or name.startswith(('~', '/', '_'))):
-            return f'a topic, or a name of the node, is given as --ros-args -r {word}'
+            return f'set a topic, or the name of the node, with --ros-args -r {word}'
         if given:
             near = _nearest(name, (*parameters, *TOPICS))
-            return f'{word} is not a known option{near}; parameters come as --ros-args -p NAME:=VALUE'
+            return f'{word} is not a known option{near}; set parameters with --ros-args -p NAME:=VALUE'
     for word in left:
         if word in ROS_OPTIONS:
-            return f'{word} comes after --ros-args: --ros-args {" ".join(left)}'
-    return f'{" ".join(left)} is not known{_nearest(left[0], OPTIONS)}; ROS options come after --ros-args'
+            return f'{word} must be after --ros-args: --ros-args {" ".join(left)}'
+    return f'{" ".join(left)} is not known{_nearest(left[0], OPTIONS)}; ROS options must be after --ros-args'
 
 
 def of_ros_arguments(text: str) -> str:
@@ -58,7 +58,7 @@ def of_ros_arguments(text: str) -> str:
     unknown = re.findall(r"'([^']*)'", text) or [text]
     word = unknown[0]
     if ':=' in word:
-        return f'{word} has to come after -p (a parameter) or -r (another name for a topic or the node)'
+        return f'{word} must be after -p (a parameter) or -r (another name for a topic or the node)'
     return f'{", ".join(unknown)}: no such ROS option{_nearest(word, ROS_OPTIONS)}; known are {", ".join(ROS_OPTIONS)}'
 
 
@@ -77,9 +77,9 @@ def _of_file(path: str, why: str) -> str:
             load_parameters(path)
         except MapperError as error:
             return f'--params-file {error}'
-    remedy = '; write each number of a list with a point' if 'same type' in why else ''
+    remedy = '; write each number of a list with a decimal point' if 'same type' in why else ''
     if 'before ros__parameters' in why:
-        remedy = '; parameters of a node stand below /**: and ros__parameters:, as in config/mapper.yaml'
+        remedy = '; parameters of a node must be below /**: and ros__parameters:, as in config/mapper.yaml'
     return f'--params-file {path}: {why}{remedy}'
 
 
@@ -89,17 +89,17 @@ def of_ros(error: BaseException) -> str:
     text = _INIT.sub('', ' '.join(filter(None, (line.strip() for line in lines))))
     if found := _RULE.search(text):
         return (
-            f'-r {found["rule"]} is not a valid rule: it takes -r OLD:=NEW, such as -r sonar:=/my/sonar, '
-            '-r __node:=my_mapper or -r __ns:=/robot1; names have letters, digits, _ and /, and no part begins with a '
-            'digit'
+            f'-r {found["rule"]} is not a valid rule: use -r OLD:=NEW, such as -r sonar:=/my/sonar, -r '
+            '__node:=my_mapper or -r __ns:=/robot1; names may have letters, digits, _ and /, and no part may begin '
+            'with a digit'
         )
     if found := _PARAMETER.search(text):
         rule = f'-p {found["rule"]} is not a valid parameter'
         if _MIXED.search(found['rule']):
-            return f'{rule}: write each number of a list with a point; ROS refuses lists of both kinds'
-        return f'{rule}: it takes -p NAME:=VALUE, such as -p resolution:=0.05'
+            return f'{rule}: write each number of a list with a decimal point; ROS refuses lists of mixed types'
+        return f'{rule}: use -p NAME:=VALUE, such as -p resolution:=0.05'
     if found := _FILE.search(text):
         return _of_file(found['file'], found['why'])
     if 'PARAMETER_NOT_SET' in text:
-        return 'a parameter has no value, or an empty list (range_topics:=[]): leave it out, or give it one'
+        return 'a parameter has no value, or an empty list (range_topics:=[]): set a value, or leave it out'
     return text or repr(error)

@@ -133,8 +133,8 @@ class Health:
             missing.append(f'no odometry for {silent_odometry:.0f} s{absent("Odometry")}')
         elif stuck > SILENCE and new and associator.odometry_stamp is not None:
             return DiagnosticStatus.WARN, (
-                f'odometry comes, but its stamp has been {stamp / NANOSECONDS:.3f} s for {stuck:.0f} s, so that '
-                'readings get no pose, or all the same; have its driver fill in header.stamp'
+                f'odometry is received, but its stamp has been {stamp / NANOSECONDS:.3f} s for {stuck:.0f} s, so that '
+                'readings have no pose, or all the same; set header.stamp in its driver'
             )
         if silent_ranges > max(SILENCE, intake.heard.patience):
             missing.append(f'no Range for {silent_ranges:.0f} s{absent("Range")}')
@@ -156,13 +156,13 @@ class Health:
                 f'no reading has been accepted so far: {wrong.total()} were rejected{_main_reason(wrong)}'
             )
         if not len(associator.buffer):
-            what = 'they wait for their poses' if received else 'none has come'
+            what = 'they wait for their poses' if received else 'none has been received'
             return DiagnosticStatus.OK, f'no reading has been accepted so far: {what}'
         bound = associator.parameters.max_readings
         if bound and NEARLY * bound < len(associator.buffer) <= bound:
             return DiagnosticStatus.WARN, (
-                f'{len(associator.buffer)} readings, and max_readings is {bound}: where readings are densest, the '
-                'oldest are removed'
+                f'{len(associator.buffer)} readings, and max_readings is {bound}: beyond it, the oldest are removed '
+                'where readings are densest'
             )
         return DiagnosticStatus.OK, MAPPING
 

@@ -161,7 +161,7 @@ class EmWorker:
             self._watch(run)
 
         try:
-            run.stage = 'waiting for kernels that are being compiled'
+            run.stage = 'waiting for the compilation of kernels'
             begin = time.monotonic()
             self._prepare(lambda: run.cancelled)
             waited = time.monotonic() - begin
@@ -177,7 +177,8 @@ class EmWorker:
             return Outcome(None, str(error))
         except MemoryError:
             return Outcome(
-                None, f'EM of {run.count} readings does not fit the memory; reset, or use a coarser resolution'
+                None,
+                f'EM of {run.count} readings does not fit into the memory; call reset, or use a coarser resolution',
             )
 
     def _end(self, run: Run, outcome: Outcome) -> None:
@@ -188,9 +189,9 @@ class EmWorker:
                     done(outcome)
                 except Exception as error:
                     # one that fails must not keep the others waiting, nor wait itself
-                    self._log(f'EM has ended, and not everybody could be told: {error!r}')
+                    self._log(f'EM has ended, but not every caller could be informed: {error!r}')
                     with suppress(Exception):
-                        done(Outcome(None, f'EM has ended, and what comes then failed: {reason(error)}'))
+                        done(Outcome(None, f'EM has ended, but the work after it failed: {reason(error)}'))
 
         self._conclude(conclude)
 

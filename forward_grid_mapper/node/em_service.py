@@ -136,14 +136,14 @@ class EmService:
             else:
                 spent = time.monotonic() - begin
                 waited = min(outcome.waited, spent)
-                compiled = f'after {waited:.0f} s in which kernels were compiled, as at the first start'
+                compiled = f'after {waited:.0f} s of compiling kernels, as at the first start'
                 said = [summary(outcome.maps, spent - waited), compiled if waited >= LONG_WAIT else '']
                 warned = [f'WARNING: {warning}' for warning in outcome.warnings]
                 reply.send(True, '; '.join(filter(None, [*said, outcome.trajectory, *warned])))
 
         run = self.current
         if (run is None or run.by_itself) and not all(map(self._kernels.has, self._needed())):
-            self._logger.info('run_em waits for kernels that are being compiled, as at the first start')
+            self._logger.info('run_em waits for the compilation of kernels, as at the first start')
         if run is None:
             self._start(done)
         elif run.by_itself and run.fresh() and not run.cancelled:
@@ -153,7 +153,7 @@ class EmService:
         elif run.by_itself:
             self._give_way(run, done)
         else:
-            reply.send(False, f'EM runs already ({run}); call again when it has ended')
+            reply.send(False, f'EM is already running ({run}); call run_em again when it has ended')
 
     def run_by_itself(self) -> bool:
         """Begin a run that nobody asked for; return whether it began: not while one goes on, nor without readings."""
@@ -189,12 +189,12 @@ class EmService:
         """Cancel the run that goes on, forget nothing, and answer when it has ended."""
         run = self.current
         if run is None:
-            reply.send(False, 'EM does not run: there is nothing to cancel')
+            reply.send(False, 'EM is not running: there is nothing to cancel')
             return
 
         def ended(outcome: Outcome) -> None:
             if outcome.maps is not None:
-                reply.send(False, 'EM had found its maps before it could be cancelled; they are published')
+                reply.send(False, 'EM ended before it could be cancelled; its maps are published')
             else:
                 reply.send(True, f'{outcome.message} (after {run.seconds:.1f} s); readings and earlier maps are kept')
 
@@ -273,7 +273,7 @@ class EmService:
                 lack = self.no_map_frame()
                 outcome.message = nothing_to_map(self._associator, self.range_topics, self.odom_topic, lack)
             elif outcome.maps is None and run.then:
-                outcome.message = 'the run that was begun after some way gave way to run_em'
+                outcome.message = 'the run that the node began by itself (refine_every) was replaced by run_em'
             self._finish(outcome, taken[0][0])
             if outcome.maps is None and run.shown:
                 self._publishers.publish('ml_map', generation, *before)

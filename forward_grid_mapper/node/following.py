@@ -95,7 +95,7 @@ class Following:
             return {}
         said = f'{follower.windows} windows, {follower.places} places recognised'
         if follower.kept:
-            said += '; the correction is kept, since readings are predicted worse where it is followed'
+            said += '; the last correction is kept, since it predicts the readings better'
         return {'followed since the latest run': f'{said}; ended: {follower.obstacle}' if follower.obstacle else said}
 
     def _take(self, follower: Follower) -> None:
@@ -107,5 +107,5 @@ class Following:
     def _say(self) -> None:
         if self.obstacle:
             self._log.warning(
-                f'map to odom is not followed any more: {self.obstacle}; it stays as it is until the next run_em'
+                f'map to odom is no longer followed: {self.obstacle}; it stays constant until the next run_em'
             )

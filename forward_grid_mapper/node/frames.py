@@ -198,8 +198,8 @@ class MapFrame:
         if self._lack is TILTED:
             return f"TF's transform {way} is tilted, not finite, or its quaternion is not normalised: {waiting}"
         if self._lack is LATE:
-            return f"TF's transform {way} comes later than pose_timeout, or has stopped: {waiting}"
-        return f'TF has no transform {way}: {waiting}; is a localiser running?'
+            return f"TF's transform {way} arrives later than pose_timeout, or has stopped: {waiting}"
+        return f'TF has no transform {way}: {waiting}; is a localisation node running?'
 
     def fault(self) -> str:
         """Return what keeps odometry that comes out of the map frame for `LASTING` seconds now, in words, or ''."""

@@ -164,14 +164,17 @@ class Intake:
         if now > recent + LASTING:
             return []
         remedy = (
-            'this node was stopped or its machine has too much to do: send less, or give it more time'
+            'this node was stopped or its machine is overloaded: reduce the rate of messages, or the load of the '
+            'machine'
             if self.reliable
-            else 'the network or this machine is too slow for them; range_reliability and odom_reliability: reliable '
-            'repeats what the network loses'
+            else (
+                'the network or this machine is too slow for them; with range_reliability and odom_reliability: '
+                'reliable, lost messages are sent again'
+            )
         )
         text = (
-            f'{self.lost} Range and {self.odometry_lost} odometry messages so far were lost before this node could '
-            f'take them (estimated): {remedy}'
+            f'{self.lost} Range and {self.odometry_lost} odometry messages so far were lost before this node received '
+            f'them (estimated): {remedy}'
         )
         if now > self._next_warning and self.lost + self.odometry_lost > self._told_of:
             self._next_warning, self._told_of = now + LASTING, self.lost + self.odometry_lost
@@ -183,8 +186,8 @@ class Intake:
         if not self.lost + self.odometry_lost:
             return []
         return [
-            f'{self.lost} Range and {self.odometry_lost} odometry messages were lost before the node could take them '
-            f'(estimated); the maps lack them'
+            f'{self.lost} Range and {self.odometry_lost} odometry messages were lost before the node received them '
+            '(estimated); they are missing in the maps'
         ]
 
     # messages

@@ -63,7 +63,7 @@ class JournalKeeper:
             if not (isinstance(cause, OSError) and cause.errno in FULL):
                 raise
             self._trouble = str(error)
-            warn(f'there is no journal: {error}')
+            warn(f'no journal is kept: {error}')
 
     def restore(self) -> None:
         """Give the journal's readings to the associator; any thread, as long as no other uses the associator.
@@ -94,13 +94,13 @@ class JournalKeeper:
         self._restored = self._taken = len(associator.buffer)
         self._last_point = associator.path[-1] if associator.path else None
         logger.info(
-            f'journal {journal.path}: {self._restored} readings of an earlier run are back, in frame '
+            f'journal {journal.path}: {self._restored} readings of an earlier run are restored, in frame '
             f'{associator.map_frame or "(none yet)"}'
         )
         if refused:
             logger.warning(
-                f'journal {journal.path}: {refused} of its readings do not fit on the map (max_cells, resolution) and '
-                f'are left out of it'
+                f'journal {journal.path}: {refused} of its readings do not fit into the map (max_cells, resolution) '
+                'and are left out'
             )
 
     def take(self) -> None:
@@ -153,7 +153,7 @@ class JournalKeeper:
         values: dict[str, Any] = {'folder': self._folder, 'readings restored': self._restored}
         if journal is not None:
             if journal.lost:
-                trouble = trouble or f'{journal.lost} readings came while nothing could be written'
+                trouble = trouble or f'{journal.lost} readings were received while nothing could be written'
             if time.monotonic() < journal.noticed + NOTICE:
                 trouble = trouble or journal.notice
             values |= {

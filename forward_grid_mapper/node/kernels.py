@@ -47,7 +47,7 @@ class Kernels:
     def begin(self, ready: Callable[[], None]) -> None:
         """Begin to compile; `ready` is called, in another thread, when the live map has its kernels."""
         self.at_work.add(self)
-        self._log('preparing kernels; the first start compiles them, which takes half a minute and more')
+        self._log('preparing kernels; the first start compiles them, which takes half a minute or more')
         begin = time.monotonic()
         # the collector would go through all that the compiler made again and again, and keep the executor waiting
         gc.disable()

@@ -53,7 +53,7 @@ def _spin(executor: Any, node: Any) -> None:
             now = time.monotonic()
             if now > logged + LOG_EVERY:
                 logged = now
-                node.get_logger().error(f'a callback failed, mapping goes on: {traceback.format_exc()}')
+                node.get_logger().error(f'a callback failed, mapping continues: {traceback.format_exc()}')
             # one that fails all the time must not take all of the time
             time.sleep(0.001)
 

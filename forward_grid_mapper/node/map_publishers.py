@@ -68,7 +68,7 @@ class MapPublishers:
         self._out = {name: node.create_publisher(OccupancyGrid, f'~/{name}', LATCHED) for name in MAPS}
         topics = [self._out[name].topic_name for name in MAPS]
         if twice := sorted(topic for topic in set(topics) if topics.count(topic) > 1):
-            raise MapperError(f'{twice[0]} can have one map only: give the others another topic, or leave them theirs')
+            raise MapperError(f'{twice[0]} can have only one map: remap the others to another topic, or not at all')
         self._updates = MapUpdates.of(node, self._out['live_map'])
         self._lock = threading.Lock()
         self._pending: dict[str, tuple[Grid, NDArray[Any]]] = {}

@@ -106,12 +106,14 @@ class MapperNode(ManagedNode):
         if why := unwritable(node.save_directory):
             log.warning(f'save_maps will fail: {why}; set save_directory to a folder that can be written')
         for topic in {topic for topic in ranges if ranges.count(topic) > 1}:
-            log.warning(f'range_topics has {topic} {ranges.count(topic)} times; its readings are taken once')
+            log.warning(f'range_topics has {topic} {ranges.count(topic)} times; its readings are used once')
         ranges = list(dict.fromkeys(ranges))
         if not node.range_topics:
-            raise MapperError('range_topics is empty; give it the name of a topic of sensor_msgs/Range, or several')
+            raise MapperError('range_topics is empty; set it to one or more topics of sensor_msgs/Range')
         if odometry in ranges:
-            raise MapperError(f'{odometry} cannot be a topic of Range and of odometry: set range_topics or odom_topic')
+            raise MapperError(
+                f'{odometry} cannot be a topic of both Range and odometry: set range_topics or odom_topic'
+            )
         transforms = Transforms.of(self)
         extrinsics = Extrinsics(ros_parameters.mounts(self), transforms)
         # with refine_poses it is this node that gives the transform
@@ -246,8 +248,8 @@ class MapperNode(ManagedNode):
             self._map()
         self._lacks.discard(what)
         if not self._lacks:
-            then = '' if self.intake.listening else '; activate the node to have them received'
-            self.get_logger().info(f'ready: the live map follows the readings{then}')
+            then = '' if self.intake.listening else '; activate the node to receive them'
+            self.get_logger().info(f'ready: the live map is updated with the readings{then}')
 
     def _map(self) -> None:
         """Answer those who waited, once what was held back is taken."""
@@ -283,7 +285,8 @@ class MapperNode(ManagedNode):
         refine = self.parameters.node.refine_poses, parameters.node.refine_poses
         if self._started and parameters.node.map_frame and refine[0] != refine[1]:
             raise ParameterError(
-                'refine_poses says who gives the transform from map_frame, which is set: restart the node to change it'
+                'map_frame is set, and refine_poses decides which node publishes its transform: restart the node to '
+                'change refine_poses'
             )
         before, self.parameters = self.parameters, parameters
         if not self._started:
@@ -392,12 +395,12 @@ class MapperNode(ManagedNode):
         self.live.restart(self.parameters, self.maps.generation)
         self._fed = {'live': 0, 'online': 0}
         self._restart_online()
-        reply.send(True, f'{forgotten} readings and all maps were forgotten{kept}')
+        reply.send(True, f'{forgotten} readings and all maps were deleted{kept}')
 
     def pause(self, reply: Reply) -> None:
         """Stop or go on taking readings; answer the service."""
         self.intake.paused = paused = bool(reply.request.data)
-        reply.send(True, 'readings are not taken until pause is called with false' if paused else 'mapping')
+        reply.send(True, 'readings are ignored until pause is called with false' if paused else 'mapping')
 
     def _account(self) -> Account:
         """Return what a report says of the node."""

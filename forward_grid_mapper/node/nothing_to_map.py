@@ -19,21 +19,21 @@ def nothing_to_map(associator: PoseAssociator, range_topics: Sequence[str], odom
 def _why(associator: PoseAssociator, range_topics: Sequence[str], odom_topic: str, no_map_frame: str) -> str:
     received, rejected = associator.received, associator.rejected
     if not received:
-        return f'no Range message has come on {", ".join(range_topics)} since the start or reset'
+        return f'no Range message has been received on {", ".join(range_topics)} since the start or reset'
     came, refused = associator.odometry_received, associator.odometry_rejected
     # odometry that waits for TF has not come as far as the associator
     if no_map_frame and not came and set(rejected) <= {'no_odometry'}:
         return no_map_frame
     if not rejected:
         has = (
-            'reading has come, and waits for its pose'
+            'reading has been received, and waits for its pose'
             if received == 1
-            else 'readings have come, and wait for their poses'
+            else 'readings have been received, and wait for their poses'
         )
         return f'{received} {has}'
     reason, count = max(rejected.items(), key=lambda row: row[1])
     if reason == 'no_odometry' and not came:
-        return f'no Odometry message has come on {odom_topic} since the start or reset'
+        return f'no Odometry message has been received on {odom_topic} since the start or reset'
     if reason == 'no_odometry' and came == refused.total():
         reason = max(refused, key=lambda key: refused[key])
         return f'all {came} odometry messages were rejected as {reason}: {ODOMETRY_REASONS[reason]}'

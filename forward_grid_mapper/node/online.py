@@ -145,7 +145,7 @@ class OnlineWorker:
             why = str(error) or 'there is not enough memory'
             if wanted.taken > taken:
                 # no lasting trouble
-                self._log(f'online map: what is left of the search is done with the next readings: {why}')
+                self._log(f'online map: the search will continue with the next readings: {why}')
                 return
             raise MapperError(f'{len(new)} readings are not in the online map: {why}') from None
         finally:

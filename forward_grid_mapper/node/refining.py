@@ -162,12 +162,12 @@ class RefiningMapper:
         found, before = self._refiner.run(readings, odometry, say), self._before
         if found.accepted or before is None or before.refinement is None or before.correction is None:
             return found
-        say('that of the run before', 0.0)
+        say('that of the previous run', 0.0)
         outcome = keep_if_not_worse(before.refinement, before.correction, found, self._parameters, self._stop)
         if outcome.accepted:
             self._kept = found.reason
             return outcome
-        return replace(found, reason=f'{found.reason}; and it is no worse than what the run before found')
+        return replace(found, reason=f'{found.reason}; and it is not worse than the trajectory of the previous run')
 
     def _live_map(self, readings: Readings, correction: Correction | None) -> LogOddsMap:
         live = LogOddsMap(self._parameters)
@@ -185,11 +185,11 @@ def outcome_words(found: Found) -> str:
     if refinement is None:
         return ''
     if correction is None:
-        return f'trajectory as odometry gives it: {refinement.reason}'
+        return f'odometry is used as the trajectory: {refinement.reason}'
     wheels = calibration_words(refinement.calibration)
     said = 'trajectory refined'
     if found.kept:
-        said = f'trajectory of the run before kept ({refinement.reason}; by itself this run says: {found.kept})'
+        said = f'trajectory of the previous run kept ({refinement.reason}; result of this run alone: {found.kept})'
     return (
         f'{said}: odometry was off by {refinement.moved:.2f} m (root mean square), '
         f'{correction.moved:.2f} m at the end of the drive, {refinement.loops} places recognised'

@@ -102,7 +102,7 @@ class Reporter:
             if trouble:
                 failed.append(f'{worker.name}: {trouble}')
         stage = self._kernels.stage
-        message = '; '.join(failed) or (f'compiling kernels: {stage}' if stage else 'all is well')
+        message = '; '.join(failed) or (f'compiling kernels: {stage}' if stage else 'no fault')
         level = DiagnosticStatus.WARN if failed else DiagnosticStatus.OK
         return diagnostics.status(f'{name}: background', level, message, name, values)
 
@@ -126,15 +126,15 @@ class Reporter:
             self._node.get_logger().warning(f'readings are not mapped: {fault}')
         elif self._no_map_frame and self._map_frame.found:
             self._no_map_frame = False
-            self._node.get_logger().info('the transform to map_frame is there')
+            self._node.get_logger().info('the transform to map_frame is available')
         return fault
 
     def _nameless(self) -> list[str]:
         """Warn of odometry whose frame has no name, which maps then lack as well; the log is told once."""
         nameless = bool(len(self._associator.record)) and not self._associator.map_frame
         text = (
-            'odometry has no frame_id in its header: RViz and Nav2 can show no map in that frame, and TF does not lead '
-            'there; have its driver set one, such as odom'
+            'odometry has no frame_id in its header: RViz and Nav2 cannot use a map in that frame, and TF has no '
+            'transform to it; set a frame_id in its driver, such as odom'
         )
         if nameless and not self._no_name:
             self._node.get_logger().warning(text)
@@ -146,12 +146,12 @@ class Reporter:
         unknown = self._associator.unknown_frames
         # a reset forgets which are unknown, too
         for frame in sorted((self._lost - unknown).intersection(self._associator.buffer.counts())):
-            self._node.get_logger().info(f'sensor {frame} has a pose on the robot now')
+            self._node.get_logger().info(f'sensor {frame} now has a pose on the robot')
         # also those that are rejected, or wait
         sent = {frame.lstrip('/') for frame in self._intake.heard}
         unheard = self._extrinsics.known.keys() - sent
         # said once, however many frames are new
-        named = f'; poses are given for {diagnostics.listed(unheard)}: is one of them meant?' if unheard else ''
+        named = f'; there are poses for {diagnostics.listed(unheard)}: is it one of these?' if unheard else ''
         for frame in sorted(unknown - self._reported)[: diagnostics.SHOWN]:
             if len(self._reported) >= MOST_FRAMES:
                 break
@@ -165,7 +165,7 @@ class Reporter:
             way = (
                 f'publish the transform from {base}'
                 if base
-                else 'have odometry name the base frame as its child_frame_id, without which TF cannot be asked'
+                else 'set child_frame_id of odometry to the base frame, which is needed for lookups in TF'
             )
             self._node.get_logger().warning(
                 f'no pose on the robot for sensor {frame}: set sensors.{frame}.pose: [x, y, yaw], or {way}; {why}; '

@@ -154,6 +154,6 @@ def _strangers(given: dict[str, RosParameter]) -> list[str]:
         near = difflib.get_close_matches(name, NAMES, n=1)
         hint = f'; did you mean {near[0]}?' if near else ''
         if re.match(r'sensors?\.', name):
-            hint = '; poses of sensors are given as sensors.<frame_id>.pose: [x, y, yaw]'
+            hint = '; set poses of sensors as sensors.<frame_id>.pose: [x, y, yaw]'
         warnings.append(f'parameter {name} is not known to this node and is ignored{hint}')
     return warnings

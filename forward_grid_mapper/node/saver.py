@@ -68,7 +68,7 @@ class Saver:
             try:
                 live = self._live.snapshot()
                 if live.generation != generation:
-                    raise MapperError('there is no map to save: they were forgotten by reset')
+                    raise MapperError('there is no map to save: reset deleted them')
                 both = maps.with_live(live.grid, live.probability)
                 reply.send(True, self._write(both, account, explained, found))
             except MapperError as error:
@@ -80,9 +80,9 @@ class Saver:
         newer = account.accepted - explained
         warnings = account.source['warnings']
         if newer > 0:
-            after = f'{counted(newer, "reading")} came after EM'
+            after = f'{counted(newer, "reading")} arrived after EM'
             warnings.append(
-                f'{after}: only the live map has {"it" if newer == 1 else "them"}; call run_em before save_maps'
+                f'{after}: only the live map contains {"it" if newer == 1 else "them"}; call run_em before save_maps'
             )
         if note := thinned(len(maps.readings), explained):
             warnings.append(note)
@@ -107,7 +107,7 @@ class Saver:
         said = [', '.join([*shown, f'and {counted(len(names) - len(shown), "file")} more'])]
         # a robot that drives measures on while it is told of its map
         if newer > 0:
-            said.append(f'{counted(newer, "reading")} came after EM')
+            said.append(f'{counted(newer, "reading")} arrived after EM')
         if count := len(report['warnings']) - (newer > 0):
             said.append(f'WARNINGS ({count}): see report.txt')
         return '; '.join(said)

@@ -47,8 +47,8 @@ class SensorWatch:
         values |= {sensor: str(row) for sensor, row in table.items()}
         for sensor, seconds in quiet.items():
             values[sensor] = f'SILENT for {seconds:.0f} s; {values.get(sensor, "")}'
-        silence = f'{listed(quiet)}: nothing comes any more' if quiet else ''
+        silence = f'{listed(quiet)}: no more messages' if quiet else ''
         warning = '; '.join(filter(None, [silence, health_warning(table)]))
-        message = warning or ('none stands out' if table else 'judged when EM has run')
+        message = warning or ('none differs from the others' if table else 'judged after EM')
         level = DiagnosticStatus.WARN if warning else DiagnosticStatus.OK
         return status(f'{name}: sensors', level, message, name, values)

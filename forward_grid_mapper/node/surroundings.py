@@ -65,7 +65,7 @@ class Surroundings:
         for topic in topics:
             types = {publisher.topic_type for publisher in self._node.get_publishers_info_by_topic(topic)}
             if not types:
-                said.append(f'nobody publishes {topic}')
+                said.append(f'no node publishes {topic}')
             elif of_kind not in types:
                 said.append(f'{topic} carries {", ".join(sorted(types))}, not {of_kind}')
         if not said:
@@ -75,7 +75,7 @@ class Surroundings:
             for topic, types in self._node.get_topic_names_and_types()
             if of_kind in types and topic not in topics and self._node.count_publishers(topic)
         )
-        remedy = f'; {kind} comes on {listed(elsewhere)}: set {PARAMETER[kind]}' if elsewhere else ''
+        remedy = f'; {kind} is published on {listed(elsewhere)}: set {PARAMETER[kind]}' if elsewhere else ''
         return f': {", ".join(said)}{remedy}'
 
     def _deaf(self) -> list[str]:
@@ -87,13 +87,13 @@ class Surroundings:
                 if fit == QoSCompatibility.ERROR:
                     offered = publisher.qos_profile.reliability.name.lower()
                     remedy = (
-                        'have it publish as reliable'
+                        'set its publisher to reliable'
                         if topic in of_transforms
                         else f'set range_reliability or odom_reliability to {offered}'
                     )
                     faults.append(
-                        f'{publisher.node_name} publishes {topic} as {offered}, and this node asks for '
-                        f'{wanted.reliability.name.lower()}: nothing of it is received; {remedy}'
+                        f'{publisher.node_name} publishes {topic} as {offered}, but this node requests '
+                        f'{wanted.reliability.name.lower()}: no message is received; {remedy}'
                     )
         return list(dict.fromkeys(faults))
 
@@ -102,8 +102,9 @@ class Surroundings:
         if not self._frames_missing():
             return []
         names = {
-            f'{publisher.node_name} publishes {topic} as volatile: what it sent before this node listened is lost; '
-            'have it publish as transient_local (ros2 bag play: --qos-profile-overrides-path), or set sensors.*.pose'
+            f'{publisher.node_name} publishes {topic} as volatile: messages sent before this node subscribed are '
+            'lost; set its publisher to transient_local (ros2 bag play: --qos-profile-overrides-path), or set '
+            'sensors.*.pose'
             for topic in self._transforms[1:]
             for publisher in self._node.get_publishers_info_by_topic(topic)
             if publisher.qos_profile.durability == DurabilityPolicy.VOLATILE
@@ -116,10 +117,10 @@ class Surroundings:
         if not clock.ros_time_is_active or clock.now().nanoseconds or time.monotonic() < self._begin + PERIOD:
             return []
         topic = self._node.resolve_topic_name('/clock')
-        who = 'publishes' if not self._node.count_publishers(topic) else 'has said a time on'
+        who = 'publishes' if not self._node.count_publishers(topic) else 'has published on'
         return [
-            f'use_sim_time is true, and nobody {who} {topic}: maps have the stamp 0; start the simulation, play the '
-            'bag with --clock, or leave use_sim_time out'
+            f'use_sim_time is true, but no node {who} {topic}: maps have the stamp 0; start the simulation, play the '
+            'bag with --clock, or leave out use_sim_time'
         ]
 
     def _namesakes(self) -> list[str]:
@@ -127,7 +128,7 @@ class Surroundings:
         count = sum(pair == own for pair in self._node.get_node_names_and_namespaces())
         name = self._node.get_fully_qualified_name()
         text = (
-            f'{count} nodes are called {name}: their maps and services mix; start each with a name of its own, '
-            '--ros-args -r __node:=NAME'
+            f'{count} nodes have the name {name}: their maps and services are mixed up; start each with a different '
+            'name, --ros-args -r __node:=NAME'
         )
         return [text] * (count > 1)

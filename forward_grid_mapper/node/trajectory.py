@@ -66,8 +66,8 @@ class _Jump(NamedTuple):
 
     def __str__(self) -> str:
         return (
-            f'odometry jumped by {self.far:.1f} m: where the robot is on the map is not known until run_em has found '
-            f'it, and new readings are placed wrongly; where it was carried away (kidnapped), call reset'
+            f'odometry jumped by {self.far:.1f} m: the pose of the robot on the map is unknown until run_em has found '
+            'it, and new readings are mapped with wrong poses; if the robot was carried away (kidnapped), call reset'
         )
 
 
@@ -123,8 +123,8 @@ class Trajectory:
         if self._associator.map_frame.lstrip('/') != self._map_frame:
             return ''
         return (
-            f'odometry comes in frame {self._map_frame}, which is that of a localised pose that does not drift '
-            f'(REP 105): where it does, set map_frame to another name, in which the maps are to be'
+            f'odometry is in frame {self._map_frame}, the frame of localised poses without drift (REP 105): if it '
+            'drifts, set map_frame to another name for the frame of the maps'
         )
 
     @property
@@ -201,7 +201,7 @@ class Trajectory:
     def outcome(self) -> str:
         """Return what became of the trajectory of the latest maps, in words; empty if it is odometry's anyway."""
         if self._parameters.node.refine_poses and self.obstacle:
-            return f'trajectory as odometry gives it: {self.obstacle}'
+            return f'odometry is used as the trajectory: {self.obstacle}'
         return outcome_words(self.found) if self.found else ''
 
     def statuses(self, name: str) -> list[DiagnosticStatus]:
@@ -227,7 +227,7 @@ class Trajectory:
             }
         if self.following is not None:
             values |= self.following.values()
-        message = self.outcome() or 'as odometry gives it until run_em is called'
+        message = self.outcome() or 'odometry is used until run_em is called'
         if self._jump is not None:
             message = f'{message}; {self._jump}'
         troubled = (

@@ -48,4 +48,4 @@ class VerdictLog:
             self._log.warning(fault)
         if self._bad and well:
             self._bad = False
-            self._log.info('readings are mapped, and nothing is wrong with them any more')
+            self._log.info('readings are mapped without faults again')

@@ -68,8 +68,8 @@ def check_frames(drives: Sequence[Described]) -> None:
     of = '; '.join(f'{frame or "no name"}: {listed(names)}' for frame, names in frames.items())
     few = min(frames.values(), key=len)
     raise InputError(
-        f'these drives are not in one map frame ({of}), so they make no one map. Localise all of them in one map and '
-        f'record that odometry (--odom-topic chooses it), or leave out {listed(few)}'
+        f'these drives are not in the same map frame ({of}), so they cannot be mapped together. Localise all of them '
+        f'in one map and record that odometry (--odom-topic selects it), or leave out {listed(few)}'
     )
 
 
@@ -142,9 +142,10 @@ def _poses(drives: Sequence[Described]) -> Iterator[str]:
     poses = [{frame.lstrip('/'): pose for frame, pose in drive.extrinsics.items()} for drive in drives]
     for names, frames, usual, value in _differing(drives, poses, key, _same_pose):
         yield (
-            f'{_is_where(frames[0], value)} in {listed(names)}, and {_at(usual)} in the other drives of this robot'
-            f'{_and_more(frames)}: if it is a mistake, give --sensor {frames[0]}=x,y,yaw; if the sensor was moved '
-            f'between the drives, all is well; if these are different robots, give their base frames different names'
+            f'{_is_where(frames[0], value)} in {listed(names)}, and {_at(usual)} in the other drives of this '
+            f'robot{_and_more(frames)}: if this is a mistake, set --sensor {frames[0]}=x,y,yaw; if the sensor was '
+            'moved between the drives, ignore this; if these are different robots, give their base frames different '
+            'names'
         )
 
 
@@ -157,10 +158,10 @@ def _limits(drives: Sequence[Described]) -> Iterator[str]:
 
     for names, frames, usual, value in _differing(drives, [drive.limits for drive in drives], key, same):
         yield (
-            f'{frames[0]} reaches {value[0]:.2f} m and sees {math.degrees(value[1]):.0f} degrees in {listed(names)}, '
-            f'and {usual[0]:.2f} m and {math.degrees(usual[1]):.0f} degrees in the other drives of this robot'
-            f'{_and_more(frames)}: is it another sensor? If a driver states it wrongly, set the parameters max_range '
-            f'or field_of_view'
+            f'{frames[0]} has a range of {value[0]:.2f} m and a field of view of {math.degrees(value[1]):.0f} degrees '
+            f'in {listed(names)}, and {usual[0]:.2f} m and {math.degrees(usual[1]):.0f} degrees in the other drives '
+            f'of this robot{_and_more(frames)}: is it another sensor? If a driver states wrong values, set the '
+            'parameters max_range or field_of_view'
         )
 
 
@@ -207,7 +208,7 @@ def _at(pose: Pose2) -> str:
 
 
 def _is_where(frame: str, pose: Pose2) -> str:
-    return f'{frame} sits on the robot {_at(pose)}'
+    return f'{frame} is mounted on the robot {_at(pose)}'
 
 
 def _and_more(frames: Sequence[str]) -> str:

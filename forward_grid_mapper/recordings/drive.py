@@ -197,9 +197,9 @@ def jumps_note(associator: PoseAssociator) -> list[str]:
     first = int(np.flatnonzero(jumped)[0])
     often = 'once,' if count == 1 else f'{count} times, first'
     return [
-        f'odometry jumps {often} by {steps[first]:.1f} m after {steps[:first].sum():.0f} m of driving: the map has '
-        f'what comes after it in another place; --refine-poses puts it where readings fit, or map a part alone with '
-        f'--start and --duration'
+        f'odometry jumps {often} by {steps[first]:.1f} m after {steps[:first].sum():.0f} m of driving: readings after '
+        'the jump are mapped in a wrong place; --refine-poses corrects this from the readings, or map only a part '
+        'with --start and --duration'
     ]
 
 
@@ -217,8 +217,8 @@ def to_and_fro_note(associator: PoseAssociator) -> list[str]:
     if count < max(MOST_JUMPED * len(steps), FEWEST_RETURNS):
         return []
     return [
-        f'poses jump to and fro, by {np.median(steps[both]):.2f} m in {count} of {len(steps)} steps; do two nodes '
-        f'publish on this topic? Record the poses of one of them, or the map has everything in two places'
+        f'poses jump back and forth, by {np.median(steps[both]):.2f} m in {count} of {len(steps)} steps; do two nodes '
+        'publish on this topic? Record the poses of only one of them, otherwise the map shows everything twice'
     ]
 
 

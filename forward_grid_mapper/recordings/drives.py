@@ -146,7 +146,8 @@ def unreadable(errors: Sequence[tuple[Path, MapperError]], count: int) -> Mapper
     more = f'\n  and {len(errors) - MOST_ERRORS} more' if len(errors) > MOST_ERRORS else ''
     kind = BagError if all(isinstance(error, BagError) for _, error in errors) else InputError
     return kind(
-        f'{len(errors)} of {count} drives cannot be mapped; leave them out, or do as is said:{"".join(lines)}{more}'
+        f'{len(errors)} of {count} drives cannot be mapped; leave them out, or follow these '
+        f'messages:{"".join(lines)}{more}'
     )
 
 

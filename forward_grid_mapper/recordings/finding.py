@@ -48,7 +48,7 @@ def find_recordings(words: Sequence[Path | str]) -> Recordings:
         if not path.exists() and glob.has_magic(str(word)):
             matches = [Path(name) for name in sorted(glob.glob(str(word)), key=_natural)]  # noqa: PTH207 (absolute too)
             if not matches:
-                raise BagError(f'no file or folder fits {word}')
+                raise BagError(f'no file or folder matches {word}')
         for match in matches:
             bags, skipped = _bags_of(match)
             found.paths.extend(bags or [match])
@@ -104,7 +104,7 @@ def _holds_recordings(folder: Path) -> bool:
 
 def _left_out(path: Path, skipped: Sequence[Path]) -> str:
     names = ', '.join(entry.name for entry in skipped)
-    return f'of {readable(path)} these are left out: {names}; if they are recordings, name them on the command line too'
+    return f'of {readable(path)} these are left out: {names}; if they are recordings, add them to the command line'
 
 
 def _natural(name: str) -> list[tuple[int, str]]:

@@ -59,8 +59,8 @@ def read_given_poses(path: Path | str) -> GivenPoses:
         raise InputError(f'{readable(path)} has no pose')
     if np.abs(stamps).max() > LATEST:
         raise InputError(
-            f'{readable(path)} has the stamp {stamps[np.abs(stamps).argmax()]:g}, which is no number of seconds; where '
-            f'stamps are nanoseconds, write CSV and call their column stamp_ns'
+            f'{readable(path)} has the stamp {stamps[np.abs(stamps).argmax()]:g}, which is not possible for seconds; '
+            'if stamps are in nanoseconds, use CSV and name the column stamp_ns'
         )
     stamp = np.rint(stamps * NANOSECONDS).astype(np.int64)
     # of poses with one stamp the first

@@ -60,15 +60,15 @@ def read_journal(
             for reason, count in associator.rejected.items()
         ]
         why = '; '.join(filter(None, [contents.harm, *reasons]))
-        raise InputError(f'the journal {path} holds no reading{f" to map: {why}" if why else ""}')
+        raise InputError(f'the journal {path} contains no reading{f" to map: {why}" if why else ""}')
     associator.map_frame, associator.base_frame = contents.map_frame, contents.base_frame
     for point in contents.path:
         associator.extend_path(point)
     warnings = _warnings(path, contents, associator, parameters)
     if extrinsics:
         warnings.append(
-            'a journal holds readings in the map frame: the poses of sensors that were given change nothing, but with '
-            '--refine-poses they tell the odometry'
+            'a journal contains readings in the map frame: given poses of sensors have no effect, except with '
+            '--refine-poses, where they are used to compute odometry from the readings'
         )
     source = {
         'bag': readable(path),
@@ -106,7 +106,7 @@ def _warnings(path: Path, contents: Contents, associator: PoseAssociator, parame
     if contents.harm:
         warnings.append(f'{path.name}: {contents.harm}')
     if contents.note:
-        warnings.append(f'{path.name}: {contents.note}; a node that starts with this journal goes on in a new file')
+        warnings.append(f'{path.name}: {contents.note}; a node that starts with this journal continues in a new file')
     for reason, count in associator.rejected.items():
         of_all = counted(associator.received, 'reading')
         warnings.append(f'{count} of {of_all} {"is" if count == 1 else "are"} refused: {REASONS[reason]}')
@@ -119,5 +119,5 @@ def _warnings(path: Path, contents: Contents, associator: PoseAssociator, parame
     # a file of the previous format has none
     if other and not contents.note:
         named = ', '.join(f'{name}={value}' for name, value in list(other.items())[:MOST_NAMED])
-        warnings.append(f'the node that kept {path.name} mapped with {named}; --set gives the same here')
+        warnings.append(f'the node that kept {path.name} mapped with {named}; use --set for the same values here')
     return warnings

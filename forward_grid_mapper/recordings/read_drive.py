@@ -78,7 +78,7 @@ class Extrinsics:
         try:
             pose = transforms.lookup(base_frame, frame)
             if pose is None and base_frame:
-                transforms, where = self._more(), 'transforms on /tf that stay the same'
+                transforms, where = self._more(), 'constant transforms on /tf'
                 pose = transforms.lookup(base_frame, frame)
         except SteepSensorError as error:
             self.steep[frame] = str(error)
@@ -104,9 +104,9 @@ class Extrinsics:
     def advice(self, base_frame: str, frames: Sequence[str]) -> str:
         """Say what to do about frames without a pose."""
         known = self._transforms.frames
-        joined = f'/tf_static joins {", ".join(known[:12])}' if known else 'the bag has no /tf_static'
+        joined = f'/tf_static connects {", ".join(known[:12])}' if known else 'the bag has no /tf_static'
         if not base_frame:
-            joined += '; odometry has no child_frame_id, without which transforms cannot be asked'
+            joined += '; odometry has no child_frame_id, which is needed to look up transforms'
         reasons = ''.join(f' {self.unusable[frame]}' for frame in frames if frame in self.unusable)
         reasons += self._on_joints(frames)
         options = ' '.join(f'--sensor {quoted(f"{frame}=x,y,yaw")}' for frame in frames[:MOST_OPTIONS])
@@ -123,8 +123,8 @@ class Extrinsics:
         if not found:
             return ''
         return (
-            f' Only transforms that may move join {", ".join(found)} to the robot: sensors on moving joints are not '
-            f'supported with bags (the node maps them while the robot drives). If the joint hardly moves, a pose does.'
+            f' Only transforms that may change connect {", ".join(found)} to the robot: sensors on moving joints are '
+            'not supported with bags (the node supports them). If the joint hardly moves, use a fixed pose.'
         )
 
 
@@ -248,7 +248,8 @@ def _warnings(bag: Bag, associator: PoseAssociator, lookup: Extrinsics) -> list[
         )
     if associator.time_jumps:
         warnings.append(
-            f"odometry's clock jumped back {counted(associator.time_jumps, 'time')}; what waited for a pose was dropped"
+            f"odometry's clock jumped back {counted(associator.time_jumps, 'time')}; readings that waited for a pose "
+            'were dropped'
         )
     warnings += to_and_fro_note(associator)
     warnings += associator.limits.warnings()
@@ -281,11 +282,11 @@ def _nothing_associated(
         if ranges and lookup.moving and not lookup.moving.keys() & set(BASE_FRAMES):
             moved = ', '.join(f'{child} in {parent}' for child, parent in sorted(lookup.moving.items())[:12])
             return BagError(
-                f'the transforms place neither {" nor ".join(BASE_FRAMES)}, but {moved}; give the poses of the robot '
-                f'with --poses, or record its Odometry'
+                f'the transforms contain neither {" nor ".join(BASE_FRAMES)}, but {moved}; give the poses of the '
+                'robot with --poses, or record its Odometry'
             )
         kind = 'Range' if not ranges else 'Odometry'
-        return BagError(f'the chosen topics hold no readable {kind} message{f" ({lost})" if lost else ""}')
+        return BagError(f'the chosen topics contain no readable {kind} message{f" ({lost})" if lost else ""}')
     if associator.unknown_frames and set(associator.rejected) <= NOWHERE:
         return InputError(lookup.advice(associator.base_frame, sorted(associator.unknown_frames)))
     if set(associator.rejected) != {'zero_stamp'} and (ranges[1] < odometry[0] or ranges[0] > odometry[1]):

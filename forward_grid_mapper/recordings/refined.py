@@ -32,11 +32,13 @@ Watch = Callable[[str, float], None]
 """Receives what is going on, and how much of it is done, from 0 to 1."""
 
 NO_MOUNTS = (
-    'a journal holds no odometry, which can be told from the readings of sensors that are fixed to the robot: give '
-    "their poses with --sensor, or the node's own file with --params"
+    'a journal contains no odometry. It can be computed from the readings of sensors that are fixed to the robot: '
+    'give their poses with --sensor, or the parameter file of the node with --params'
 )
 
-NO_TIMES = "no calibration is applied: there are readings of a time without odometry, as where odometry's clock jumped"
+NO_TIMES = (
+    "no calibration is applied: there are readings at times without odometry, as after a jump of odometry's clock"
+)
 
 
 @dataclass(frozen=True)
@@ -152,7 +154,7 @@ def refine_drives(
         told.append(_told(drive, poses, outcome, parameters, watch, given))
     fitted = [''] * len(outcomes)
     if several and any(outcome.accepted for outcome in outcomes):
-        watch('fitting the drives to each other', 0.0)
+        watch('aligning the drives with each other', 0.0)
         outcomes, fitted = _fitted(outcomes, parameters)
     rows = zip(drives.drives, odometry, outcomes, fitted, told, strict=True)
     for number, (drive, poses, outcome, fits, known) in enumerate(rows, 1):
@@ -176,7 +178,7 @@ def _told(
 ) -> dict[str, Estimate]:
     if not outcome.accepted or not outcome.calibration:
         return {}
-    watch('what the drive tells of its odometry', 0.0)
+    watch('calibration of odometry', 0.0)
     readings, trajectory, stop = drive.associator.readings, outcome.trajectory, np.zeros(1, np.uint8)
     if outcome.stretch is not None:
         # wheels say nothing of what lies beyond a jump
@@ -214,7 +216,9 @@ def _fitted(outcomes: list[Refinement], parameters: Parameters) -> tuple[list[Re
             there = readings_moved(outcome.readings, begin, found.begin)
             out[k] = replace(outcome, trajectory=trajectory, readings=there)
             x, y, yaw = relative(begin, found.begin).tolist()
-            words[k] = f'turned by {math.degrees(yaw):+.1f}° and moved by {math.hypot(x, y):.2f} m to fit the others'
+            words[k] = (
+                f'turned by {math.degrees(yaw):+.1f}° and moved by {math.hypot(x, y):.2f} m to align with the others'
+            )
         placed.append(k)
     return out, words
 

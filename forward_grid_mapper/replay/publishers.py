@@ -125,7 +125,7 @@ class Publishers:
                 # DDS waits for space in the history for a tenth of a second only
                 if time.monotonic() > deadline:
                     raise InputError(
-                        f'subscribers of {topic} have taken nothing for {PATIENCE:.0f} s ({error})'
+                        f'subscribers of {topic} have received nothing for {PATIENCE:.0f} s ({error})'
                     ) from error
 
     def publish_latched(self, topic: str, **fields: Any) -> None:
@@ -173,7 +173,7 @@ class Publishers:
             if not waiting:
                 return
             if time.monotonic() > deadline:
-                raise InputError(f'subscribers of {", ".join(waiting)} acknowledge nothing since {PATIENCE:.0f} s')
+                raise InputError(f'subscribers of {", ".join(waiting)} have acknowledged nothing for {PATIENCE:.0f} s')
             self._stop.wait(0.05)
 
     def finish(self) -> None:
@@ -202,7 +202,7 @@ class Publishers:
             if other.topic_type != msgtype:
                 return f'{other.node_name} expects {other.topic_type} there instead of {msgtype}'
         if found:
-            return f'{found[0].node_name} wants it reliable; leave out --best-effort'
+            return f'{found[0].node_name} requests reliable; leave out --best-effort'
         ours = {publisher.topic_name for publisher in self._publishers.values()}
         elsewhere = [
             other
@@ -210,8 +210,8 @@ class Publishers:
             if msgtype in types and other not in ours and self._node.count_subscribers(other)
         ]
         if elsewhere:
-            return f'{msgtype} is listened to on {", ".join(elsewhere)}'
-        return f'nobody listens to {msgtype} on any topic'
+            return f'{msgtype} has subscribers on {", ".join(elsewhere)}'
+        return f'no node subscribes to {msgtype} on any topic'
 
 
 def renamed(topics: Mapping[str, str], remaps: Sequence[str]) -> dict[str, str]:
@@ -236,10 +236,12 @@ def renamed(topics: Mapping[str, str], remaps: Sequence[str]) -> dict[str, str]:
         if '/' in (old, new):
             raise ParameterError(f'--remap: {text!r} is not of the form OLD:=NEW, such as /sonar:=/robot/sonar')
         if old not in by_name:
-            raise ParameterError(f'--remap: {old} is not replayed; there are: {", ".join(sorted(by_name))}')
+            raise ParameterError(f'--remap: {old} is not replayed; replayed topics: {", ".join(sorted(by_name))}')
         names[by_name[old]] = new
     types: dict[str, str] = {}
     for topic, name in names.items():
         if types.setdefault(name, topics[topic]) != topics[topic]:
-            raise ParameterError(f'{name} would have messages of both {types[name]} and {topics[topic]}; see --remap')
+            raise ParameterError(
+                f'{name} would have messages of two types, {types[name]} and {topics[topic]}; see --remap'
+            )
     return names

@@ -107,8 +107,8 @@ class Cluster:
                 self._client = self._open.enter_context(Client(address, timeout=PATIENCE, set_as_default=False))
             except (OSError, ValueError, TimeoutError) as error:
                 raise ClusterError(
-                    f'no scheduler answers at {self._scheduler}: {error or "nothing came"}. Is the address right '
-                    f'(tcp://HOST:8786), and does "dask scheduler" run there?'
+                    f'no scheduler answers at {self._scheduler}: {error or "no response"}. Is the address right '
+                    '(tcp://HOST:8786), and does "dask scheduler" run there?'
                 ) from error
             if self._scheduler is None:
                 # for workers that come later, too
@@ -136,7 +136,7 @@ class Cluster:
         except ValueError as error:
             raise ClusterError(f'the workers do not have the packages of this machine: {error}') from error
         except ImportError as error:
-            raise ClusterError(f'a worker lacks what this machine has: {error}') from error
+            raise ClusterError(f'a worker lacks a package of this machine: {error}') from error
         limits = list(self._client.run(_memory_of).values())
         self.workers, self.memory = len(limits), min(filter(None, limits), default=0)
 
@@ -168,13 +168,13 @@ class Cluster:
                 except KilledWorker as error:
                     raise ClusterError(
                         f'{name} {number} ended its worker {SETTINGS["distributed.scheduler.allowed-failures"]} times '
-                        f'and more: its memory is not enough, most likely. Give more (--memory-per-worker), or '
-                        f'make tiles smaller (--tiles)'
+                        'and more: most likely it has too little memory. Give it more (--memory-per-worker), or make '
+                        'tiles smaller (--tiles)'
                     ) from error
                 except MemoryError as error:
                     raise ClusterError(
-                        f'{name} {number}: the memory of its worker is not enough; give more (--memory-per-worker), '
-                        f'or make tiles smaller (--tiles)'
+                        f'{name} {number}: its worker has too little memory; give it more (--memory-per-worker), or '
+                        'make tiles smaller (--tiles)'
                     ) from error
                 except OSError as error:
                     raise OutputError(f'{name} {number}: {error}') from error

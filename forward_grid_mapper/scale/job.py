@@ -118,8 +118,8 @@ def check_versions(wanted: Mapping[str, str]) -> None:
     wrong = [f'{name} {mine.get(name)}, not {value}' for name, value in wanted.items() if mine.get(name) != value]
     if wrong:
         raise ClusterError(
-            f'a worker on {platform.node()} has {"; ".join(wrong)}: install the same versions there, so that all tiles '
-            f'are made alike'
+            f'a worker on {platform.node()} has {"; ".join(wrong)}: install the same versions there, so that all '
+            'tiles are computed in the same way'
         )
 
 

@@ -85,14 +85,14 @@ class WorkFolder:
             if before != described:
                 differ = ', '.join(key for key in {**before, **described} if before.get(key) != described.get(key))
                 raise OutputError(
-                    f'{self.path} holds what was done of another job (they differ in {differ}): remove it, or choose '
-                    f'another folder with --work'
+                    f'{self.path} contains the work of another job (they differ in {differ}): remove it, or choose '
+                    'another folder with --work'
                 )
             return True
         with output_errors(self.root):
             self.root.mkdir(parents=True, exist_ok=True)
             if any(entry for entry in self.root.iterdir() if not entry.name.endswith(PARTIAL)):
-                raise OutputError(f'{self.path} is not empty, and holds no job; choose another folder with --work')
+                raise OutputError(f'{self.path} is not empty, and contains no job; choose another folder with --work')
         write_json(self.manifest, described)
         return False
 
@@ -139,9 +139,7 @@ def read_json(path: Path) -> dict[str, Any]:
     try:
         found: dict[str, Any] = json.loads(path.read_text(encoding='utf-8'))
     except (OSError, ValueError) as error:
-        raise OutputError(
-            f'{path} cannot be read ({error}); remove the work folder, and the job begins anew'
-        ) from error
+        raise OutputError(f'{path} cannot be read ({error}); remove the work folder to start the job again') from error
     return found
 
 

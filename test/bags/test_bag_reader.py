@@ -239,7 +239,7 @@ def test_a_log_that_cannot_be_read_where_it_is(tmp_path: Path, monkeypatch: pyte
     file = storage_file(bag)
     file.with_name(f'{file.name}-wal').write_bytes(b'7' * 100)
     monkeypatch.setattr(os, 'access', lambda path, mode: mode != os.W_OK)
-    with pytest.raises(BagError, match=r'messages in a log beside it, .*-wal, .* copy the bag to one, with all its'):
+    with pytest.raises(BagError, match=r'messages in a log next to it, .*-wal, .* copy the bag to one, with all its'):
         read_all(bag)
 
 

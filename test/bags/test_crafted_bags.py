@@ -458,7 +458,7 @@ def test_pipes_sockets_and_devices(tmp_path: Path) -> None:
         if name == 'metadata.yaml':
             assert count == 2 * COUNT, 'the only file will do'
         else:
-            assert count == -1 and str(file) in said and 'no regular file' in said
+            assert count == -1 and str(file) in said and 'not a regular file' in said
 
 
 # ---- metadata that say less usual things

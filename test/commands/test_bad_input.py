@@ -105,7 +105,7 @@ def test_a_bag_that_was_cut_off_is_mapped_as_far_as_it_goes(
     report = mapped(bag, tmp_path / 'maps', '-q')
     assert 0.2 * COUNT < report['counts']['accepted'] < 0.8 * COUNT
     (warning,) = (w for w in report['warnings'] if 'cut off' in w)
-    assert 'what was intact was read' in warning and 'repair it with' in warning
+    assert 'the intact part was read' in warning and 'repair it with' in warning
     assert f'process_bag: warning: {warning}' in capsys.readouterr().err
     assert 'WARNINGS' in (tmp_path / 'maps' / 'report.txt').read_text('utf-8')
 
@@ -130,7 +130,7 @@ def test_a_bag_of_which_nothing_is_left(tmp_path: Path, capsys: pytest.CaptureFi
 
 def test_no_range(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     said = refused_drive(capsys, tmp_path, tape()._replace(ranges=[]))
-    assert 'no sensor_msgs/Range' in said and 'LaserScan, PointCloud and others are not read' in said
+    assert 'no sensor_msgs/Range' in said and 'LaserScan, PointCloud and other types are not read' in said
     assert '/odom: ' in said and '/tf_static: ' in said
 
 
@@ -222,7 +222,7 @@ def test_odometry_that_does_not_name_the_robot(tmp_path: Path, capsys: pytest.Ca
 
 def test_stamps_that_nobody_filled_in(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     said = refused_drive(capsys, tmp_path, tape().with_ranges(stamp=0))
-    assert f'{COUNT} zero_stamp (header.stamp is 0: have the driver fill it in)' in said
+    assert f'{COUNT} zero_stamp (header.stamp is 0: set it in the driver)' in said
 
 
 def test_one_frame_without_a_pose_costs_only_its_readings(tmp_path: Path) -> None:
@@ -366,10 +366,10 @@ def test_a_field_of_view_that_cannot_be(tmp_path: Path, capsys: pytest.CaptureFi
 @pytest.mark.parametrize(
     ('changes', 'reason', 'words'),
     [
-        ({'range': math.nan}, 'nan_range', 'not a number; a driver that means "no echo" should send +inf'),
+        ({'range': math.nan}, 'nan_range', 'not a number; a driver should send +inf if there is no echo'),
         ({'range': -math.inf}, 'too_near', '-inf'),
         ({'range': 0.0}, 'below_min_range', 'set the parameter invalid_range to no_echo'),
-        ({'range': 0.0, 'min_range': 0.0}, 'too_near', 'a driver that means "no echo" should send +inf'),
+        ({'range': 0.0, 'min_range': 0.0}, 'too_near', 'a driver should send +inf if there is no echo'),
         ({'max_range': math.inf}, 'bad_limits', 'not finite'),
         ({'max_range': 0.0}, 'bad_limits', 'max_range'),
         ({'min_range': -1.0}, 'bad_limits', 'negative'),

@@ -189,5 +189,5 @@ def test_a_folder_that_came_up_meanwhile(
     write = process_bag.write_results
     monkeypatch.setattr(process_bag, 'write_results', meanwhile)
     assert code_of(process_bag.main, bag, '-o', tmp_path / 'maps') == 1
-    assert 'exists by now' in capsys.readouterr().err
+    assert 'has been created meanwhile' in capsys.readouterr().err
     assert [path.name for path in tmp_path.rglob('*')] == ['maps', 'mine.txt']

@@ -320,7 +320,7 @@ def test_quiet_says_once_that_it_compiles(monkeypatch: pytest.MonkeyPatch) -> No
     with Ticker(quiet=True, stream=stream) as ticker:
         ticker.say('one')
         with compiling_begun():
-            wait_until_shown(stream, 'compiling kernels, which takes half a minute once\n')
+            wait_until_shown(stream, 'compiling kernels; this takes half a minute and is done once\n')
             ticker.say('two')
         with compiling_begun():
             ticker.say('three')

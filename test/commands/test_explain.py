@@ -80,9 +80,9 @@ def test_a_cell_behind_a_wall_says_so(maps: Path, capsys: pytest.CaptureFixture[
             said[part] = capsys.readouterr().out
         if len(said) == 3:
             break
-    assert 'a wall stands in the way of all of these' in said['all'] and 'too little' not in said['all']
-    assert re.search(r'too little is known.*; a wall stands in the way of \d+ of these', said['some'])
-    assert 'too little is known' in said['none'] and 'in the way' not in said['none']
+    assert 'a wall blocks all of these' in said['all'] and 'not enough evidence' not in said['all']
+    assert re.search(r'not enough evidence.*; a wall blocks \d+ of these', said['some'])
+    assert 'not enough evidence' in said['none'] and 'a wall blocks' not in said['none']
 
 
 def test_readings_are_kept_as_they_were(maps: Path) -> None:
@@ -146,7 +146,7 @@ def test_folders_without_maps_or_readings_are_named(
     assert code_of(explain.main, tmp_path, 0, 0) == 1
     said = capsys.readouterr().err
     assert 'readings.npz does not exist' in said and 'without --workers' in said
-    for content, reason in ((b'PK\3\4nothing', 'is damaged'), (None, 'is not of the maps beside it')):
+    for content, reason in ((b'PK\3\4nothing', 'is damaged'), (None, 'does not belong to the maps next to it')):
         if content is None:
             with np.load(maps / 'readings.npz', allow_pickle=False) as data:
                 np.savez(tmp_path / 'readings.npz', **{**data, 'log_likelihood': data['log_likelihood'] + 1e-6})

@@ -108,7 +108,7 @@ def test_a_part_and_several_drives(tmp_path: Path) -> None:
         ('stamp,x,y,yaw\n', 'has no pose'),
         ('1.0 2 3\n', 'line 1: not the eight numbers'),
         ('stamp,x,y\n1,2,3\n', 'has no column yaw'),
-        ('stamp,x,y,yaw\n1700000000000000000,2,3,0\n', 'call their column stamp_ns'),
+        ('stamp,x,y,yaw\n1700000000000000000,2,3,0\n', 'name the column stamp_ns'),
         ('stamp,x,y,yaw\n5,2,3,0\n6,2,3,0\n', 'the stamps do not overlap: Range has'),
     ],
 )

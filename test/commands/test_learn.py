@@ -115,7 +115,7 @@ def test_values_that_held_out_readings_speak_against_are_not_handed_out(
 
 
 def test_what_was_not_judged_is_told(bag: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    told = 'no readings were held out to judge the learned values by'
+    told = 'no readings were held out to test the learned values'
     assert told in ' '.join(said(capsys, bag, '--rounds', 1, '--keep-going').split())
     assert told not in ' '.join(said(capsys, bag, '--rounds', 1).split())
 
@@ -160,7 +160,7 @@ def test_a_place_without_permission_is_told_of_before_the_work(
     monkeypatch.setattr(os, 'access', lambda path, mode: mode == os.F_OK)
     monkeypatch.setattr(learn, 'read_drives', lambda *arguments: pytest.fail('it began to work'))
     message = said(capsys, bag, '-o', tmp_path / 'x.yaml', code=1)
-    assert message.endswith(f'{tmp_path} may not be written to; choose another folder with --output\n')
+    assert message.endswith(f'{tmp_path} is not writable; choose another folder with --output\n')
 
 
 def test_a_bad_request(bag: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -194,4 +194,4 @@ def test_input_that_is_wrong_is_told_of(tmp_path: Path, capsys: pytest.CaptureFi
     bag = write_tape(tmp_path / 'bag', wrong._replace(ranges=[m for m in wrong.ranges for _ in range(2)]))
     text = ' '.join(said(capsys, bag, '--rounds', 1).split())
     assert 'are copies of others' in text and 'recorded twice' in text
-    assert 'the sensors seem to be turned by 180 degrees; check the poses of the sensors' in text
+    assert 'the sensors seem to be rotated by 180 degrees; check the poses of the sensors' in text

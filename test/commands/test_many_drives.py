@@ -151,7 +151,7 @@ def test_max_readings_bounds_all_drives_together(days: Path, tmp_path: Path, bou
     report = mapped_thinned(days, tmp_path / 'maps', bound)
     assert report['result']['readings'] == bound < report['counts']['accepted']
     (note,) = report['warnings']
-    assert note.startswith(f'EM maps from {bound} of {report["counts"]["accepted"]} readings')
+    assert note.startswith(f'EM used {bound} of {report["counts"]["accepted"]} readings')
     whole = mapped(days, tmp_path / 'whole')
     assert report['counts'] == whole['counts']
     np.testing.assert_array_equal(arrays_in(tmp_path / 'maps')['live_map'], arrays_in(tmp_path / 'whole')['live_map'])
@@ -267,7 +267,7 @@ def framed(number: int, frame: str) -> Tape:
 def test_drives_of_different_frames_are_refused(days: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     other = write_tape(tmp_path / 'other', framed(2, 'warehouse'))
     said = refusal(capsys, tmp_path, days / 'day_0', days / 'day_1', other, '-o', tmp_path / 'maps')
-    assert 'not in one map frame' in said and f'warehouse: {other}' in said and f'leave out {other}' in said
+    assert 'not in the same map frame' in said and f'warehouse: {other}' in said and f'leave out {other}' in said
 
 
 def test_a_leading_slash_is_no_other_frame(days: Path, tmp_path: Path) -> None:
@@ -281,7 +281,7 @@ def test_a_sensor_that_sits_elsewhere_is_told(days: Path, tmp_path: Path) -> Non
     moved = [(frame, pose._replace(x=pose.x + 0.05)), *rest]
     other = write_tape(tmp_path / 'other', drive._replace(extrinsics=moved))
     (warning,) = read(days / 'day_0', days / 'day_1', other).source['warnings']
-    assert f'{frame} sits on the robot at x = {pose.x + 0.05:.2f} m' in warning
+    assert f'{frame} is mounted on the robot at x = {pose.x + 0.05:.2f} m' in warning
     assert f'in {other}, and at x = {pose.x:.2f} m' in warning and f'--sensor {frame}=x,y,yaw' in warning
 
 
@@ -293,7 +293,7 @@ def test_robots_of_different_frames_may_differ(days: Path, tmp_path: Path) -> No
     drive = drive._replace(extrinsics=moved, odometry=odometry)
     sensors = dict(moved)
     drives = read_drives([days / 'day_0', write_tape(tmp_path / 'other', drive)], Parameters(), sensors)
-    assert not any('sits on the robot' in warning for warning in drives.source['warnings'])
+    assert not any('is mounted on the robot' in warning for warning in drives.source['warnings'])
 
 
 def test_a_sensor_of_other_limits_is_told(days: Path, tmp_path: Path) -> None:
@@ -302,7 +302,7 @@ def test_a_sensor_of_other_limits_is_told(days: Path, tmp_path: Path) -> None:
     ranges = [m._replace(field_of_view=2 * m.field_of_view) if m.frame_id == frame else m for m in drive.ranges]
     other = write_tape(tmp_path / 'other', drive._replace(ranges=ranges))
     (warning,) = read(days / 'day_0', days / 'day_1', other).source['warnings']
-    assert warning.startswith(f'{frame} reaches') and str(other) in warning and 'field_of_view' in warning
+    assert warning.startswith(f'{frame} has a range of') and str(other) in warning and 'field_of_view' in warning
 
 
 def test_a_sensor_that_is_missing_is_told(days: Path, tmp_path: Path) -> None:
@@ -362,7 +362,7 @@ def test_lines_of_one_drive_are_told_from_other_drives() -> None:
 
 def test_a_pattern_that_fits_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     said = refusal(capsys, tmp_path, f'{tmp_path}/monday_*', '-o', tmp_path / 'maps')
-    assert f'no file or folder fits {tmp_path}/monday_*' in said
+    assert f'no file or folder matches {tmp_path}/monday_*' in said
 
 
 def test_files_of_one_bag_without_metadata_are_no_drives(

@@ -162,10 +162,10 @@ NODE = [row for row in TABLE if row.group == 'node']
 def test_parameters_of_the_node_cannot_be_set(name: str, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     value = {float: '2.5', bool: 'true', int: '3'}.get(next(row.type for row in NODE if row.name == name), 'reliable')
     options = process_bag.parser().parse_args(['bag', '--set', f'{name}={value}'])
-    with pytest.raises(ParameterError, match=f'--set {name}: only the node has this parameter'):
+    with pytest.raises(ParameterError, match=f'--set {name}: this parameter is only for the node'):
         chosen_parameters(options)
     assert code_of(process_bag.main, tmp_path / 'absent', '--set', f'{name}={value}', '-o', tmp_path / 'maps') == 1
-    assert f'--set {name}: only the node' in capsys.readouterr().err
+    assert f'--set {name}: this parameter is only for the node' in capsys.readouterr().err
 
 
 def test_parameters_that_only_the_node_has_are_told_of(
@@ -176,7 +176,7 @@ def test_parameters_that_only_the_node_has_are_told_of(
     file.write_text('/**: {ros__parameters: {map_frame: map, publish_rate: 5.0, odom_topic: odom, p_hit: 0.6}}')
     path = write_tape(tmp_path / 'recorded', tape())
     report = mapped(path, tmp_path / 'maps', '--params', file, '-q')
-    (warning,) = (w for w in report['warnings'] if 'only the node' in w)
+    (warning,) = (w for w in report['warnings'] if 'only for the node' in w)
     assert str(file) in warning and "map_frame (the maps are in odometry's frame)" in warning
     assert 'publish_rate' in warning and 'odom_topic' not in warning, 'a default changes nothing'
     assert 'p_hit' not in warning

@@ -371,7 +371,7 @@ def test_poses_that_the_readings_contradict_are_told_of(tmp_path: Path) -> None:
     right, wrong = backwards()
     bag = write_tape(tmp_path / 'bag', wrong)
     report = mapped(bag, tmp_path / 'maps')
-    expected = 'the sensors seem to be turned by 180 degrees; check the poses of the sensors on the robot'
+    expected = 'the sensors seem to be rotated by 180 degrees; check the poses of the sensors on the robot'
     assert sum(w.startswith(expected) for w in report['warnings']) == 1
     assert expected in ' '.join((tmp_path / 'maps' / 'report.txt').read_text('utf-8').split())
     for frame, pose in wrong.extrinsics:

@@ -88,7 +88,7 @@ def test_without_the_option_nothing_is_said(tmp_path: Path) -> None:
     write_tape(tmp_path / 'bag', tape())
     report = mapped(tmp_path / 'bag', tmp_path / 'maps', '--set', 'odometry_noise=2deg')
     assert 'trajectory' not in report['input']
-    assert 'odometry_noise has an effect with --refine-poses alone, which is not given' in report['warnings']
+    assert 'odometry_noise has an effect only with --refine-poses, which is not given' in report['warnings']
     assert code_of(process_bag.main, tmp_path / 'bag', '-o', tmp_path / 'maps', '--refine-poses') != 0
 
 
@@ -202,7 +202,7 @@ def test_a_journal_is_refined_as_the_bag_is(tmp_path: Path, kept: Kept) -> None:
     at = np.stack([np.interp(b[:, 0], a[:, 0], a[:, k]) for k in (1, 2)], 1)
     # about its begin a trajectory may swing a little
     assert rms_after_alignment(b[:, 1:3], at) < 0.1
-    assert any('they tell the odometry' in warning for warning in of_journal['warnings'])
+    assert any('they are used to compute odometry' in warning for warning in of_journal['warnings'])
 
 
 def test_a_journal_without_poses_of_the_sensors_stays(tmp_path: Path, kept: Kept) -> None:

@@ -95,7 +95,7 @@ def test_in_the_middle_of_the_work(tmp_path: Path, number: signal.Signals) -> No
     done = interrupted(tmp_path, 'matplotlib', number, 'process_bag', bag, '-q', '-o', tmp_path / 'new' / 'maps')
     assert (done.returncode, done.stdout) == (128 + number, '')
     # whoever runs this test alone has no kernels yet
-    said = done.stderr.removeprefix('compiling kernels, which takes half a minute once\n')
+    said = done.stderr.removeprefix('compiling kernels; this takes half a minute and is done once\n')
     assert said == 'process_bag: cancelled; nothing was written\n'
     assert everything_in(tmp_path) == before
 

@@ -103,9 +103,14 @@ def test_wrong_options(
 @pytest.mark.parametrize(
     ('world', 'option', 'work', 'advice'),
     [
-        ('door', '--seen', 'door_drive', 'so long a drive; lower --seen'),
-        ('corridor', '--passes', 'corridor_drive', 'so long a drive; lower --passes'),
-        ('campus', '--buildings', 'campus_world', 'lower --buildings or --readings, or make fewer drives at once'),
+        ('door', '--seen', 'door_drive', 'a drive of this length; lower --seen'),
+        ('corridor', '--passes', 'corridor_drive', 'a drive of this length; lower --passes'),
+        (
+            'campus',
+            '--buildings',
+            'campus_world',
+            'lower --buildings or --readings, or simulate fewer drives in parallel',
+        ),
     ],
 )
 def test_what_the_memory_does_not_hold(
@@ -178,5 +183,5 @@ def test_a_campus_without_anything_in_it(tmp_path: Path, option: tuple[str, int]
 
 
 def test_a_process_that_is_ended_from_outside_is_told_of() -> None:
-    with pytest.raises(ClusterError, match=r'fewer drives at once \(--jobs\)'):
+    with pytest.raises(ClusterError, match=r'fewer drives in parallel \(--jobs\)'):
         list(simulate.at_once(os._exit, [1, 1], 2))

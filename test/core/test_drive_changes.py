@@ -46,7 +46,7 @@ def test_a_door_that_was_shut_in_one_drive_is_told(order: int) -> None:
         assert change.drive == (1 if order == 1 else 0)
         assert abs(change.x - DOOR[0]) < 0.5 and abs(change.y - DOOR[1]) < 0.8
     (warning, *_) = change_warnings(maps, ['monday', 'tuesday'])
-    assert warning.startswith('something stood at x = 5.') and 'The map shows the place free' in warning
+    assert warning.startswith('there was an obstacle at x = 5.') and 'The map is free there' in warning
 
 
 @pytest.mark.parametrize('ring', [False, True])

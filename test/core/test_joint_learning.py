@@ -63,7 +63,7 @@ def test_they_are_handed_out_on_request() -> None:
     learned = learn_jointly(corridor(1).readings, Parameters().varied(PLAIN), 2, keep_going=True)
     assert learned.accepted == 2
     assert learned.parameters.model == learned.rounds[2].model
-    assert 'written all the same' in walls_of(learned)[0]
+    assert 'written in any case' in walls_of(learned)[0]
     assert smooth_recall(learned.maps, corridor(1)) < 0.5
 
 
@@ -121,14 +121,14 @@ def test_weak_values_are_called_so() -> None:
     readings.half_angle[:] = 0.1
     learned = learn_jointly(readings, Parameters().varied(PLAIN), 2, keep_going=True)
     told = ' '.join(learned.warnings)
-    assert 'inform p_hit; take it as a guess' in told
-    assert 'had not come to rest' in learn_jointly(readings, Parameters().varied(PLAIN), 1, keep_going=True).warnings[0]
+    assert 'inform p_hit; it is only a rough estimate' in told
+    assert 'had not converged' in learn_jointly(readings, Parameters().varied(PLAIN), 1, keep_going=True).warnings[0]
 
 
 def test_much_chance_is_called_so() -> None:
     recording = door_drive(3, NoiseModel(sigma=0.05, p_random=0.6), 0)
     learned = learn_jointly(recording.readings, Parameters().varied({**PLAIN, 'prior': 0.05}), 3)
-    assert any('more than a sonar makes up by itself' in warning for warning in learned.warnings)
+    assert any('more than the random measurements of a working sonar' in warning for warning in learned.warnings)
 
 
 def test_no_readings() -> None:

@@ -35,22 +35,22 @@ def test_what_is_told_comes_back(tmp_path: Path) -> None:
 def test_what_is_not_told_is_left_out_in_words() -> None:
     text = calibration_text({'bias': TOLD['bias']}, 'two\nlines')
     assert list(yaml.safe_load(text)) == ['turn_per_metre_deg']
-    assert '# travel_factor: not known; this drive does not tell it' in text
+    assert '# travel_factor: not known; this drive does not determine it' in text
     assert calibration_text({}, 'monday') == ''
 
 
 @pytest.mark.parametrize(
     ('text', 'said'),
     [
-        ('', 'holds no calibration'),
-        ('- 1.0', 'holds no calibration'),
+        ('', 'contains no calibration'),
+        ('- 1.0', 'contains no calibration'),
         ('travel_factor: [', 'is not valid YAML'),
-        ('travel: 1.0', "'travel' is none of travel_factor"),
+        ('travel: 1.0', "'travel' is not one of travel_factor"),
         ('travel_factor: fast', "'fast', not a finite number"),
         ('travel_factor: true', 'not a finite number'),
         ('travel_factor: .nan', 'not a finite number'),
-        ('travel_factor: 0.3', 'which no calibration of wheels is'),
-        ('turn_per_metre_deg: 90', 'which no calibration of wheels is'),
+        ('travel_factor: 0.3', 'which is not possible for a calibration of wheels'),
+        ('turn_per_metre_deg: 90', 'which is not possible for a calibration of wheels'),
     ],
 )
 def test_what_is_wrong_is_told_with_the_file(tmp_path: Path, text: str, said: str) -> None:

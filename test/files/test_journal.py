@@ -164,7 +164,7 @@ def test_a_file_that_goes_is_noticed_and_begun_anew(tmp_path: Path, monkeypatch:
         os.truncate(log_of(path), 5000)
     # also while nothing is put
     until(lambda: journal.gone)
-    assert 'a new file begins with what is in memory' in said[0]
+    assert 'the readings in memory are written to a new file' in said[0]
     assert journal.notice == said[0]
     # what came before it was told
     journal.put(made(30, 10), FRAMES)
@@ -247,7 +247,7 @@ def test_what_waits_for_a_disk_is_bounded(tmp_path: Path, monkeypatch: pytest.Mo
             journal.put(made(10 * k, 10, (f'sonar {k}',)), FRAMES)
         assert journal.unwritten <= 1010
         assert journal.lost >= 4990 - 1010 - 100
-        assert any('lost from here on' in text for text in said)
+        assert any('lost from now on' in text for text in said)
     until(lambda: not journal.unwritten)
     written(journal, made(5000, 10, ('sonar 499',)))
     journal.close()
@@ -288,7 +288,7 @@ def test_without_a_free_descriptor_nothing_is_written_twice(tmp_path: Path, monk
         resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
     until(lambda: not journal.unwritten)
     journal.close()
-    assert any('does not keep what is written' in text for text in said)
+    assert any('does not sync written data' in text for text in said)
     assert numbers(drives(tmp_path)[0])[0] == list(range(500))
     assert numbers(drives(tmp_path)[1])[0] == list(range(500, 510))
 
@@ -398,7 +398,7 @@ def test_a_limit_on_the_size_of_files_is_a_full_disk(tmp_path: Path) -> None:
         text=True,
         env={**os.environ, 'PYTHONUNBUFFERED': '1'},
     )
-    assert 'cannot be written: disk I/O error; mapping goes on' in line_of(process)
+    assert 'cannot be written: disk I/O error; mapping continues' in line_of(process)
     time.sleep(0.5)
     assert process.poll() is None
     process.kill()
@@ -466,7 +466,7 @@ def test_a_damaged_file_is_left_as_it_is_and_its_readings_carried_over(tmp_path:
         assert not said
     else:
         assert 'drive_0007.journal' in said[0]
-        assert 'the journal goes on in drive_0008.journal' in said[0]
+        assert 'the journal continues in drive_0008.journal' in said[0]
         assert journal.notice == said[-1]
     written(journal, made(1000, 10))
     journal.close()

@@ -146,22 +146,22 @@ def test_a_database_with_other_tables_is_refused(path: Path, tmp_path: Path, sql
     journal.close()
     assert journal.path.name == 'drive_0002.journal'
     assert path.read_bytes() == before
-    assert 'the journal goes on in drive_0002.journal' in said[0]
+    assert 'the journal continues in drive_0002.journal' in said[0]
     assert numbers(journal.path)[0] == list(range(10))
 
 
 @pytest.mark.parametrize(
     ('sql', 'said', 'count'),
     [
-        ("UPDATE readings SET rows = 'text'", 'hold no readings', 0),
-        ('UPDATE readings SET rows = NULL', 'hold no readings', 0),
-        ('UPDATE readings SET rows = 1.5', 'hold no readings', 0),
-        ("UPDATE readings SET rows = x''", 'hold no readings', 0),
-        ('UPDATE readings SET rows = zeroblob(67)', 'hold no readings', 0),
+        ("UPDATE readings SET rows = 'text'", 'contain no readings', 0),
+        ('UPDATE readings SET rows = NULL', 'contain no readings', 0),
+        ('UPDATE readings SET rows = 1.5', 'contain no readings', 0),
+        ("UPDATE readings SET rows = x''", 'contain no readings', 0),
+        ('UPDATE readings SET rows = zeroblob(67)', 'contain no readings', 0),
         ('UPDATE readings SET rows = zeroblob(6800)', '100 readings are left out', 0),
-        ('UPDATE readings SET rows = zeroblob(68000000)', 'hold no readings', 0),
-        ("UPDATE readings SET rows = replace(hex(zeroblob(50000000)), '0', 'a')", 'hold no readings', 0),
-        ('UPDATE readings SET number = number - 1 WHERE number = 10', 'would be there twice', 10),
+        ('UPDATE readings SET rows = zeroblob(68000000)', 'contain no readings', 0),
+        ("UPDATE readings SET rows = replace(hex(zeroblob(50000000)), '0', 'a')", 'contain no readings', 0),
+        ('UPDATE readings SET number = number - 1 WHERE number = 10', 'are duplicates', 10),
         ('UPDATE readings SET number = -5 WHERE number = 0', 'out of order', 0),
         ('UPDATE readings SET number = 9223372036854775807 WHERE number = 10', 'out of order', 10),
         ('UPDATE readings SET number = 1000 WHERE number = 10', '', 20),
@@ -169,7 +169,7 @@ def test_a_database_with_other_tables_is_refused(path: Path, tmp_path: Path, sql
         ("UPDATE sensors SET name = 'text'", 'name of a sensor is damaged', 0),
         ("UPDATE sensors SET name = x'ff'", 'name of a sensor is damaged', 0),
         ('UPDATE sensors SET name = zeroblob(50000000)', 'name of a sensor is damaged', 0),
-        ('UPDATE sensors SET number = -1 WHERE number = 0', 'besides readings cannot be read', 0),
+        ('UPDATE sensors SET number = -1 WHERE number = 0', 'other than readings cannot be read', 0),
         ('UPDATE sensors SET number = 4294967296 WHERE number = 0', 'name of a sensor is damaged', 10),
         ("UPDATE drive SET parameters = x'5b5d'", 'parameters of the node are damaged', 20),
         ("UPDATE drive SET parameters = x'ff'", 'parameters of the node are damaged', 20),
@@ -279,7 +279,7 @@ def test_a_schema_without_end(path: Path) -> None:
         },
     )
     result = examined(path)
-    assert 'to read it takes more steps than it has bytes' in result['error']
+    assert 'reading it takes more steps than it has bytes' in result['error']
     assert result['count'] == 0
 
 
@@ -301,7 +301,7 @@ def test_rows_that_share_their_bytes(path: Path) -> None:
     cells = [struct.pack('>I', number) + varint((each * (k + 1) - 1) * 10_000) for k, number in enumerate(leaves)]
     replaced(path, {at: page(5, cells[:-1], first + 399), **leaves})
     result = examined(path)
-    assert 'hold more than the file has' in result['harm']
+    assert 'contain more than the file' in result['harm']
     assert 10_000 <= result['count'] < 2 * path.stat().st_size // ROW.itemsize
 
 

@@ -53,7 +53,7 @@ def test_fills_an_empty_folder_in_place(tmp_path: Path, monkeypatch: pytest.Monk
 
 def test_refuses_a_folder_with_something_in_it(tmp_path: Path) -> None:
     (tmp_path / 'mine.txt').write_text('mine')
-    with pytest.raises(OutputError, match='choose another with -o'):
+    with pytest.raises(OutputError, match='choose another folder with -o'):
         fill(tmp_path)
     assert names_in(tmp_path) == ['mine.txt']
 
@@ -67,7 +67,7 @@ def test_refuses_a_file(tmp_path: Path) -> None:
 
 
 def test_refuses_a_folder_that_came_up_meanwhile(tmp_path: Path) -> None:
-    with pytest.raises(OutputError, match='exists by now'), output_folder(tmp_path / 'maps') as folder:
+    with pytest.raises(OutputError, match='has been created meanwhile'), output_folder(tmp_path / 'maps') as folder:
         (folder / 'a.txt').write_text('a')
         (tmp_path / 'maps').mkdir()
         (tmp_path / 'maps' / 'mine.txt').write_text('mine')
@@ -120,7 +120,7 @@ def test_a_folder_that_cannot_be_written_is_known_before(tmp_path: Path, monkeyp
     monkeypatch.setattr(
         os, 'access', lambda path, mode: there(path, mode) and (path, mode) != (tmp_path, os.W_OK | os.X_OK)
     )
-    assert unwritable(tmp_path / 'new') == f'{tmp_path} may not be written to'
+    assert unwritable(tmp_path / 'new') == f'{tmp_path} is not writable'
 
 
 def test_output_errors_name_the_file() -> None:

@@ -50,7 +50,7 @@ def test_a_header_alone_is_no_pose(tmp_path: Path) -> None:
         ('stamp,x,y,yaw\n1,2,3,0\n1,2,far,0\n', "line 3: no number for 'y'"),
         ('stamp,x,y,yaw\n1,2\n', "line 2: no number for 'y'"),
         ('stamp,x,y,yaw\n1,2,inf,0\n', "line 2: no number for 'y'"),
-        ('stamp,x,y,yaw\n1,2,3,180\n', 'if these are degrees, call the column yaw_deg'),
+        ('stamp,x,y,yaw\n1,2,3,180\n', 'if these are degrees, name the column yaw_deg'),
         ('stamp,x,y,qx,qy,qz,qw\n1,2,3,0,0,0,2\n', 'line 2: the quaternion is not normalised'),
         (f'stamp,x,y,yaw\n1,2,3,"{"0" * 200_000}"\n', 'is not CSV: field larger than field limit'),
     ],

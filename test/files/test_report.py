@@ -85,7 +85,7 @@ def test_text_tells_what_matters() -> None:
         '4.0 x 3.0 m: 40 x 30 cells of 0.1 m, corner (-2.00, -1.50)',
         '120 occupied, 816 free, 264 not observed',
         '-123.5 nats (-2.058 a reading)',
-        '-150.2 nats; -151.5 nats where the search ended, before post-processing\n',
+        '-150.2 nats; -151.5 nats at the end of the search, before post-processing\n',
         'NOT converged',
         'index 0.25, search 0.50; together 0.75',
         f'p_hit  0.3  (default {Parameters().model.p_hit})',
@@ -108,7 +108,7 @@ def test_a_broken_sensor_is_warned_of_and_in_the_table() -> None:
 
 def test_many_random_readings_point_to_drift_unless_a_trajectory_was_looked_for() -> None:
     maps = made_maps(readings=200)
-    hint = 'many, as where odometry drifts (refine_poses)'
+    hint = 'many, as with odometry that drifts (refine_poses)'
     for part, source, told in ((50, {}, True), (20, {}, False), (50, {'trajectory': {'refined': False}}, False)):
         some = dataclasses.replace(maps, unexplained=np.arange(200) < part)
         assert (hint in ' '.join(report_text(report_data(some, source)).split())) == told

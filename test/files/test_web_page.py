@@ -177,7 +177,7 @@ def test_the_page_is_used(tmp_path: Path, width: int, height: int) -> None:
     assert f'nats from {len(found.readings)} readings' in out['tip']
     assert out['rows'] == min(12, len(found.readings)) > 0
     assert ': occupied' in out['cell']
-    assert 'for the cell with its occupied neighbours' in out['cell']
+    assert 'for the cell together with its occupied neighbours' in out['cell']
     assert out['zoom'] == pytest.approx(1.5)
     assert out['pan'] == pytest.approx(50 / out['scale'])
     assert out['hash'].startswith('#x=')

@@ -53,7 +53,7 @@ def begun(inside: Callable[..., Inside], quick: Any, monkeypatch: pytest.MonkeyP
 def test_it_is_joined_where_nothing_came_since(begun: Begun) -> None:
     answer = begun.robot.begin(begun.em.run_em)
     refused = begun.robot.begin(begun.em.run_em)
-    assert 'EM runs already' in refused.sent[0][1], 'the one who called has asked for this run'
+    assert 'EM is already running' in refused.sent[0][1], 'the one who called has asked for this run'
     begun.end(answer)
     success, message = answer.sent[0]
     assert success and message.startswith('100 readings')
@@ -123,7 +123,7 @@ def test_a_run_that_was_asked_for_is_not_ended(
     robot.until(held.begun.is_set)
     robot.drive(60, 20)
     second = robot.begin(robot.node.em.run_em)
-    assert 'EM runs already' in second.sent[0][1]
+    assert 'EM is already running' in second.sent[0][1]
     assert not robot.node.em.run_by_itself()
     held.go_on.set()
     robot.until(lambda: first.sent)

@@ -115,7 +115,7 @@ def test_a_reset_says_that_it_was_the_reset(inside: Callable[..., Inside], monke
 
 def test_there_is_nothing_to_cancel(inside: Callable[..., Inside]) -> None:
     robot = inside().start()
-    assert robot.call(robot.node.em.cancel) == (False, 'EM does not run: there is nothing to cancel')
+    assert robot.call(robot.node.em.cancel) == (False, 'EM is not running: there is nothing to cancel')
 
 
 def test_maps_that_were_found_already_stay(inside: Callable[..., Inside], monkeypatch: pytest.MonkeyPatch) -> None:
@@ -137,7 +137,7 @@ def test_maps_that_were_found_already_stay(inside: Callable[..., Inside], monkey
     go_on.set()
     robot.until(lambda: first and cancelled)
     assert first[0][0] and node.em.maps is not None
-    assert cancelled == [(False, 'EM had found its maps before it could be cancelled; they are published')]
+    assert cancelled == [(False, 'EM ended before it could be cancelled; its maps are published')]
 
 
 def test_an_em_that_fails_by_itself_brings_the_map_back_too(

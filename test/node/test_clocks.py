@@ -102,7 +102,7 @@ def test_a_sensor_whose_clock_is_ahead_is_told_of_and_odometry_that_is_rare_is_n
     robot = taking()
     drive(robot, 6, -2.0, 'sonar')
     (fault,) = faults(robot)
-    assert fault.startswith('the stamps of sonar are 2.0 s ahead of those of odometry: where a clock is wrong')
+    assert fault.startswith('the stamps of sonar are 2.0 s ahead of those of odometry: if a clock is wrong')
     rare = taking()
     for k in range(200):
         if k % 20 == 0:

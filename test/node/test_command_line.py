@@ -37,7 +37,7 @@ def refused(domain: int, *arguments: str, **changes: str) -> tuple[int, str]:
         (['--ros-args', '-r', '__node:=1st'], 1, '-r __node:=1st is not a valid rule'),
         (['--ros-args', '-p', 'range_topics:=[]'], 1, 'a parameter has no value, or an empty list'),
         (['--ros-args', '-p', 'odom_topic:="a b"'], 1, "odom_topic: 'a b' is not a valid topic name"),
-        (['--ros-args', '-r', '~/ml_map:=/map', '-r', '~/live_map:=/map'], 1, '/map can have one map only'),
+        (['--ros-args', '-r', '~/ml_map:=/map', '-r', '~/live_map:=/map'], 1, '/map can have only one map'),
         (['--ros-args', '-p', 'journal:=~nobody_of_this_name/x'], 1, 'there is no user nobody_of_this_name'),
     ],
 )
@@ -64,13 +64,13 @@ def test_domains_that_there_are(number: str) -> None:
     ('arguments', 'expected'),
     [
         (['--hlep'], '--hlep is not known; did you mean --help?'),
-        (['bag.mcap'], 'bag.mcap is not known; ROS options come after --ros-args'),
+        (['bag.mcap'], 'bag.mcap is not known; ROS options must be after --ros-args'),
         (['resolution:=0.1'], 'resolution is a parameter: --ros-args -p resolution:=0.1'),
         (['-p', 'resolution:=0.1'], 'resolution is a parameter: --ros-args -p resolution:=0.1'),
         (['odom:=/wheels'], '--ros-args -r odom:=/wheels'),
         (['~/ml_map:=/map'], '--ros-args -r ~/ml_map:=/map'),
         (['__ns:=/robot1'], '--ros-args -r __ns:=/robot1'),
-        (['--params-file', 'x.yaml'], '--params-file comes after --ros-args: --ros-args --params-file x.yaml'),
+        (['--params-file', 'x.yaml'], '--params-file must be after --ros-args: --ros-args --params-file x.yaml'),
     ],
 )
 def test_arguments_that_ros_does_not_take(arguments: list[str], expected: str) -> None:
@@ -81,7 +81,7 @@ def test_arguments_that_ros_does_not_take(arguments: list[str], expected: str) -
     ('text', 'expected'),
     [
         ("['--remp', 'a:=b']", '--remp, a:=b: no such ROS option; did you mean --remap?'),
-        ("['resolution:=1']", 'resolution:=1 has to come after -p (a parameter) or -r'),
+        ("['resolution:=1']", 'resolution:=1 must be after -p (a parameter) or -r'),
         ('odd', 'odd: no such ROS option; known are --param,'),
     ],
 )
@@ -94,19 +94,19 @@ def test_options_that_ros_does_not_know(text: str, expected: str) -> None:
     [
         (
             "failed to initialize rcl: Couldn't parse remap rule: '-r foo'. Error: x, at /a/b.c:1, at /c/d.c:22",
-            '-r foo is not a valid rule: it takes -r OLD:=NEW',
+            '-r foo is not a valid rule: use -r OLD:=NEW',
         ),
         (
             "failed to initialize rcl: Couldn't parse parameter override rule: '-p foo'. Error: x, at /a/b.c:1",
-            '-p foo is not a valid parameter: it takes -p NAME:=VALUE',
+            '-p foo is not a valid parameter: use -p NAME:=VALUE',
         ),
         (
             "Couldn't parse parameter override rule: '-p sensors.a.pose:=[0,0.2,1]'. Error: x, at /a/b.c:1",
-            '-p sensors.a.pose:=[0,0.2,1] is not a valid parameter: write each number of a list with a point',
+            '-p sensors.a.pose:=[0,0.2,1] is not a valid parameter: write each number of a list with a decimal point',
         ),
         (
             "Couldn't parse parameter override rule: '-p sensors.a.pose:=[0.1,0.2'. Error: x, at /a/b.c:1",
-            '-p sensors.a.pose:=[0.1,0.2 is not a valid parameter: it takes -p NAME:=VALUE',
+            '-p sensors.a.pose:=[0.1,0.2 is not a valid parameter: use -p NAME:=VALUE',
         ),
         (
             "failed to initialize rcl: Couldn't parse params file: '--params-file x'. Error: cannot open, at /a/b.c:1",
@@ -124,11 +124,15 @@ def test_what_rclpy_says_is_told_without_its_sources(text: str, expected: str) -
     ('text', 'why', 'expected'),
     [
         ('mapper:\n  ros_parameters:\n    a: 1', 'Cannot have a value before', ': ros_parameters: did you mean ros__'),
-        ('p_hit: 0.6', 'Cannot have a value before ros__parameters at line 1', 'stand below /**: and ros__parameters:'),
+        (
+            'p_hit: 0.6',
+            'Cannot have a value before ros__parameters at line 1',
+            'must be below /**: and ros__parameters:',
+        ),
         (
             '/**:\n  ros__parameters:\n    sensors.a.pose: [0.1, 0, 0]',
             "Sequence should be of same type. Value type 'integer' do not belong at line_num 3",
-            'write each number of a list with a point',
+            'write each number of a list with a decimal point',
         ),
     ],
 )

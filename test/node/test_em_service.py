@@ -109,7 +109,7 @@ def test_time_in_which_kernels_are_compiled_is_told_apart(robot: EmRobot) -> Non
     robot.compiled.add('EM')
     robot.settle()
     message, spent = answer.sent[0][1], time.monotonic() - begin
-    assert message.endswith(' s in which kernels were compiled, as at the first start')
+    assert message.endswith(' s of compiling kernels, as at the first start')
     assert float(message.split(' in ')[1].split()[0]) < spent - 0.5
     quick = robot.run_em()
     robot.settle()
@@ -126,7 +126,11 @@ def test_kernels_of_the_trajectory_are_waited_for_where_one_is_found(make: Calla
 def test_a_second_call_is_refused_while_one_goes_on(held: EmRobot) -> None:
     first, second = held.run_em(), held.run_em()
     ((success, message),) = second.sent
-    assert not success and message.startswith('EM runs already (') and message.endswith('call again when it has ended')
+    assert (
+        not success
+        and message.startswith('EM is already running (')
+        and message.endswith('call run_em again when it has ended')
+    )
     held.begun().go_on.set()
     held.settle()
     assert first.sent[0][0] and len(held.searches) == 1
@@ -166,7 +170,7 @@ def test_a_run_by_itself_that_is_old_gives_way(held: EmRobot, why: str) -> None:
     answer = held.run_em()
     assert held.searches[0].cancelled and answer.sent == []
     held.until(lambda: len(held.searches) == 2)
-    assert held.em.last_run == 'the run that was begun after some way gave way to run_em'
+    assert held.em.last_run == 'the run that the node began by itself (refine_every) was replaced by run_em'
     assert waiting == [], 'it waits for the other run'
     held.begun().go_on.set()
     held.settle()
@@ -197,7 +201,7 @@ def test_who_waits_for_a_run_that_cannot_begin_is_told(held: EmRobot, monkeypatc
 
 def test_cancelling_is_answered_when_the_run_has_ended(held: EmRobot) -> None:
     ((success, message),) = held.cancel_em().sent
-    assert (success, message) == (False, 'EM does not run: there is nothing to cancel')
+    assert (success, message) == (False, 'EM is not running: there is nothing to cancel')
     answer = held.run_em()
     held.begun()
     cancelled = held.cancel_em()
@@ -219,7 +223,7 @@ def test_cancelling_too_late_says_so(held: EmRobot, monkeypatch: pytest.MonkeyPa
     cancelled = held.cancel_em()
     held.settle()
     assert answer.sent[0][0] and held.em.maps is not None
-    assert cancelled.sent == [(False, 'EM had found its maps before it could be cancelled; they are published')]
+    assert cancelled.sent == [(False, 'EM ended before it could be cancelled; its maps are published')]
 
 
 def test_who_goes_before_a_run_is_told_when_it_is_cancelled(held: EmRobot) -> None:
@@ -422,9 +426,9 @@ def test_closing_cancels_the_run(held: EmRobot) -> None:
 @pytest.mark.parametrize(
     ('received', 'rejected', 'said'),
     [
-        (0, {}, 'no Range message has come on /sonar, /left since'),
-        (7, {}, '7 readings have come, and wait for their poses'),
-        (1, {}, '1 reading has come, and waits for its pose'),
+        (0, {}, 'no Range message has been received on /sonar, /left since'),
+        (7, {}, '7 readings have been received, and wait for their poses'),
+        (1, {}, '1 reading has been received, and waits for its pose'),
         (9, {'nan_range': 2, 'below_min_range': 7}, '7 of 9 readings were rejected as below_min_range: the range is'),
     ],
 )
@@ -444,7 +448,7 @@ def test_why_there_is_nothing_to_map(
 
 def test_without_any_odometry_that_is_what_there_is_to_be_told(make: Callable[..., EmRobot]) -> None:
     for came, refused, said in (
-        (0, {}, 'no Odometry message has come on /wheels since the start or reset'),
+        (0, {}, 'no Odometry message has been received on /wheels since the start or reset'),
         (8, {'long_frame_id': 3, 'bad_pose': 5}, 'all 8 odometry messages were rejected as bad_pose: the pose is not'),
         (9, {'bad_pose': 5}, '6 of 9 readings were rejected as no_odometry: odometry, or its transform'),
     ):
@@ -480,12 +484,12 @@ def test_odometry_that_waits_for_a_localiser_is_not_called_missing(make: Callabl
 
 
 def test_a_call_that_waits_for_kernels_is_logged_as_such(robot: EmRobot) -> None:
-    said = 'run_em waits for kernels that are being compiled, as at the first start'
+    said = 'run_em waits for the compilation of kernels, as at the first start'
     robot.compiled.clear()
     robot.run_em()
     assert robot.node.warned == [said]
     # one that is refused does not wait
-    assert robot.run_em().sent[0][1].startswith('EM runs already')
+    assert robot.run_em().sent[0][1].startswith('EM is already running')
     assert robot.node.warned == [said]
     robot.compiled.add('EM')
     robot.settle()

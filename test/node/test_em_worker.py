@@ -53,7 +53,7 @@ def caller() -> Iterator[Caller]:
 
 @pytest.mark.parametrize(
     ('error', 'reported'),
-    [(MemoryError(), 'does not fit the memory'), (ValueError('odd'), "EM failed: ValueError('odd')")],
+    [(MemoryError(), 'does not fit into the memory'), (ValueError('odd'), "EM failed: ValueError('odd')")],
 )
 def test_a_run_that_fails_says_why_and_the_next_begins(
     monkeypatch: pytest.MonkeyPatch, caller: Caller, error: Exception, reported: str
@@ -223,7 +223,7 @@ def test_a_run_that_waits_for_kernels_can_be_cancelled() -> None:
     assert worker.start(Run(Mapper(Parameters()), Parameters(), lambda: READING), outcomes.append)
     assert waits.wait(60.0)
     assert worker.current is not None
-    assert 'waiting for kernels' in str(worker.current)
+    assert 'waiting for the compilation of kernels' in str(worker.current)
     worker.cancel()
     conclusions.get(timeout=60.0)()
     assert outcomes[0].message == 'EM was cancelled'

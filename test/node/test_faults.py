@@ -60,7 +60,7 @@ def test_callers_that_die_or_come_all_at_once(start: Any, robot: Robot, domain: 
         robot.until(call.done, 60.0, 'an answer')
     answers = [call.result() for call in calls]
     assert sum(answer.success for answer in answers) == 1
-    assert all('runs already' in answer.message for answer in answers if not answer.success)
+    assert all('already running' in answer.message for answer in answers if not answer.success)
     robot.until(lambda: em_state(robot) == 'idle', what='the last run has ended')
     with bystander(domain, 'call', '/forward_grid_mapper/run_em') as caller:
         assert line_of(caller) == 'called\n'
@@ -82,7 +82,7 @@ def test_memory_that_runs_out_fails_the_call_and_nothing_else(start: Any, robot:
     robot.sent = 4000
     robot.play(circle(0, 50))
     # the compiler takes more than the limit leaves
-    robot.until(lambda: robot.diagnostics.get('background', {}).get('message') == 'all is well', what='all is compiled')
+    robot.until(lambda: robot.diagnostics.get('background', {}).get('message') == 'no fault', what='all is compiled')
     free = memory(node, 'VmSize:')
     # enough for all that the node does, and less than EM takes at the least
     limit = memory(node, 'VmSize:') + (50 << 20)
@@ -91,7 +91,7 @@ def test_memory_that_runs_out_fails_the_call_and_nothing_else(start: Any, robot:
     assert not answer.success
     assert ' MB are free' in answer.message
     robot.play(circle(robot.sent, 50))
-    robot.until(lambda: accepted(robot) == robot.sent, what='mapping goes on')
+    robot.until(lambda: accepted(robot) == robot.sent, what='mapping continues')
     resource.prlimit(node.process.pid, resource.RLIMIT_AS, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
     answer = robot.call('run_em')
     assert answer.success
@@ -126,7 +126,7 @@ def test_a_subscriber_that_never_reads_stops_nobody(start: Any, robot: Robot, do
         for first in range(50, 250, 50):
             robot.play(circle(first, 50))
             robot.spin(0.2)
-        robot.until(lambda: accepted(robot) == 250, what='mapping goes on')
+        robot.until(lambda: accepted(robot) == 250, what='mapping continues')
         assert len(robot.maps['live_map']) > begin + 3
         assert float(robot.diagnostics['readings']['longest delay of a reading (ms)']) < 1000
         listener.send_signal(signal.SIGCONT)

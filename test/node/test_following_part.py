@@ -84,7 +84,7 @@ def test_what_there_is_is_followed_where_the_robot_has_moved(driving: Driving) -
     assert driving.corrections == 3 * [follower.correction]
     assert driving.part.values() == {'followed since the latest run': '3 windows, 2 places recognised'}
     follower.kept = True
-    assert 'the correction is kept' in driving.part.values()['followed since the latest run']
+    assert 'the last correction is kept' in driving.part.values()['followed since the latest run']
     assert driving.node.warned == []
 
 
@@ -111,7 +111,7 @@ def test_a_fault_ends_it_and_is_told(driving: Driving, error: BaseException, why
     driving.offer(HERE)
     driving.settle()
     assert why in driving.part.obstacle
-    assert 'is not followed any more' in driving.node.warned[-1] and why in driving.node.warned[-1]
+    assert 'is no longer followed' in driving.node.warned[-1] and why in driving.node.warned[-1]
     assert 'until the next run_em' in driving.node.warned[-1]
     assert f'; ended: {driving.part.obstacle}' in driving.part.values()['followed since the latest run']
     follower.error = None

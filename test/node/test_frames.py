@@ -301,7 +301,7 @@ def test_a_map_frame_without_its_transform_is_named(
     assert frame.fault() == '' and frame.found
     buffer.until = round(now * NANOSECONDS)
     drive(4)
-    assert "TF's transform from map (map_frame) to odom comes later than pose_timeout" in frame.fault()
+    assert "TF's transform from map (map_frame) to odom arrives later than pose_timeout" in frame.fault()
     # late as TF is, by a tenth of a second
     for _ in range(50):
         buffer.until = round(now * NANOSECONDS)

@@ -176,7 +176,9 @@ def test_topics_are_subscribed_to_once_each_and_left() -> None:
     assert intake.lost == 0
 
 
-@pytest.mark.parametrize(('reliability', 'remedy'), [('reliable', 'give it more time'), ('best_effort', 'network')])
+@pytest.mark.parametrize(
+    ('reliability', 'remedy'), [('reliable', 'or the load of the machine'), ('best_effort', 'network')]
+)
 def test_losses_are_warned_of_while_they_are_fresh_and_in_the_log_now_and_then(
     monkeypatch: pytest.MonkeyPatch, reliability: str, remedy: str
 ) -> None:

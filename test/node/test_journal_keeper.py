@@ -114,7 +114,7 @@ def test_what_is_new_goes_to_disk_and_comes_back(tmp_path: Path) -> None:
     assert len(again.associator.buffer) == 12
     assert (again.associator.map_frame, again.associator.base_frame) == ('odom', 'base_link')
     assert list(again.associator.path) == [(0.0, 1.0), (5.0, 1.0)]
-    assert '12 readings of an earlier run are back, in frame odom' in again.node.warned[0]
+    assert '12 readings of an earlier run are restored, in frame odom' in again.node.warned[0]
     assert again.values()['readings restored'] == '12'
     again.drive(12, 3)
     again.keeper.close()
@@ -125,7 +125,7 @@ def test_what_is_new_goes_to_disk_and_comes_back(tmp_path: Path) -> None:
 
 def test_a_new_journal_names_no_frame(tmp_path: Path) -> None:
     kept = Kept(tmp_path).start()
-    assert '0 readings of an earlier run are back, in frame (none yet)' in kept.node.warned[0]
+    assert '0 readings of an earlier run are restored, in frame (none yet)' in kept.node.warned[0]
     assert len(kept.node.warned) == 1
     kept.keeper.close()
 
@@ -137,7 +137,7 @@ def test_readings_that_do_not_fit_on_the_map_any_more_are_told_of(tmp_path: Path
     kept.keeper.close()
     again = Kept(tmp_path, max_cells=10_000).start()
     assert len(again.associator.buffer) < 10
-    assert 'of its readings do not fit on the map (max_cells, resolution)' in again.node.warned[1]
+    assert 'of its readings do not fit into the map (max_cells, resolution)' in again.node.warned[1]
     again.keeper.close()
 
 
@@ -228,7 +228,7 @@ def test_the_status_says_what_waits_and_what_is_lost(tmp_path: Path) -> None:
     assert journal is not None
     journal.lost = 7
     assert kept.status().level == WARN and kept.values()['readings lost'] == '7'
-    assert kept.status().message == '7 readings came while nothing could be written'
+    assert kept.status().message == '7 readings were received while nothing could be written'
     # what is so now goes before what was
     journal.trouble = 'the disk is broken'
     assert kept.status().message == 'the disk is broken'
@@ -251,7 +251,7 @@ def test_a_full_disk_at_the_start_does_not_keep_the_node_from_mapping(
     kept = Kept(tmp_path).start()
     kept.drive(0, 1)
     kept.keeper.take()
-    assert kept.node.warned == ['there is no journal: cannot be opened'] and kept.node.timers == []
+    assert kept.node.warned == ['no journal is kept: cannot be opened'] and kept.node.timers == []
     assert (kept.status().level, kept.status().message) == (WARN, 'cannot be opened')
     assert kept.values() == {'folder': str(tmp_path), 'readings restored': '0'}
     assert kept.keeper.reset() == ''

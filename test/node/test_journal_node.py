@@ -54,7 +54,7 @@ def test_a_node_that_is_killed_goes_on_where_it_was(
     rng = random.Random(4)
     for run in range(2):
         node = start(*options)
-        assert f'{sent} readings of an earlier run are back' in node.output
+        assert f'{sent} readings of an earlier run are restored' in node.output
         robot = Robot(domain)
         try:
             robot.meet()
@@ -99,7 +99,7 @@ def test_a_node_that_is_killed_goes_on_where_it_was(
         robot.close()
     assert node.stop() == 0
     node = start(*options)
-    assert '50 readings of an earlier run are back' in node.output
+    assert '50 readings of an earlier run are restored' in node.output
     # a node stopped in order leaves no log, and one that runs has one
     files = {path.name for path in folder.iterdir()}
     assert files - {'drive_0002.journal-wal'} == {'drive_0001.journal', 'drive_0002.journal', 'lock'}
@@ -122,12 +122,12 @@ def test_node_and_offline_keep_the_same_readings(start: Any, robot: Robot, tmp_p
     assert robot.call('run_em').message.startswith('300 readings')
     saved = Path(robot.call('save_maps').message.split(', ')[0]).parent
     warnings = json.loads((saved / 'report.json').read_text())['warnings']
-    assert any('EM maps from 300 of 1500 readings' in text for text in warnings)
-    assert not any('came after EM' in text for text in warnings)
+    assert any('EM used 300 of 1500 readings' in text for text in warnings)
+    assert not any('arrived after EM' in text for text in warnings)
     out = tmp_path / 'offline'
     assert process_bag([str(folder), '-o', str(out), '-q', '--set', 'max_readings=300']) == 0
     # a journal does not say where the sensors sit, so poses cannot be compared with the readings; these make no room
-    warnings = [text for text in warnings if 'with this undone' not in text]
+    warnings = [text for text in warnings if 'with this corrected' not in text]
     assert warnings == json.loads((out / 'report.json').read_text())['warnings']
     ours, offline = read_npz(saved / 'maps.npz'), read_npz(out / 'maps.npz')
     assert ours.grid == offline.grid
@@ -173,8 +173,8 @@ def test_a_journal_that_is_deleted_or_hostile_is_begun_anew(
     Path(f'{path}-wal').unlink(missing_ok=True)
     path.write_bytes(b'SQLite format 3\0' + bytes(range(256)) * 100)
     node = start(*options)
-    assert 'the journal goes on in drive_0003.journal' in node.output
-    assert '0 readings of an earlier run are back' in node.output
+    assert 'the journal continues in drive_0003.journal' in node.output
+    assert '0 readings of an earlier run are restored' in node.output
     # another one, since the first still counts the node that was killed among its subscribers
     other = Robot(domain)
     try:

@@ -115,8 +115,8 @@ def test_a_manager_starts_pauses_and_ends_it(start: Any, robot: Robot, manager: 
     robot.until(lambda: robot.diagnostics.get('readings', {}).get('message') == 'inactive: nothing is received')
     assert robot.range_out.get_subscription_count() == 0
     node.wait_for('kernels of the EM are ready')
-    node.wait_for('ready: the live map follows the readings; activate the node to have them received')
-    assert 'no Range message has come on /sonar' in robot.call('run_em').message
+    node.wait_for('ready: the live map is updated with the readings; activate the node to receive them')
+    assert 'no Range message has been received on /sonar' in robot.call('run_em').message
     assert manager.change(Transition.TRANSITION_ACTIVATE)
     robot.meet()
     robot.play(circle(0, 300))
@@ -175,7 +175,7 @@ def test_what_cannot_be_configured_is_refused_in_words(start: Any, robot: Robot,
     for _ in range(2):
         assert not manager.change(Transition.TRANSITION_CONFIGURE)
         assert manager.state() == State.PRIMARY_STATE_UNCONFIGURED
-    node.wait_for('/sonar cannot be a topic of Range and of odometry', 10.0)
+    node.wait_for('/sonar cannot be a topic of both Range and odometry', 10.0)
     assert not any(name.endswith('_map') for name in published(robot))
     assert 'Traceback' not in node.output
     assert node.stop() == 0

@@ -68,8 +68,8 @@ def test_what_the_middleware_drops_is_counted_and_warned_of(start: Any, robot: R
     assert received + lost == 5050
     assert lost > 1000
     assert robot.diagnostics['readings']['level'] != b'\x00'
-    assert 'were lost before this node could take them' in robot.diagnostics['readings']['message']
-    node.wait_for('were lost before this node could take them', 20.0)
+    assert 'were lost before this node received them' in robot.diagnostics['readings']['message']
+    node.wait_for('were lost before this node received them', 20.0)
 
 
 @pytest.mark.slow
@@ -81,7 +81,9 @@ def test_a_first_start_loses_nothing_and_shows_the_live_map_first(start: Any, ro
     readings = robot.diagnostics['readings']
     assert readings['readings received'] == '300'
     em = robot.ask('run_em')
-    robot.until(lambda: 'waiting for kernels' in robot.diagnostics['EM']['state'], what='EM says what it waits for')
+    robot.until(
+        lambda: 'waiting for the compilation' in robot.diagnostics['EM']['state'], what='EM says what it waits for'
+    )
     assert 'compiling kernels' in robot.diagnostics['background']['message']
     robot.until(lambda: robot.maps['live_map'], 240.0, 'a live map')
     assert not em.done()

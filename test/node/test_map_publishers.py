@@ -220,7 +220,7 @@ def test_updates_are_of_the_live_map_alone(node: Publishing, monkeypatch: pytest
 
 def test_two_maps_cannot_have_one_topic(node: Publishing) -> None:
     node.topics = {'ml_map': '/map', 'live_map': '/map'}
-    with pytest.raises(MapperError, match=r'^/map can have one map only'):
+    with pytest.raises(MapperError, match=r'^/map can have only one map'):
         MapPublishers(node, 0.1, lambda: 'map', at_once)
     node.topics = {'ml_map': '/map'}
     MapPublishers(node, 0.1, lambda: 'map', at_once)

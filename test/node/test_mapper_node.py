@@ -181,7 +181,7 @@ def test_services_during_em_and_reset(start: Any, robot: Robot) -> None:
     robot.until(lambda: robot.diagnostics.get('EM', {}).get('state', 'idle') != 'idle', what='EM runs')
     second = robot.call('run_em')
     assert not second.success
-    assert 'runs already' in second.message
+    assert 'already running' in second.message
     # live mapping goes on, and the map found so far can be watched
     before = len(robot.maps['live_map'])
     robot.play(messages[most : most + 200], rate=400.0)
@@ -199,7 +199,7 @@ def test_services_during_em_and_reset(start: Any, robot: Robot) -> None:
     robot.until(lambda: robot.maps['ml_map'][-1].info.width == 1, what='an empty map')
     empty = robot.call('run_em')
     assert not empty.success
-    assert 'no Range message has come on /sonar' in empty.message
+    assert 'no Range message has been received on /sonar' in empty.message
     save = robot.call('save_maps')
     assert not save.success
     # a run that is under way does not keep the node from ending
@@ -249,7 +249,7 @@ def test_a_bad_value_at_start_is_an_error(start: Any) -> None:
 def test_one_topic_for_ranges_and_odometry_is_an_error(start: Any) -> None:
     node = start('-p', 'odom_topic:=/sonar', ready=False)
     assert node.process.wait(60) == 1
-    assert '/sonar cannot be a topic of Range and of odometry' in node.output
+    assert '/sonar cannot be a topic of both Range and odometry' in node.output
     assert 'Traceback' not in node.output
 
 

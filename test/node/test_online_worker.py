@@ -287,7 +287,7 @@ def test_readings_that_were_taken_are_not_said_to_be_missing(node: Node, maps: t
     maps.late = MemoryError()
     node.worker.offer(readings(3))
     node.settle()
-    said = 'online map: what is left of the search is done with the next readings: there is not enough memory'
+    said = 'online map: the search will continue with the next readings: there is not enough memory'
     assert node.logged == [said]
     assert node.worker.worker.trouble == '' and node.worker.kept == 3
 

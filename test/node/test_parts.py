@@ -161,7 +161,7 @@ def test_em_that_cannot_have_what_came_meanwhile_says_so(
 
     monkeypatch.setattr(node.em, '_take', once)
     success, message = robot.call(node.em.run_em)
-    assert not success and 'does not fit the memory' in message
+    assert not success and 'does not fit into the memory' in message
 
 
 def test_a_call_that_fails_after_the_start_does_not_hold_up_the_others(inside: Callable[..., Inside]) -> None:
@@ -302,7 +302,7 @@ def test_a_tenth_of_max_readings_before_it_there_is_a_warning(inside: Callable[.
     readings = robot.status('readings')
     assert readings['level'] == WARN
     assert (
-        '92 readings, and max_readings is 100: where readings are densest, the oldest are removed'
+        '92 readings, and max_readings is 100: beyond it, the oldest are removed where readings are densest'
         in readings['message']
     )
     robot.drive(92, 30)
@@ -498,7 +498,7 @@ def test_a_callback_that_fails_is_logged_and_the_node_goes_on() -> None:
     with pytest.raises(main._Stop):
         main._spin(Executor(), node)
     assert len(logged) == 1
-    assert 'ValueError: odd' in logged[0] and 'mapping goes on' in logged[0]
+    assert 'ValueError: odd' in logged[0] and 'mapping continues' in logged[0]
 
 
 def test_the_buffer_of_the_node_is_thinned_aside(inside: Callable[..., Inside]) -> None:

@@ -66,7 +66,7 @@ def test_a_refusal_leaves_everything_as_odometry_has_it(inside: Callable[..., In
         ours, theirs = (getattr(each.node.em.maps, name) for each in (robot, plain))
         assert np.array_equal(ours, theirs, equal_nan=True)
     assert np.array_equal(live_of(robot)[1], live_of(plain)[1], equal_nan=True)
-    assert 'as odometry gives it: the test says so' in robot.node.em.last_run
+    assert 'odometry is used as the trajectory: the test says so' in robot.node.em.last_run
     assert 'the test says so' in robot.status('trajectory')['message']
     assert 'rajectory' not in plain.node.em.last_run
 
@@ -78,7 +78,7 @@ def test_a_refusal_after_a_trajectory_keeps_it(inside: Callable[..., Inside], qu
         robot.drive(first, 20)
         answer = robot.call(robot.node.em.run_em)
         assert answer[0]
-        assert 'trajectory of the run before kept' in answer[1] and 'the test says so' in answer[1]
+        assert 'trajectory of the previous run kept' in answer[1] and 'the test says so' in answer[1]
         assert robot.node.trajectory.correction.end == odometry_of(robot).stamp[-1], 'it goes on to the end'
         assert_live(robot, bent)
     status = robot.status('trajectory')
@@ -102,7 +102,10 @@ def test_it_goes_back_to_odometry_where_this_is_better(
     answer = robot.call(robot.node.em.run_em)
     assert robot.node.trajectory.correction is None
     assert_live(robot, None)
-    assert 'as odometry gives it: the test says so; and it is no worse than what the run before found' in answer[1]
+    assert (
+        'odometry is used as the trajectory: the test says so; '
+        'and it is not worse than the trajectory of the previous run' in answer[1]
+    )
 
 
 def test_a_jump_of_odometry_is_warned_of_until_a_run_has_looked_at_it(

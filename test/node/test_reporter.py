@@ -190,13 +190,13 @@ def test_both_that_are_missing_are_told_and_where_they_come_from(clock: Any) -> 
             'none yet',
             Grid(0.1, 0, 0, 1, 1),
             {},
-            absent=lambda kind: f': nobody publishes {kind}',
+            absent=lambda kind: f': no node publishes {kind}',
         )[0]
         return made.level, made.message
 
-    assert verdict() == (OK, 'no reading has been accepted so far: none has come')
+    assert verdict() == (OK, 'no reading has been accepted so far: none has been received')
     clock.now += 4.0
-    said = 'no odometry for 4 s: nobody publishes Odometry; no Range for 4 s: nobody publishes Range'
+    said = 'no odometry for 4 s: no node publishes Odometry; no Range for 4 s: no node publishes Range'
     assert verdict() == (WARN, said)
 
 
@@ -226,7 +226,7 @@ def test_what_did_not_come_while_nobody_listened_is_not_missed(clock: Any) -> No
     robot.intake.subscribe()
     for _ in range(3):
         clock.now += 1.0
-        assert verdict() == (OK, 'no reading has been accepted so far: none has come')
+        assert verdict() == (OK, 'no reading has been accepted so far: none has been received')
     clock.now += 1.0
     assert verdict()[1].startswith('no odometry for 4 s')
 
@@ -282,7 +282,7 @@ def test_well_is_said_only_where_readings_are_mapped(inside: Any) -> None:
     assert log.warned == [fault]
     robot.drive(40, 20)
     looks(LOOKS)
-    assert log.warned == [fault, 'readings are mapped, and nothing is wrong with them any more']
+    assert log.warned == [fault, 'readings are mapped without faults again']
 
 
 def reporter_of(robot: Taking) -> Any:
@@ -338,4 +338,4 @@ def test_poses_of_frames_that_nobody_sends_are_named_beside_one_without_a_pose()
     reporter._name_frames()
     text, other = robot.node.warned
     assert other.endswith('its readings are rejected')
-    assert text.endswith('; poses are given for us_left, us_right: is one of them meant?')
+    assert text.endswith('; there are poses for us_left, us_right: is it one of these?')

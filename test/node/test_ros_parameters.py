@@ -98,7 +98,7 @@ def test_names_that_mean_nothing_are_told_of_and_those_of_ros_are_not() -> None:
     assert poses == {}
     assert sorted(warning.split()[1] for warning in warnings) == ['cut', 'p_hitt', 'sensors.a.poze']
     assert any('did you mean p_hit?' in warning for warning in warnings)
-    assert any('a.poze' in text and 'given as sensors.<frame_id>.pose: [x, y, yaw]' in text for text in warnings)
+    assert any('a.poze' in text and 'as sensors.<frame_id>.pose: [x, y, yaw]' in text for text in warnings)
     assert any('cut is ignored: it is no longer a parameter' in warning for warning in warnings)
 
 

@@ -126,7 +126,7 @@ def test_a_robot_without_a_path_has_one_of_no_points(node: Node) -> None:
 
 @pytest.mark.parametrize(
     ('newer', 'said', 'them'),
-    [(0, '', ''), (1, '1 reading came after EM', 'it'), (7, '7 readings came after EM', 'them')],
+    [(0, '', ''), (1, '1 reading arrived after EM', 'it'), (7, '7 readings arrived after EM', 'them')],
 )
 def test_readings_that_came_after_em_are_told_of(node: Node, newer: int, said: str, them: str) -> None:
     node.accepted += newer
@@ -134,16 +134,16 @@ def test_readings_that_came_after_em_are_told_of(node: Node, newer: int, said: s
     message = node.save().answer()[1]
     warnings = node.written[0][2]['warnings']
     assert len(warnings) == bool(said) and 'WARNINGS' not in message
-    assert ('came after EM' in message) == bool(said)
+    assert ('arrived after EM' in message) == bool(said)
     if said:
         assert message.endswith(f'; {said}')
-        assert warnings[0].startswith(f'{said}: only the live map has {them};')
+        assert warnings[0].startswith(f'{said}: only the live map contains {them};')
 
 
 def test_readings_that_were_thinned_are_told_of(node: Node) -> None:
     node.em.explained = node.accepted = 25
     node.save().answer()
-    assert 'EM maps from 10 of 25 readings' in node.written[0][2]['warnings'][1]
+    assert 'EM used 10 of 25 readings' in node.written[0][2]['warnings'][1]
 
 
 def test_whether_it_waits_for_em_is_logged(node: Node) -> None:
@@ -169,7 +169,7 @@ def test_without_maps_the_reason_is_the_answer(node: Node) -> None:
 def test_maps_that_a_reset_overtakes_are_not_written(node: Node) -> None:
     node.generation = 5
     success, message = node.save().answer()
-    assert not success and 'forgotten by reset' in message
+    assert not success and 'reset deleted them' in message
     assert node.written == []
 
 

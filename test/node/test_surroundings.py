@@ -22,29 +22,29 @@ def test_a_publisher_that_does_not_fit_and_a_namesake(start: Any, robot: Robot) 
     node = start(*options)
     robot.meet()
     robot.until(lambda: 'readings' in robot.diagnostics)
-    assert 'nothing of it is received' not in node.output
+    assert 'no message is received' not in node.output
     best_effort = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
     publisher = robot.node.create_publisher(Range, 'sonar', best_effort)
-    said = 'robot publishes /sonar as best_effort, and this node asks for reliable'
+    said = 'robot publishes /sonar as best_effort, but this node requests reliable'
     robot.until(lambda: said in robot.diagnostics['readings']['message'], what='a warning')
     assert robot.diagnostics['readings']['level'] == b'\x01'
     robot.node.destroy_publisher(publisher)
     robot.until(lambda: said not in robot.diagnostics['readings']['message'], what='it passes')
     assert node.output.count(said) == 1
     other = start(*options)
-    node.wait_for('2 nodes are called /forward_grid_mapper', 20.0)
-    other.wait_for('2 nodes are called /forward_grid_mapper', 20.0)
-    assert 'start each with a name of its own, --ros-args -r __node:=NAME' in other.output
+    node.wait_for('2 nodes have the name /forward_grid_mapper', 20.0)
+    other.wait_for('2 nodes have the name /forward_grid_mapper', 20.0)
+    assert 'start each with a different name, --ros-args -r __node:=NAME' in other.output
 
 
 @pytest.mark.parametrize(
     ('published', 'said'),
     [
-        ({}, ': nobody publishes /sonar'),
+        ({}, ': no node publishes /sonar'),
         ({'/sonar': 'sensor_msgs/msg/Range'}, ''),
         (
             {'/us': 'sensor_msgs/msg/Range', '/odom': 'nav_msgs/msg/Odometry', '/a': 'sensor_msgs/msg/Range'},
-            ': nobody publishes /sonar; Range comes on /a, /us: set range_topics, or remap sonar',
+            ': no node publishes /sonar; Range is published on /a, /us: set range_topics, or remap sonar',
         ),
         (
             {'/sonar': 'sensor_msgs/msg/LaserScan'},

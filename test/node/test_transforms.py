@@ -135,7 +135,7 @@ def test_static_transforms_that_came_too_early_are_named(
     readings = robot.status('readings')
     assert readings['level'] == WARN
     assert (
-        'player publishes /tf_static as volatile: what it sent before this node listened is lost'
+        'player publishes /tf_static as volatile: messages sent before this node subscribed are lost'
         in (readings['message'])
     )
 
@@ -145,7 +145,7 @@ def test_static_transforms_that_are_not_reliable_are_named(
 ) -> None:
     robot = begun(inside)
     player(QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT))
-    robot.until(lambda: 'nothing of it is received; have it publish' in robot.status('readings')['message'])
+    robot.until(lambda: 'no message is received; set its publisher' in robot.status('readings')['message'])
 
 
 def test_a_map_frame_without_its_transform_is_said_by_name(inside: Callable[..., Inside]) -> None:
@@ -164,11 +164,11 @@ def test_a_map_frame_without_its_transform_is_said_by_name(inside: Callable[...,
 
 def test_simulated_time_that_nobody_publishes_is_said(inside: Callable[..., Inside]) -> None:
     robot = begun(inside, use_sim_time=True)
-    robot.until(lambda: 'use_sim_time is true, and nobody publishes /clock' in robot.status('readings')['message'])
+    robot.until(lambda: 'use_sim_time is true, but no node publishes /clock' in robot.status('readings')['message'])
     from rosgraph_msgs.msg import Clock
 
     publisher = robot.node.create_publisher(Clock, '/clock', 10)
-    robot.until(lambda: 'nobody has said a time on /clock' in robot.status('readings')['message'])
+    robot.until(lambda: 'no node has published on /clock' in robot.status('readings')['message'])
     now = Clock()
     now.clock.sec = 5
 
@@ -234,13 +234,13 @@ def test_the_log_tells_once_of_a_sensor_without_a_pose_and_of_its_pose(
     from_tower(robot, k, 5)
     for _ in range(3):
         assert robot.status('readings')['frames without a pose'] == ''
-    assert told.count('sensor tower has a pose on the robot now') == 1
+    assert told.count('sensor tower now has a pose on the robot') == 1
     # a reset forgets which frames are unknown, and that is no news of a pose
     node.associator.unknown_frames.add('tower')
     robot.status('readings')
     robot.call(node.reset)
     robot.status('readings')
-    assert told.count('has a pose on the robot now') == 1
+    assert told.count('now has a pose on the robot') == 1
 
 
 def test_the_log_tells_once_of_a_map_frame_without_its_transform_and_of_its_end(
@@ -261,14 +261,14 @@ def test_the_log_tells_once_of_a_map_frame_without_its_transform_and_of_its_end(
     # the robot stands still for a while: that is no transform
     robot.until(lambda: not frame.fault())
     robot.status('readings')
-    assert told.count('the transform to map_frame is there') == 0
+    assert told.count('the transform to map_frame is available') == 0
     pose = Transform()
     pose.rotation.w = 1.0
     frame._transforms._buffer.lookup_transform = lambda *names: SimpleNamespace(transform=pose)
     drive()
     for _ in range(3):
         robot.status('readings')
-    assert told.count('the transform to map_frame is there') == 1
+    assert told.count('the transform to map_frame is available') == 1
 
 
 def heard_from(robot: Inside, pose: Transform) -> None:
@@ -297,4 +297,4 @@ def test_the_log_tells_once_of_a_steep_sensor(inside: Callable[..., Inside], log
     pose = Transform()
     pose.rotation.y, pose.rotation.w = math.sin(0.75), math.cos(0.75)
     heard_from(robot, pose)
-    assert told.count('readings of tower are rejected: the sensor looks up or down') == 1
+    assert told.count('readings of tower are rejected: the sensor points up or down') == 1

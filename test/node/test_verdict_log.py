@@ -12,7 +12,7 @@ from stand_ins import PlainNode
 
 from forward_grid_mapper.node.verdict_log import AGAIN, MOST, VerdictLog
 
-WELL = 'readings are mapped, and nothing is wrong with them any more'
+WELL = 'readings are mapped without faults again'
 
 
 def test_a_fault_that_lasts_is_told_once_whatever_its_numbers(clock: Any) -> None:

@@ -36,7 +36,7 @@ def journal(folder: Path, count: int, parameters: dict[str, Any] | None = None, 
 def test_a_journal_without_readings(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = journal(tmp_path / 'empty', 0)
     assert process_bag([str(folder), '-o', str(tmp_path / 'out')]) == 1
-    assert 'holds no reading' in capsys.readouterr().err
+    assert 'contains no reading' in capsys.readouterr().err
 
 
 def test_options_that_a_journal_has_no_use_for(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -44,7 +44,7 @@ def test_options_that_a_journal_has_no_use_for(tmp_path: Path, capsys: pytest.Ca
     assert process_bag([str(folder), '-o', str(tmp_path / 'a'), '--odom-topic', 'odom']) == 1
     assert 'leave out' in capsys.readouterr().err
     assert process_bag([str(folder), '-o', str(tmp_path / 'b'), '-q', '--sensor', 'sonar=0,0,0']) == 0
-    assert 'change nothing' in capsys.readouterr().err
+    assert 'have no effect' in capsys.readouterr().err
 
 
 def test_a_damaged_journal_is_mapped_as_far_as_it_goes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -119,7 +119,7 @@ def test_goals_are_no_poses_of_the_robot(tmp_path: Path, wish: str) -> None:
 
 def test_transforms_are_taken_only_if_asked_for(tmp_path: Path) -> None:
     path = written(tmp_path / 'bag', TF, ('/tf',))
-    with pytest.raises(BagError, match='--odom-topic /tf` takes those of base_link from its transforms'):
+    with pytest.raises(BagError, match='--odom-topic /tf` uses the poses of base_link from the transforms of the bag'):
         drive_of(path)
     with Bag(path) as bag, pytest.raises(BagError, match=r'no nav_msgs/Odometry.*robot\. It has'):
         bag.choose_topics()

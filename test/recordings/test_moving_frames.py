@@ -122,7 +122,7 @@ def test_a_sensor_on_a_joint_is_told(tmp_path: Path, frame: str, named: str) -> 
     servo = ('base_link', frame, lambda i: Pose2(0.1, 0.0, i / 10))
     fixed = ('servo', 'sonar') if frame == 'servo' else ('base_link', 'laser')
     path = recorded(tmp_path / 'bag', [[('odom', 'base_link', at)], [servo]], fixed=fixed)
-    with pytest.raises(InputError, match=f'join {named} to the robot: sensors on moving joints are not'):
+    with pytest.raises(InputError, match=f'connect {named} to the robot: sensors on moving joints are not'):
         read(path)
 
 
@@ -139,7 +139,7 @@ def test_transforms_that_are_repeated_are_as_good_as_static_ones(tmp_path: Path,
     drive = read(path)
     expected = Pose2(0.3, -0.1, 0.7).compose(SENSOR)
     assert drive.source['extrinsics']['sonar'] == pytest.approx(expected)
-    assert drive.source['mounts_from'] == 'transforms on /tf that stay the same'
+    assert drive.source['mounts_from'] == 'constant transforms on /tf'
     assert drive.source['warnings'] == []
 
 
@@ -155,7 +155,7 @@ def test_static_transforms_are_believed_more_than_repeated_ones(tmp_path: Path) 
     path = recorded(tmp_path / 'bag', [[('odom', 'base_link', at)], fixed], fixed=('mast', 'sonar'))
     drive = read(path)
     assert drive.source['extrinsics']['sonar'] == pytest.approx(Pose2(0.3, 0.0, 0.0).compose(SENSOR))
-    assert ['/tf and /tf_static give different poses' in warning for warning in drive.source['warnings']] == [True]
+    assert ['/tf and /tf_static contain different poses' in warning for warning in drive.source['warnings']] == [True]
 
 
 def test_long_recordings_are_not_read_twice_as_a_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

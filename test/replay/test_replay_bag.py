@@ -119,8 +119,8 @@ def test_without_listeners_it_names_the_topics(dds: Wire, tmp_path: Path) -> Non
     code, out, err = dds.replay(write_bag(tmp_path), '--wait', 0.2).end()
     assert (code, out) == (1, '')
     assert 'Traceback' not in err
-    assert '/sonar: nobody listens to sensor_msgs/msg/Range' in err
-    assert '/odom: nobody listens to nav_msgs/msg/Odometry' in err
+    assert '/sonar: no node subscribes to sensor_msgs/msg/Range' in err
+    assert '/odom: no node subscribes to nav_msgs/msg/Odometry' in err
     assert '--remap' in err
 
 
@@ -130,8 +130,8 @@ def test_with_listeners_that_do_not_fit_it_says_why(dds: Wire, tmp_path: Path) -
     replay = dds.replay(write_bag(tmp_path), '--wait', 8, '--best-effort')
     code, _, err = listener.receive(replay)
     assert code == 1
-    assert '/odom: nav_msgs/msg/Odometry is listened to on /robot/odom' in err
-    assert '/sonar: listener wants it reliable' in err
+    assert '/odom: nav_msgs/msg/Odometry has subscribers on /robot/odom' in err
+    assert '/sonar: listener requests reliable' in err
 
 
 def test_topics_can_be_renamed(dds: Wire, tmp_path: Path) -> None:

@@ -297,8 +297,8 @@ def test_ctrl_c_says_once_what_is_kept(drives: Path, tmp_path: Path) -> None:
     output, error = client.communicate(timeout=PATIENCE)
     lines = [line for line in error.decode().splitlines() if 'compiling' not in line]
     assert lines == [
-        f'process_bag: cancelled; no results were written, what was done is kept in {work}; the same command goes on '
-        'there'
+        f'process_bag: cancelled; no results were written, finished work is kept in {work}; the same command continues '
+        'from there'
     ]
     assert client.returncode == 130 and not output
     assert not (tmp_path / 'maps').exists() and any(work.glob('tiles/*/normals.npz'))
@@ -347,7 +347,7 @@ def test_a_disk_that_is_really_full(
     assert code_of(*arguments) == 1
     error = capsys.readouterr().err
     assert f'{where[full]}' in error and 'the disk is full; free some space' in error
-    assert 'the same command goes on there' in error and 'Traceback' not in error
+    assert 'the same command continues from there' in error and 'Traceback' not in error
     assert not where['maps'].exists() and not list(small_disk.rglob('.*partial'))
     # what is there is whole
     for path in where['work'].rglob('*.npz'):
@@ -450,7 +450,7 @@ def test_workers_are_told_what_has_no_effect(drives: Path, monkeypatch: pytest.M
 
     monkeypatch.setattr(process_bag, 'with_workers', with_workers)
     assert code_of(drives, '--workers', 2, '--set', 'odometry_noise=2deg') == 0
-    assert told == ['odometry_noise has an effect with --refine-poses alone, which is not given']
+    assert told == ['odometry_noise has an effect only with --refine-poses, which is not given']
 
 
 # ---- errors
@@ -471,9 +471,9 @@ def test_without_the_extra_it_says_what_to_install(
     [
         (('--workers', 0), '--workers'),
         (('--workers', 100_000), 'cores; give at most'),
-        (('--scheduler', 'nonsense'), 'is no address of a scheduler'),
-        (('--scheduler', 'http://localhost:8786'), 'is no address of a scheduler'),
-        (('--scheduler', ''), 'is no address of a scheduler'),
+        (('--scheduler', 'nonsense'), 'is not the address of a scheduler'),
+        (('--scheduler', 'http://localhost:8786'), 'is not the address of a scheduler'),
+        (('--scheduler', ''), 'is not the address of a scheduler'),
         (('--workers', 2, '--scheduler', 'tcp://a:1'), 'leave out --workers'),
         (('--workers', 2, '--memory-per-worker', 0.1), '--memory-per-worker'),
         (('--workers', 2, '--refine-poses'), '--refine-poses'),

@@ -39,5 +39,5 @@ RENAMED = {
 def deprecation(name: str) -> str:
     """Return the warning for a name of `DEPRECATED` or `RENAMED`."""
     if name in RENAMED:
-        return f'parameter {name} is called {RENAMED[name]} now; the next version does not know the old name'
+        return f'parameter {name} is called {RENAMED[name]} now; the next version will not accept the old name'
     return f'parameter {name} is ignored: it is {DEPRECATED[name]}'

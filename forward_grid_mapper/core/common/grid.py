@@ -47,7 +47,7 @@ class Grid:
             if isinstance(value, bool) or not isinstance(value, numbers.Integral):
                 raise ValueError(f'{name} of a grid must be a whole number: {value!r}')
         if self.width < 0 or self.height < 0:
-            raise ValueError(f'a grid has no fewer than 0 cells: width {self.width}, height {self.height}')
+            raise ValueError(f'a grid must have at least 0 cells: width {self.width}, height {self.height}')
 
     @property
     def origin(self) -> tuple[float, float]:
@@ -115,8 +115,8 @@ class Grid:
     def _check_lattice(self, other: Grid) -> None:
         if self.resolution != other.resolution:
             raise ValueError(
-                f'grids of {self.resolution} m and of {other.resolution} m a cell are not of one lattice; make both '
-                f'maps with the same resolution'
+                f'grids of {self.resolution} m and of {other.resolution} m a cell are not aligned; make both maps '
+                'with the same resolution'
             )
 
     @classmethod

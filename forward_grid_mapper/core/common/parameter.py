@@ -96,7 +96,7 @@ class Parameter:
             int: 'a whole number',
             bool: 'true or false',
             str: 'text',
-            tuple: 'a list of text, none of it empty',
+            tuple: 'a list of text without empty entries',
         }[self.type]
         if isinstance(value, np.generic):
             value = value.item()

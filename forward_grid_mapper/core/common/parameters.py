@@ -166,8 +166,8 @@ class ModelParameters:
     def __post_init__(self) -> None:
         if self.p_rand + self.p_lost > 0.99:
             raise ParameterError(
-                f'p_rand = {self.p_rand:g} and p_lost = {self.p_lost:g} leave nothing for the map to account for; '
-                f'their sum must not exceed 0.99'
+                f'p_rand = {self.p_rand:g} and p_lost = {self.p_lost:g} leave no probability for the map; their sum '
+                'must not exceed 0.99'
             )
 
 
@@ -213,7 +213,7 @@ class SearchParameters:
     threads: int = param(0, 'Threads of a search, 0 for one per core; the maps do not depend on it.', 'threads', 0, 256)
     max_memory: int = param(
         4000,
-        'Memory for pairs of cells and readings; beyond it they are computed again each time: the same maps, but slower.',
+        'Memory for pairs of cells and readings; beyond it they are computed again each time: the same maps, slower.',
         'MB',
         0,
         1_000_000,
@@ -367,7 +367,7 @@ class Parameters:
         for name, value in constants.items():
             kind = type(_CONSTANTS[name].default)
             if type(value) is not kind or not math.isfinite(value):
-                raise ParameterError(f'{name}: {value!r} is no finite {kind.__name__}')
+                raise ParameterError(f'{name}: {value!r} is not a finite {kind.__name__}')
         # what no longer is there was none that a user chose for this version
         others = {name: value for name, value in values.items() if name not in constants and name not in DEPRECATED}
         return cls.from_flat(others).varied(constants)

@@ -136,7 +136,7 @@ def consistency_warnings(
     gain, fault = max(gains, key=itemgetter(0))
     if gain < max(fault.least, TOTAL / count):
         return []
-    return [f'{fault.told} (with this undone, a map explains {count} readings better by {gain:.2f} nats each)']
+    return [f'{fault.told} (with this corrected, a map explains {count} readings better by {gain:.2f} nats each)']
 
 
 def _drive(readings: Readings, extrinsics: Mapping[str, Pose2]) -> _Drive | None:
@@ -207,23 +207,23 @@ def _faults(drive: _Drive) -> Iterator[_Fault]:
     for factor in FACTORS:
         much = f'{factor:.3g} times as far as' if factor > 1 else f'1/{1 / factor:.3g} as far as'
         yield _Fault(
-            f'by the readings the robot drives {much} odometry says; are odometry or ranges in feet, or is the radius '
-            f'of the wheels wrong? Correct the driver: messages must state metres',
+            f'according to the readings, the robot drives {much} odometry says; are odometry or ranges in feet, or is '
+            'the wheel radius wrong? Correct the driver: messages must be in metres',
             drive.placed(robot=np.stack([factor * x, factor * y, yaw])),
         )
     for width in WIDTHS:
         half = np.minimum(width * drive.readings.half_angle, WIDEST)
         stated, fitting = (round(math.degrees(2 * float(np.median(h)))) for h in (drive.readings.half_angle, half))
         yield _Fault(
-            f'the field of view is stated as {stated} degrees, and the readings look as if it were about {fitting}; '
-            f'is it half of the angle, or twice? Correct the driver, or set the parameter field_of_view',
+            f'the field of view is stated as {stated} degrees, but the readings fit about {fitting} degrees; is it '
+            'half of the angle, or twice the angle? Correct the driver, or set the parameter field_of_view',
             replace(drive.readings, half_angle=half),
         )
     for shift in SHIFTS:
         for sign, word in ((-1, 'late'), (1, 'early')):
             yield _Fault(
                 f'the stamps of the readings seem to be about {shift:g} s {word} against those of odometry; drivers '
-                f'must stamp a reading when it is measured, by one clock',
+                'must stamp a reading at the time of its measurement, all by the same clock',
                 drive.placed(robot=drive.robot_at(sign * shift)),
                 SHIFT_GAIN if shift == LEAST_SHIFT else GAIN,
             )
@@ -251,13 +251,13 @@ def _of_axes(drive: _Drive) -> Iterator[_Fault]:
         cos, sin = math.cos(angle), math.sin(angle)
         by = f'{abs(degrees)} degrees{word}'
         yield _Fault(
-            f'the sensors seem to be turned by {by}; {check}, or the axes of odometry. {REP_103}',
+            f'the sensors seem to be rotated by {by}; {check}, or the axes of odometry. {REP_103}',
             drive.placed(extrinsics=np.stack([cos * forward - sin * left, sin * forward + cos * left, turn + angle])),
         )
     at, directions = _travel(drive)
     if np.ptp(yaw) < SAME_YAW and len(at) >= 2:
         yield _Fault(
-            'the yaw of odometry never changes, though the robot turns as it drives; is the orientation left out? '
+            'the yaw of odometry never changes, although the robot turns; does its driver leave out the orientation? '
             'Correct the driver',
             drive.placed(robot=np.stack([x, y, np.interp(np.arange(len(x)), at, np.unwrap(directions))])),
         )
@@ -296,6 +296,6 @@ def _axes(drive: _Drive) -> str:
     else:
         cause = 'y, or yaw, seems to have the wrong sign' if angle < math.pi / 4 else 'x seems to have the wrong sign'
     return (
-        f'odometry turns to one side and drives to the other: {cause} in it. {REP_103}; correct its driver, or choose '
-        f'another odometry topic'
+        f'odometry turns to one side and moves to the other: {cause} in odometry. {REP_103}; correct its driver, or '
+        'choose another odometry topic'
     )

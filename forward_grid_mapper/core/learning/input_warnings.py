@@ -143,9 +143,8 @@ def _copies(readings: Readings) -> str:
     if copies < COPIES * len(z) or len(np.unique(stamp)) < 0.1 * len(z) / max(len(readings.sensor_names), 1):
         return ''
     return (
-        f'{copies} of {len(z)} readings are copies of others (same sensor, stamp and range), and count as evidence '
-        f'of their own: was a topic recorded twice, or is it published by two nodes? Leave one of them out '
-        f'(range_topics)'
+        f'{copies} of {len(z)} readings are copies of others (same sensor, stamp and range), and their evidence '
+        'counts twice: was a topic recorded twice, or do two nodes publish it? Leave one of them out (range_topics)'
     )
 
 
@@ -156,10 +155,10 @@ def _whole_seconds(readings: Readings) -> str:
     most = max((len(mine) / len(np.unique(mine.stamp // 1_000_000_000)) for _, mine in _sensors(readings)), default=0.0)
     if most < CROWDED:
         return ''
-    stamps = 'all stamps are one and the same' if np.ptp(readings.stamp) == 0 else 'all stamps are whole seconds'
+    stamps = 'all stamps are equal' if np.ptp(readings.stamp) == 0 else 'all stamps are whole seconds'
     return (
-        f'{stamps}, though a sensor has {most:.0f} readings at each: does the driver fill in header.stamp, with its '
-        f'nanosec in nanoseconds? Readings are placed where the robot was at their stamp'
+        f'{stamps}, although a sensor has {most:.0f} readings at each: does the driver set header.stamp, with nanosec '
+        'in nanoseconds? Readings are placed with the pose of the robot at their stamp'
     )
 
 
@@ -179,8 +178,9 @@ def _shared_frame(readings: Readings) -> str:
     if not suspects:
         return ''
     return (
-        f'the readings of frame {_listed(suspects)} take turns as those of several sensors do: do all sensors have one '
-        f'frame_id? Give each its own in its driver, with its own pose, or all readings are mapped from one pose'
+        f'the readings of frame {_listed(suspects)} alternate like those of several sensors: do all sensors have the '
+        'same frame_id? Set a different one for each in its driver, with its pose; otherwise all readings are mapped '
+        'from the same pose'
     )
 
 
@@ -196,8 +196,8 @@ def _speed(readings: Readings) -> str:
     if len(driven) < ENOUGH or np.median(driven) < FASTEST:
         return ''
     return (
-        f'the poses move at {np.median(driven):.0f} m/s: are they in millimetres or centimetres, or their stamps in '
-        f'another unit? Poses are in metres, and stamps in seconds: correct the odometry, or the file of poses'
+        f'the poses move at {np.median(driven):.0f} m/s: are they in millimetres or centimetres, or are their stamps '
+        'in another unit? Poses must be in metres, and stamps in seconds: correct the odometry, or the file of poses'
     )
 
 
@@ -218,8 +218,8 @@ def _standing(readings: Readings) -> str:
     if not lasted:
         return ''
     return (
-        f'odometry stands still for {lasted:.0f} s while the ranges of most sensors change: does the robot drive while '
-        f'odometry does not count? Check its wheel encoders, or choose another odometry topic'
+        f'odometry does not change for {lasted:.0f} s while the ranges of most sensors change: does the robot drive '
+        'while odometry is not updated? Check its wheel encoders, or choose another odometry topic'
     )
 
 
@@ -259,8 +259,8 @@ def _stuck(readings: Readings) -> str:
     if not suspects:
         return ''
     return (
-        f'sensor {_listed(suspects)} gives one and the same range wherever the robot drives: is it broken, or does it '
-        f'hear a part of the robot? Repair it, or leave its topic out'
+        f'sensor {_listed(suspects)} gives the same range everywhere: is it broken, or does it hear a part of the '
+        'robot? Repair it, or leave out its topic'
     )
 
 
@@ -291,9 +291,9 @@ def _ceiling(readings: Readings) -> str:
     if np.count_nonzero(sectors >= LEAST) < DIRECTIONS:
         return ''
     return (
-        f'{count / len(heard):.0%} of the echoes are at {longest:.3f} m, hardly any is longer, and no '
-        f'reading is without echo: is that what the driver sends where it hears nothing? Then set the parameter '
-        f'max_range to {0.98 * longest:.2g}, or a wall is mapped at that range'
+        f'{count / len(heard):.0%} of the echoes are at {longest:.3f} m, hardly any is longer, and no reading is '
+        'without an echo: does the driver send this range if there is no echo? Then set the parameter max_range to '
+        f'{0.98 * longest:.2g}, otherwise a wall is mapped at that range'
     )
 
 
@@ -343,10 +343,10 @@ def _reach(readings: Readings) -> str:
         return ''
     limit = float(np.median(readings.z_max))
     metres = farthest * limit
-    unit = 'is max_range in centimetres, millimetres or feet?' if farthest < 0.1 else 'does the sensor reach so far?'
+    unit = 'is max_range in centimetres, millimetres or feet?' if farthest < 0.1 else 'does the sensor reach that far?'
     return (
-        f'max_range is {limit:g} m, and no echo comes from beyond {metres:.1f} m: {unit} A reading without echo '
-        f'is taken to say that all is free up to max_range; set the parameter max_range to what the sensor reaches'
+        f'max_range is {limit:g} m, and no echo is from beyond {metres:.1f} m: {unit} A reading without an echo is '
+        'evidence for free space up to max_range; set the parameter max_range to the range of the sensor'
     )
 
 
@@ -373,8 +373,8 @@ def _extent(readings: Readings) -> str:
         )
     else:
         cause = (
-            f'one at ({x:.1f}, {y:.1f}) m has a range of {z:.1f} m, more than all others: does the sensor reach so '
-            f'far? If not, set the parameter max_range to what it reaches'
+            f'one at ({x:.1f}, {y:.1f}) m has a range of {z:.1f} m, more than all others: does the sensor reach that '
+            'far? If not, set the parameter max_range to its range'
         )
     return (
         f'{np.count_nonzero(reached[side] > middle)} of {len(readings)} readings make the map {_size(whole)} instead '

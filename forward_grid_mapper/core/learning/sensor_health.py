@@ -275,5 +275,5 @@ def health_warning(table: dict[str, SensorHealth]) -> str:
         return ''
     return (
         f'{"a sensor stands" if len(suspects) == 1 else f"{len(suspects)} sensors stand"} out from the others: '
-        f'{", ".join(suspects)}; broken, covered, or mounted elsewhere than its pose says?'
+        f'{", ".join(suspects)}; broken, covered, or with a wrong pose?'
     )

@@ -127,13 +127,13 @@ def _held(name: str, model: ModelParameters, resolution: float, informed: float)
     """Return why a parameter does not move, or ''."""
     value, row = getattr(model, name), find(name)
     if name == 'p_lost' and value == 0:
-        return '0 is the model without lost echoes, which is not left by learning'
+        return '0 is the model without lost echoes, which learning keeps'
     if informed < 1:
         return 'no reading informs it'
     if name == 'sigma' and value <= resolution / 2:
         return 'it lies below half a cell, which is used instead'
     if value < row.low + _NEAR or value > row.high - _NEAR:
-        return f'it lies at a bound of what is admitted, {row.range}'
+        return f'it lies at a bound of the admitted range, {row.range}'
     return ''
 
 

@@ -105,9 +105,9 @@ def _beyond(ranges: Floats, _: Floats, limits: Floats) -> str:
     ratio = _at(0.98, (ranges / limits)[beyond])
     unit = next((name for name, count in UNITS.items() if ratio < BEYOND * count), 'millimetres')
     return (
-        f'{count} of {len(ranges)} ranges looked at are larger than max_range ({_middle(limits):g} m), up to '
-        f'{ratio:.0f} times as large, and so count as no echo: are the ranges in {unit} and the limits in metres? '
-        f'Messages must state metres; correct the driver'
+        f'{count} of {len(ranges)} examined ranges are larger than max_range ({_middle(limits):g} m), up to '
+        f'{ratio:.0f} times as large, and so are treated as no echo: are the ranges in {unit} and the limits in '
+        'metres? Messages must state metres; correct the driver'
     )
 
 
@@ -137,15 +137,16 @@ def _far(ranges: Floats, _: Floats, limits: Floats) -> str:
     if large > FARTHEST:
         return (
             f'a tenth of the ranges is larger than {large:.0f} m, and max_range is {limit:.4g} m, farther than sonars '
-            f'hear: are ranges and limits in centimetres or millimetres? Messages must state metres; correct the driver'
+            'can measure: are ranges and limits in centimetres or millimetres? Messages must state metres; correct '
+            'the driver'
         )
     farthest = ranges[ranges < limits].max(initial=0.0)
     if farthest > NEAR * limit:
         return ''
     cause = 'is it in centimetres or millimetres' if limit < STATED else 'does the driver state no limit'
     return (
-        f'max_range is {limit:.4g} m, and no range is larger than {farthest:.1f} m: {cause}? A reading without echo is '
-        f'taken to say that all is free up to max_range; correct the driver, or set the parameter max_range'
+        f'max_range is {limit:.4g} m, and no range is larger than {farthest:.1f} m: {cause}? A reading without an '
+        'echo is evidence for free space up to max_range; correct the driver, or set the parameter max_range'
     )
 
 

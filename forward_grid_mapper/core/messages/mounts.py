@@ -38,7 +38,7 @@ def mount_from(name: str, values: object) -> Pose2:
     pose = Pose2(*good)
     if abs(pose.yaw) > TURN + 1e-6:
         raise ParameterError(
-            f'{name}: a yaw of {pose.yaw:g} is in radians, and more than a full turn; {pose.yaw:g} degrees are '
+            f'{name}: a yaw of {pose.yaw:g} is in radians, which is more than a full turn; {pose.yaw:g} degrees are '
             f'{math.radians(pose.yaw):.4f}'
         )
     if math.hypot(pose.x, pose.y) > FARTHEST:
@@ -59,7 +59,7 @@ def far_mounts(poses: Mapping[str, Pose2]) -> list[str]:
     if not far:
         return []
     return [
-        f'transforms put {", ".join(far[:8])}{" and others" if len(far) > 8 else ""} up to '
-        f'{max(away.values()):.3g} m away from the middle of the robot: are they in millimetres? Transforms are in '
-        f'metres; correct the URDF, or what publishes them, or give sensors.{far[0]}.pose'
+        f'transforms put {", ".join(far[:8])}{" and others" if len(far) > 8 else ""} up to {max(away.values()):.3g} m '
+        'away from the middle of the robot: are they in millimetres? Transforms are in metres; correct the URDF or '
+        f'the node that publishes them, or set sensors.{far[0]}.pose'
     ]

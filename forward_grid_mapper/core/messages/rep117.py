@@ -16,42 +16,44 @@ from .message_batch import REASON, Ranges
 from .message_types import RangeMessage
 
 _SILENT_DRIVER = (
-    'a driver that means "no echo" should send +inf (REP 117); where it sends NaN, 0 or a negative range, set the '
+    'a driver should send +inf if there is no echo (REP 117); if it sends NaN, 0 or a negative range, set the '
     'parameter invalid_range to no_echo'
 )
 
 REASONS = {
     'nan_range': f'the range is not a number; {_SILENT_DRIVER}',
-    'too_near': 'the range is -inf, or less than a millimetre: something too near to measure, or a dead sensor; '
-    f'{_SILENT_DRIVER}',
+    'too_near': 'the range is -inf, or less than a millimetre: an object is too near to measure, or the sensor is '
+    f'dead; {_SILENT_DRIVER}',
     'below_min_range': f'the range is below min_range; {_SILENT_DRIVER}',
     'over_range': 'no echo, and over_range is "discard"',
     'bad_limits': 'min_range or max_range is negative or not finite, or max_range is not above min_range, or below a '
-    'millimetre; correct the driver, or set the parameter max_range to what the sensor reaches, in metres',
+    'millimetre; correct the driver, or set the parameter max_range to the range of the sensor, in metres',
     'bad_field_of_view': 'the field of view is not between 0 and pi radians; correct the driver, or set the parameter '
     'field_of_view to the full angle, such as 0.26 for 15 degrees',
-    'empty_frame_id': 'the header has no frame_id; have the driver give each sensor one of its own, such as sonar_left',
+    'empty_frame_id': 'the header has no frame_id; set a different one for each sensor in its driver, such as '
+    'sonar_left',
     'long_frame_id': 'the frame_id has more than 255 characters',
     'unprintable_frame_id': 'the frame_id has characters that cannot be printed',
-    'unknown_extrinsics': 'nothing says where this frame is on the robot: give sensors.<frame_id>.pose in a parameter '
-    'file, or its transform',
+    'unknown_extrinsics': 'the pose of this frame on the robot is unknown: set sensors.<frame_id>.pose in a parameter '
+    'file, or publish its transform',
     'late_transform': 'TF knows this frame, but no transform for the stamp arrived within pose_timeout',
-    'steep_sensor': 'the sensor looks up or down, by more than 60° or straight so with a part of its cone',
-    'before_odometry': 'the stamp is before the first odometry, or minutes before the newest; if that goes on, the '
+    'steep_sensor': 'the sensor points up or down by more than 60°, or its cone contains the vertical',
+    'before_odometry': 'the stamp is before the first odometry, or minutes before the newest; if this continues, the '
     'clocks of the drivers differ',
-    'zero_stamp': 'header.stamp is 0: have the driver fill it in',
+    'zero_stamp': 'header.stamp is 0: set it in the driver',
     'after_odometry': 'the recording ended before odometry reached the stamp',
     'no_odometry': 'odometry, or its transform to map_frame, did not reach the stamp within pose_timeout: has it '
     'stopped, or do the clocks of the drivers differ?',
-    'pose_gap': 'odometry has a gap longer than max_pose_gap here; where its messages come so seldom all the time, set '
-    'max_pose_gap to some more than is between two of them',
-    'pose_jump': 'odometry jumps here, faster than anything drives (are its poses in millimetres? They are in metres)',
-    'from_the_future': 'odometry went on for pose_timeout and is still before the stamp; is the clock of the sensor '
+    'pose_gap': 'odometry has a gap longer than max_pose_gap here; if its rate is always so low, set max_pose_gap to '
+    'more than the time between two messages',
+    'pose_jump': 'odometry jumps here, faster than a robot can drive (are its poses in millimetres? They must be in '
+    'metres)',
+    'from_the_future': 'odometry continued for pose_timeout and is still before the stamp; is the clock of the sensor '
     'ahead?',
     'time_jump': 'the clock jumped back while the reading waited for its pose',
     'too_many_waiting': 'too many readings waited for odometry at once',
     'too_far_away': 'the map would have more than max_cells cells; are pose and max_range right?',
-    'far_from_map': 'the reading is farther than max_jump from all that is mapped; if the pose is right, reset',
+    'far_from_map': 'the reading is farther than max_jump from the mapped area; if the pose is right, call reset',
     'large_cone': 'the cone has millions of cells; are range, field of view and resolution right?',
     'paused': 'the mapper was paused',
 }
@@ -90,12 +92,13 @@ CHOSEN = {'over_range', 'paused'}
 
 
 ODOMETRY_REASONS = {
-    'bad_pose': 'the pose is not finite, absurdly far away or tilted too far, or its quaternion is not normalised',
+    'bad_pose': 'the pose is not finite, impossibly far away or tilted too far, or its quaternion is not normalised',
     'long_frame_id': 'the frame_id or child_frame_id has more than 255 characters',
     'unprintable_frame_id': 'the frame_id or child_frame_id has characters that cannot be printed',
     'ahead_of_others': 'the stamp is more than a second ahead of those before and after it: do two nodes publish '
     'odometry, or was a clock set?',
-    'other_frame': 'the frame_id or child_frame_id is not that of the first odometry message; reset takes the new',
+    'other_frame': 'the frame_id or child_frame_id is not that of the first odometry message; call reset to use the '
+    'new one',
 }
 """Why an odometry message is rejected, in words."""
 

@@ -62,8 +62,8 @@ def shortage(cells: int, readings: int, threads: int) -> str:
     if free is None or needed <= free:
         return ''
     return (
-        f'EM of {readings} readings takes {_words(needed)} at the least, and {_words(free)} are free; '
-        f'lower max_readings, use a coarser resolution, or reset'
+        f'EM of {readings} readings takes {_words(needed)}, and {_words(free)} are free; lower max_readings, use a '
+        'coarser resolution, or call reset'
     )
 
 

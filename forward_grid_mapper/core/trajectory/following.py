@@ -198,7 +198,7 @@ class Follower:
         path, whole = self.correction.trajectory, self.correction.odometry
         odometry = since_jump(whole)
         if odometry is not whole and odometry.travel[-1] < SHORTEST:
-            self.obstacle = f'odometry jumped, and the robot drove no more than {odometry.travel[-1]:.1f} m after that'
+            self.obstacle = f'odometry jumped, and the robot drove only {odometry.travel[-1]:.1f} m after it'
             return None
         early = readings.stamp < odometry.stamp[0]
         driven = (readings.stamp <= self.correction.end) & ~early

@@ -380,12 +380,12 @@ def jump_words(begins: Sequence[Begin], parts: Sequence[Part]) -> str:
 
 
 OUTCOME_WORDS = {
-    FIRST: ', where there are hardly any readings before',
-    STOOD: ': the readings fit where the robot was before it, and what follows is mapped from there',
-    DRIVEN: ', and the readings after it fit where odometry has them',
+    FIRST: ', with hardly any readings before it',
+    STOOD: ': the readings fit the pose of the robot before it, and mapping continues from that pose',
+    DRIVEN: ', and the readings after it fit the poses of odometry',
     UNKNOWN: (
-        ', and the readings after it do not say where the robot was: they stay where odometry has them, which may be '
-        'wrong; after a jump call reset, or map what follows by itself'
+        ', and the readings after it do not determine the pose of the robot: they are mapped with the poses of '
+        'odometry, which may be wrong; after a jump call reset, or map the rest of the drive separately'
     ),
 }
 """The result for a jump in words, by `Begin.how`."""

@@ -60,7 +60,7 @@ def keep_if_not_worse(
     moved, turned = differences(odometry, path)
     return Refinement(
         True,
-        'readings do not say that odometry is better than what an earlier run found',
+        'the readings do not show that odometry is better than the trajectory of an earlier run',
         replaced(readings, odometry, path),
         path,
         before.calibration,

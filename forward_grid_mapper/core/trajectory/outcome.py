@@ -115,7 +115,11 @@ def joined_parts(
 
 def with_outliers(found: Refinement, readings: Readings, odometry: Odometry, count: int) -> Refinement:
     """Return the result for a drive from the one for its odometry without outliers; `count` is their number."""
-    named = f'{count} poses that odometry jumps to and back are outliers' if count > 1 else 'one pose is an outlier'
+    named = (
+        f'{count} poses of odometry are outliers (jumps and back)'
+        if count > 1
+        else 'one pose of odometry is an outlier (a jump and back)'
+    )
     reason = f'{found.reason}; {named}'
     if not found.accepted:
         return replace(found, reason=reason, readings=readings, trajectory=odometry)

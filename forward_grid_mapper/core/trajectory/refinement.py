@@ -61,14 +61,14 @@ LEAST_CERTAINTY = 0.9
 LEAST_MOVED = 0.15
 """Least difference from odometry of an accepted trajectory, metres (rms): about the error of the trajectory itself."""
 
-NOT_ENOUGH = ': not enough to tell that odometry is off'
+NOT_ENOUGH = ': this does not show that odometry is wrong'
 
 NO_WALLS = (
-    'echoes do not agree on directions of walls: it takes walls at right angles to each other beside the robot, and '
-    'odometry whose yaw holds for a few metres'
+    'the echoes do not agree on directions of walls: this needs walls at right angles to each other beside the robot, '
+    'and odometry with an accurate yaw over a few metres'
 )
 
-NOR_MATCHES = '; matches alone tell no better trajectory'
+NOR_MATCHES = '; scan matching alone gives no better trajectory'
 
 SCAN_MATCHED = 2 * TRAVEL
 """Largest median distance between poses of odometry for matching alone, metres. Scan matching takes the shape of two
@@ -132,7 +132,7 @@ class Refiner:
             return with_outliers(found, readings, odometry, len(odometry.stamp) - len(sound.stamp))
         jumped_to = jumps(odometry)
         if len(jumped_to) > MOST_JUMPS:
-            reason = f'odometry jumps {len(jumped_to)} times: it is no wheel odometry, or messages are missing'
+            reason = f'odometry jumps {len(jumped_to)} times: it is not wheel odometry, or messages are missing'
             return Refinement(False, reason, readings, odometry, {})
         jumped_to = with_doubtful(readings, odometry, jumped_to, self._parameters, self._stop)
         if not len(jumped_to):
@@ -211,12 +211,14 @@ class Refiner:
             if not revisited and not votes_suffice:
                 return unproven
             better = gain_at_revisits(scans, windows.node, nodes)
-            gain_words = f'with places seen before, {_gain_words(better)}' if revisited else _gain_words(better)
+            gain_words = f'with recognised places, {_gain_words(better)}' if revisited else _gain_words(better)
             if better.sigmas < (LEAST_SIGMAS if revisited else LEAST_SIGMAS_WITH_WALLS):
                 return keep_odometry(gain_words + NOT_ENOUGH, better)._replace(sure=agrees)
             if not revisited:
-                likelier = f'that walls stand at right angles is likelier by {vote_gain:.0f} nats than with odometry'
-                gain_words = f'{likelier}; {gain_words}'
+                gain_words = (
+                    f'with walls at right angles, the readings are more likely by {vote_gain:.0f} nats than with '
+                    f'odometry; {gain_words}'
+                )
         loops = found.loops if nodes is found.solution.nodes else []
         if nodes is found.solution.nodes:
             by_name = dict(zip(CALIBRATION, solver.calibration_of(found.solution).tolist(), strict=True))
@@ -254,7 +256,7 @@ class Refiner:
         moved, turned = differences(odometry, trajectory)
         if better.sigmas < LEAST_SIGMAS or moved < least_moved:
             return _without_better(by_walls.refinement)
-        at_revisits = 'with places seen before, ' if has_revisits(scans, nodes) else ''
+        at_revisits = 'with recognised places, ' if has_revisits(scans, nodes) else ''
         by_name = dict.fromkeys(CALIBRATION, 0.0) | {
             name: estimate.value
             for name, estimate in yaw_errors(odometry, trajectory).items()
@@ -262,7 +264,7 @@ class Refiner:
         }
         return Refinement(
             True,
-            f'walls are not taken to stand at right angles; {at_revisits}{_gain_words(better)}'
+            f'walls are not assumed to be at right angles; {at_revisits}{_gain_words(better)}'
             f'{_recognition_words(found.part)}',
             replaced(readings, odometry, trajectory),
             trajectory,
@@ -305,10 +307,10 @@ class Refiner:
 def without_times(readings: Readings, odometry: Odometry) -> str:
     """Return why the odometry does not cover all readings; empty if it does."""
     if not len(odometry.stamp):
-        return 'the poses of odometry are not at hand, as in a journal'
+        return 'there are no poses of odometry, as in a journal'
     early, late = readings.stamp.min(initial=odometry.stamp[0]), readings.stamp.max(initial=odometry.stamp[-1])
     if early < odometry.stamp[0] or late > odometry.stamp[-1]:
-        return "there are readings of a time that has no odometry, as where odometry's clock jumped"
+        return "there are readings at times without odometry, as after a jump of odometry's clock"
     return ''
 
 
@@ -318,20 +320,21 @@ def unfit(readings: Readings, odometry: Odometry) -> str:
         return reason
     if len(odometry.stamp) < 2 or odometry.travel[-1] < SHORTEST:
         return (
-            f'the drive is {odometry.travel[-1]:.1f} m long; from {SHORTEST:g} m on odometry drifts enough to be told'
+            f'the drive is {odometry.travel[-1]:.1f} m long; the drift of odometry can be measured from {SHORTEST:g} '
+            'm on'
         )
     if len(readings) < FEWEST_READINGS:
-        return f'there are {len(readings)} readings; it takes {FEWEST_READINGS}'
+        return f'there are {len(readings)} readings; at least {FEWEST_READINGS} are needed'
     if readings.echo.mean() < LEAST_ECHOES:
         return f'only {readings.echo.mean():.0%} of the readings have an echo'
     if len(np.unique(readings.sensor)) < LEAST_SENSORS:
-        return 'there is one sensor only, which cannot tell a turn from a step aside'
+        return 'there is only one sensor, which cannot distinguish a rotation from a sideways translation'
     return ''
 
 
 def too_little_words(moved: float) -> str:
     """Return the reason for keeping an odometry whose error, metres, is so small."""
-    return f'odometry is off by {moved:.2f} m, which is no more than sonar can tell'
+    return f'odometry is off by {moved:.2f} m, which is not more than the accuracy of sonar'
 
 
 def usual_step(odometry: Odometry) -> float:
@@ -343,14 +346,14 @@ def usual_step(odometry: Odometry) -> float:
 def too_sparse_words(apart: float) -> str:
     """Return why matching alone is not tried if poses are so far apart, metres."""
     return (
-        f'; poses of odometry are usually {apart:.1f} m apart, and matches alone need one every {SCAN_MATCHED:g} m: '
+        f'; poses of odometry are usually {apart:.1f} m apart, and scan matching needs one every {SCAN_MATCHED:g} m: '
         f'record odometry at a higher rate'
     )
 
 
 def lost_words(certainty: float) -> str:
     """Return the reason for keeping odometry if the heading is only this certain."""
-    return f'the heading was lost somewhere: that it is not off by a right angle is only {certainty:.0%} certain'
+    return f'the heading was lost: the probability that it is not wrong by a right angle is only {certainty:.0%}'
 
 
 def refined(odometry: Odometry, windows: Windows, nodes: Floats) -> Odometry:
@@ -375,9 +378,7 @@ def _heading_lost(drive: _Drive, certainty: float) -> _Attempt:
 
 def _gain_words(better: Gain) -> str:
     if not np.isfinite(better.error):
-        return (
-            'there are too few readings on maps of others to tell whether they are predicted better than with odometry'
-        )
+        return 'too few readings overlap with maps of other readings to compare the prediction with that of odometry'
     return f'readings are predicted {better.mean:+.3f} ± {better.error:.3f} nats a reading better than with odometry'
 
 
@@ -385,7 +386,7 @@ def _recognition_words(part: float) -> str:
     """Return the warning about the fraction of blocks on earlier visits that are recognised; empty if it is large."""
     if part >= LEAST_RECOGNISED:
         return ''
-    return f'; {part:.0%} of the way through places seen before is recognised: the drive may be bent as a whole'
+    return f'; {part:.0%} of the path through places seen before is recognised: the drive may be bent as a whole'
 
 
 def _report_part(watch: Watch, name: str, stage: str, part: float) -> None:

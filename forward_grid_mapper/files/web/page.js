@@ -163,10 +163,10 @@ class Page {
     }
     if (found.state === 'occupied' && this.evidence.count) {
       groups.append(make('li', {
-        textContent: `${signed(found.wall)} nats for the cell with its occupied neighbours, which share their readings`}));
+        textContent: `${signed(found.wall)} nats for the cell together with its occupied neighbours, which share their readings`}));
     }
     if (this.page.arrays.traversed[found.cell]) {
-      groups.append(make('li', {textContent: 'a sensor was moved over it, so it is free whatever the readings say'}));
+      groups.append(make('li', {textContent: 'a sensor traversed it, so it is free, independent of the readings'}));
     }
     box.append(groups);
     if (!readings.length) return;
@@ -191,7 +191,7 @@ class Page {
       more.addEventListener('click', () => this.listReadings(Infinity));
       box.append(more);
     }
-    box.append(make('p', {className: 'hint', textContent: 'Orange cones speak for an obstacle here, blue ones against it.'}));
+    box.append(make('p', {className: 'hint', textContent: 'Orange cones are evidence for an obstacle here, blue ones against it.'}));
   }
 
   /** Return when a reading was taken: seconds from the beginning of its drive, and which one if there are several. */
@@ -325,5 +325,5 @@ class Page {
 }
 
 unpack().then(page => { window.report = new Page(page); document.body.dataset.ready = 'yes'; }, error => {
-  $('cell').textContent = `This browser cannot show the page: ${error}. One of 2023 or later is needed.`;
+  $('cell').textContent = `This browser cannot show the page: ${error}. It needs a browser of 2023 or later.`;
 });

@@ -84,13 +84,16 @@ SCENARIOS: dict[str, tuple[Callable[[Messages], Messages], str]] = {
     ),
     'sensors turned to the left': (
         lambda m: m.mounted(turned(90)),
-        r'seem to be turned by 90 degrees to the left',
+        r'seem to be rotated by 90 degrees to the left',
     ),
     'sensors turned to the right': (
         lambda m: m.mounted(turned(-90)),
-        r'sensors seem to be turned by 90 degrees to the right',
+        r'sensors seem to be rotated by 90 degrees to the right',
     ),
-    'sensors front to back': (lambda m: m.mounted(turned(180)), r'the sensors seem to be turned by 180 degrees; check'),
+    'sensors front to back': (
+        lambda m: m.mounted(turned(180)),
+        r'the sensors seem to be rotated by 180 degrees; check',
+    ),
     'yaw of odometry clockwise': (
         lambda m: m.driven(lambda p: Pose2(p.x, p.y, -p.yaw)),
         r'y, or yaw, seems to have the wrong sign in it.*correct its driver',
@@ -109,11 +112,11 @@ SCENARIOS: dict[str, tuple[Callable[[Messages], Messages], str]] = {
     ),
     'odometry without orientation': (
         lambda m: m.driven(lambda p: Pose2(p.x, p.y, 0.0)),
-        r'yaw of odometry never changes, though the robot turns.*is the orientation left out',
+        r'yaw of odometry never changes, although the robot turns.*leave out the orientation',
     ),
     'ranges half a second late': (
         lambda m: m.late(0.5),
-        r'seem to be about 0\.5 s late.*must stamp a reading when',
+        r'seem to be about 0\.5 s late.*must stamp a reading at the time of its measurement',
     ),
     'ranges a second late': (lambda m: m.late(1.0), r'readings seem to be about 1 s late against those of odometry'),
     'odometry half a second late': (lambda m: m.late(-0.5), r'readings seem to be about 0\.5 s early'),
@@ -123,20 +126,20 @@ SCENARIOS: dict[str, tuple[Callable[[Messages], Messages], str]] = {
     ),
     'cones of 60 degrees for 15': (
         lambda m: m.wide(4.0),
-        r'field of view is stated as 60 degrees.*as if it were about 15;.*set the parameter field_of_view',
+        r'field of view is stated as 60 degrees.*fit about 15 degrees;.*set the parameter field_of_view',
     ),
-    'half of the field of view': (lambda m: m.wide(0.5), r'field of view is stated as 7 degrees.*if it were about 15'),
+    'half of the field of view': (lambda m: m.wide(0.5), r'field of view is stated as 7 degrees.*fit about 15'),
     'odometry in feet': (
         lambda m: m.driven(lambda p: Pose2(3.281 * p.x, 3.281 * p.y, p.yaw)),
-        r'the robot drives 1/3\.28 as far as odometry says.*in feet.*must state metres',
+        r'the robot drives 1/3\.28 as far as odometry says.*in feet.*must be in metres',
     ),
     'ranges and limits in feet': (
         lambda m: m.in_feet(),
-        r'the robot drives 3\.28 times as far as odometry says.*in feet.*must state metres',
+        r'the robot drives 3\.28 times as far as odometry says.*in feet.*must be in metres',
     ),
     'diameter of the wheels for their radius': (
         lambda m: m.driven(lambda p: Pose2(2 * p.x, 2 * p.y, p.yaw)),
-        r'the robot drives 1/2 as far as odometry says.*is the radius of the wheels wrong',
+        r'the robot drives 1/2 as far as odometry says.*is the wheel radius wrong',
     ),
 }
 

@@ -143,26 +143,29 @@ SECOND = 1_000_000_000
 
 SCENARIOS: dict[str, tuple[Callable[[], Messages], str]] = {
     'every message twice': (twice, r'copies of others.*recorded twice.*Leave one'),
-    'stamps of 0': (lambda: stamped(lambda stamp: 0), r'all stamps are one and the same.*fill in header\.stamp'),
+    'stamps of 0': (lambda: stamped(lambda stamp: 0), r'all stamps are equal.*set header\.stamp'),
     'stamps without nanoseconds': (
         lambda: stamped(lambda stamp: stamp - stamp % SECOND),
-        r'all stamps are whole seconds, though a sensor has 10 readings at each.*nanosec in nanoseconds',
+        r'all stamps are whole seconds, although a sensor has 10 readings at each.*nanosec in nanoseconds',
     ),
     'milliseconds in place of nanoseconds': (
         lambda: stamped(lambda stamp: stamp - stamp % SECOND + stamp % SECOND // 1_000_000),
         r'all stamps are whole seconds',
     ),
-    'one frame, one stamp a sweep': (lambda: one_frame(0), r'frame sonar take turns.*one frame_id.*Give each its own'),
-    'one frame, one after the other': (lambda: one_frame(8_000_000), r'frame sonar take turns.*one frame_id'),
+    'one frame, one stamp a sweep': (
+        lambda: one_frame(0),
+        r'frame sonar alternate.*the same frame_id.*Set a different one for each',
+    ),
+    'one frame, one after the other': (lambda: one_frame(8_000_000), r'frame sonar alternate.*the same frame_id'),
     'one frame, one after the other, while it turns': (
         lambda: one_frame(8_000_000, circling()),
-        r'frame sonar take turns.*one frame_id',
+        r'frame sonar alternate.*the same frame_id',
     ),
-    'odometry never moves': (lambda: standing(0.0), r'odometry stands still.*while the ranges.*encoders'),
-    'odometry stops in the middle': (lambda: standing(0.5), r'odometry stands still for \d+ s'),
+    'odometry never moves': (lambda: standing(0.0), r'odometry does not change.*while the ranges.*encoders'),
+    'odometry stops in the middle': (lambda: standing(0.5), r'odometry does not change for \d+ s'),
     'poses in centimetres': (lambda: moved_by(100), r'poses move at \d+ m/s: are they in millimetres or centimetres'),
-    'a sensor at 1.2 m': (lambda: stuck(2, 1.2345), r'gives one and the same range.*Repair it'),
-    'a sensor at 0.2 m': (lambda: stuck(5, 0.2), r'sensor \S+ \(0\.200 m\) gives one and the same range'),
+    'a sensor at 1.2 m': (lambda: stuck(2, 1.2345), r'gives the same range.*Repair it'),
+    'a sensor at 0.2 m': (lambda: stuck(5, 0.2), r'sensor \S+ \(0\.200 m\) gives the same range'),
     'field of view of 1 degree': (
         lambda: drive().with_ranges(lambda m: m._replace(field_of_view=math.radians(1))),
         r'field of view is 1 degrees.*set the parameter field_of_view',
@@ -175,11 +178,11 @@ SCENARIOS: dict[str, tuple[Callable[[], Messages], str]] = {
         lambda: drive().with_ranges(
             lambda m: m._replace(max_range=4 * m.max_range, range=math.inf if m.range >= m.max_range else m.range)
         ),
-        r'no echo comes from beyond.*does the sensor reach so far.*set the parameter max_range',
+        r'no echo is from beyond.*does the sensor reach that far.*set the parameter max_range',
     ),
     'no echo is 3 m, max_range 5 m': (
         lambda: own_silence(3.0),
-        r'of the echoes are at 3\.000 m.*where it hears nothing.*set the parameter max_range to 2\.9,',
+        r'of the echoes are at 3\.000 m.*if there is no echo.*set the parameter max_range to 2\.9,',
     ),
     'no echo is a float below max_range': (lambda: own_silence(4.9999995), r'of the echoes are at 5\.000 m'),
     'no limit stated': (
@@ -196,7 +199,7 @@ SCENARIOS: dict[str, tuple[Callable[[], Messages], str]] = {
     'ranges in centimetres': (lambda: scaled(100, 1), r'are the ranges in centimetres and the limits in metres'),
     'ranges in centimetres, of near walls': (
         lambda: scaled(52, 1),
-        r'times as large, and so count as no echo: are the ranges in centimetres',
+        r'times as large, and so are treated as no echo: are the ranges in centimetres',
     ),
     'ranges in millimetres': (lambda: scaled(1000, 1), r'are the ranges in millimetres and the limits in metres'),
     'ranges in feet': (lambda: scaled(3.281, 1), r'are the ranges in feet and the limits in metres'),
@@ -328,7 +331,7 @@ def test_a_wall_that_is_far_and_always_as_far_is_no_silence() -> None:
     poses = [last._replace(stamp=last.stamp + k * 100_000_000) for k in range(1, 3000)]
     farthest = [m._replace(range=4.4) for m in rounded.ranges[-len(rounded.extrinsics) :]]
     ranges = [m._replace(stamp=pose.stamp) for pose in poses for m in farthest]
-    assert not [text for text in told(Messages(rounded.extrinsics, poses, ranges)) if 'hears nothing' in text]
+    assert not [text for text in told(Messages(rounded.extrinsics, poses, ranges)) if 'if there is no echo' in text]
 
     at_the_side = {'left': Pose2(0.0, 0.0, math.pi / 2)}
     beside = [Pose2(min(k, 200 - k) * 0.1, 0.0, 0.0) for k in range(200)]
@@ -336,7 +339,7 @@ def test_a_wall_that_is_far_and_always_as_far_is_no_silence() -> None:
     ranges = [
         RangeMessage(k * 250_000_000, 'left', round(1.5 + 0.01 * math.sin(k), 2), 0.1, 4.0, 0.26) for k in range(400)
     ]
-    assert not [text for text in told(Messages(at_the_side, poses, ranges)) if 'hears nothing' in text]
+    assert not [text for text in told(Messages(at_the_side, poses, ranges)) if 'if there is no echo' in text]
 
 
 def test_one_reading_at_each_whole_second_is_no_fault() -> None:

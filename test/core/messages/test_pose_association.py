@@ -482,7 +482,7 @@ def test_a_stamp_that_was_never_filled_in_is_told_apart() -> None:
     p.add_range(sonar(0.0))
     p.add_range(sonar(99.0))
     assert p.rejected == {'zero_stamp': 1, 'before_odometry': 1}
-    assert 'have the driver fill it in' in REASONS['zero_stamp']
+    assert 'set it in the driver' in REASONS['zero_stamp']
     # where time begins with 0, it is a stamp as any other
     p = associator()
     p.add_odometry(odometry(0.0))

@@ -45,7 +45,7 @@ def test_a_sensor_that_loses_nearly_all_readings_is_named_however_few_they_are()
     fine = {f'sonar_{k}': (100, 20) for k in range(20)}
     by_frame = {'left': {'too_near': 95, 'nan_range': 3}, 'sonar_3': {'too_near': 50}, 'right': {'nan_range': 29}}
     (told,) = sensor_rejections(by_frame, {**fine, 'left': (2, 0)})
-    assert told.startswith('nearly all readings of left were rejected as too_near: ') and 'dead sensor' in told
+    assert told.startswith('nearly all readings of left were rejected as too_near: ') and 'sensor is dead' in told
     assert sensor_rejections(by_frame, {**fine, 'left': (20, 0)}) == []
     assert sensor_rejections(by_frame, fine, known={'too_near'}) == []
     # a frame without a name is told of by its reason, and so is what costs many of all readings

@@ -52,7 +52,7 @@ def test_what_is_free_is_known_and_bounded_by_the_group(monkeypatch: pytest.Monk
     (tmp_path / 'memory.current').write_text('2000000\n')
     assert free_memory() == 3_000_000
     assert shortage(1000, 10, 1) == ''
-    assert '15 MB at the least, and 3 MB are free' in shortage(10**5, 12_000, 1)
+    assert '15 MB, and 3 MB are free' in shortage(10**5, 12_000, 1)
     (tmp_path / 'memory.max').write_text('max\n')
     assert shortage(10**5, 12_000, 1) == ''
 

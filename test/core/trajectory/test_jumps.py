@@ -141,7 +141,7 @@ def test_odometry_that_begins_anew_goes_on_where_the_robot_stood(
     assert found.accepted and not found.unplaced
     assert off(exact, odometry) > 2.0
     assert off(exact, found.trajectory) < 0.2
-    assert 'the readings fit where the robot was before it' in found.jumps
+    assert 'the readings fit the pose of the robot before it' in found.jumps
     assert found.jumps in found.reason
     assert np.array_equal(found.trajectory.stamp, odometry.stamp)
     assert np.hypot(*np.diff(found.trajectory.pose[:, :2], axis=0).T).max() < 0.3, 'no jump is left'
@@ -171,7 +171,7 @@ def test_missing_messages_are_no_reason_to_move_exact_odometry(exact: Recording)
     assert len(jumps(odometry)) == 1
     found = Refiner(Parameters()).run(readings, odometry)
     assert not found.accepted and not found.unplaced
-    assert 'fit where odometry has them' in found.jumps
+    assert 'fit the poses of odometry' in found.jumps
     assert found.readings is readings and found.trajectory is odometry
 
 
@@ -193,7 +193,7 @@ def test_a_robot_that_was_carried_away_is_told_of(exact: Recording, bent: tuple[
     whole = Odometry.of(stamp, np.concatenate([odometry.pose, compose(away, elsewhere.pose)]))
     found = Refiner(Parameters()).run(both, whole)
     assert found.unplaced
-    assert 'do not say where the robot was' in found.jumps and 'reset' in found.jumps
+    assert 'do not determine the pose of the robot' in found.jumps and 'reset' in found.jumps
     before, after = found.trajectory.between(0, int(odometry.stamp[-1])), found.trajectory.between(gap, stamp[-1])
     assert off(exact, before) < 0.2, 'what came before is refined all the same'
     assert np.hypot(*(after.pose[0] - before.pose[-1])[:2]) > 30.0
@@ -203,7 +203,7 @@ def test_a_robot_that_was_carried_away_is_told_of(exact: Recording, bent: tuple[
 def test_a_few_readings_after_a_jump_are_not_enough(bent: tuple[Readings, Odometry]) -> None:
     readings, odometry = begun_anew(*bent, 0.98)
     found = Refiner(Parameters()).run(readings, odometry)
-    assert found.unplaced and 'do not say' in found.jumps
+    assert found.unplaced and 'do not determine' in found.jumps
     assert found.accepted, 'the part before is refined'
     first = int(0.98 * len(odometry.stamp))
     correction = Correction(
@@ -248,7 +248,7 @@ def test_a_yaw_that_begins_anew_is_told_from_turns(
     readings, odometry = begun_anew(readings, odometry, 0.55, (x, y, yaw + 1.2))
     assert first in doubtful_steps(odometry) and not len(jumps(odometry))
     found = Refiner(Parameters()).run(readings, odometry)
-    assert found.accepted and found.jumps.count('the readings fit where the robot was before it') == 1
+    assert found.accepted and found.jumps.count('the readings fit the pose of the robot before it') == 1
     assert rms_after_alignment(odometry.pose, true.pose) > 1.0
     assert rms_after_alignment(found.trajectory.pose, true.pose) < 0.2
 
@@ -275,7 +275,7 @@ def test_odometry_that_always_jumps_is_refused(bent: tuple[Readings, Odometry]) 
     pose = odometry.pose.copy()
     pose[np.arange(len(pose)) // (len(pose) // 50) % 2 == 1] += np.array([4.0, 0.0, 0.0])
     left = Refiner(Parameters()).run(readings, replace(odometry, pose=pose))
-    assert not left.accepted and 'no wheel odometry' in left.reason
+    assert not left.accepted and 'not wheel odometry' in left.reason
     assert left.readings is readings
 
 
@@ -285,7 +285,7 @@ def test_odometry_may_begin_anew_again_and_again(exact: Recording, bent: tuple[R
     assert len(jumps(odometry)) == 2
     found = Refiner(Parameters()).run(readings, odometry)
     assert found.accepted and not found.unplaced
-    assert found.jumps.count('the readings fit where the robot was before it') == 2
+    assert found.jumps.count('the readings fit the pose of the robot before it') == 2
     assert off(exact, found.trajectory) < 0.2
 
 
@@ -315,7 +315,7 @@ def test_poses_that_odometry_jumps_to_and_back_are_left_out(
     assert np.isin(odometry.stamp, sound.stamp).sum() == len(sound.stamp) == len(pose) - 30 * count
     assert without_outliers(odometry) is odometry
     found = Refiner(Parameters()).run(moved(readings, odometry, wild), wild)
-    assert found.accepted and f'{30 * count} poses that odometry jumps to and back are outliers' in found.reason
+    assert found.accepted and f'{30 * count} poses of odometry are outliers (jumps and back)' in found.reason
     assert np.array_equal(found.trajectory.stamp, wild.stamp)
     assert off(exact, found.trajectory) < 0.2
 
@@ -327,7 +327,7 @@ def test_with_outliers_a_drive_that_is_left_alone_is_as_it_came(exact: Recording
     wild = Odometry.of(true.stamp, pose)
     came = moved(readings, true, wild)
     found = Refiner(Parameters()).run(came, wild)
-    assert not found.accepted and 'one pose is an outlier' in found.reason
+    assert not found.accepted and 'one pose of odometry is an outlier' in found.reason
     assert found.readings is came and found.trajectory is wild
 
 
@@ -368,7 +368,7 @@ def test_following_needs_some_way_behind_a_jump(bent: tuple[Readings, Odometry])
     readings, odometry = begun_anew(*bent, 0.9)
     follower = Follower(Correction(odometry, odometry), {}, Parameters())
     assert not follower.follow(readings, odometry)
-    assert 'odometry jumped, and the robot drove no more than' in follower.obstacle
+    assert 'odometry jumped, and the robot drove only' in follower.obstacle
 
 
 def test_following_ends_where_odometry_jumps(bent: tuple[Readings, Odometry]) -> None:

@@ -84,11 +84,11 @@ def test_drift_is_taken_out(tour, bent, outcome, stages) -> None:
 
 
 def test_what_speaks_for_it_is_named(bent, monkeypatch, outcome) -> None:
-    assert outcome.reason.startswith(('readings are predicted', 'that walls stand at right angles'))
+    assert outcome.reason.startswith(('readings are predicted', 'with walls at right angles'))
     # no readings are predicted so much better, and nothing was seen before, so the walls have the word
     monkeypatch.setattr(refinement, 'LEAST_SIGMAS', 1e9)
     monkeypatch.setattr(refinement, 'has_revisits', lambda *rest: False)
-    assert 'that walls stand at right angles is likelier by' in Refiner(Parameters()).run(*bent).reason
+    assert 'with walls at right angles, the readings are more likely by' in Refiner(Parameters()).run(*bent).reason
 
 
 @pytest.fixture
@@ -114,7 +114,7 @@ def test_places_seen_before_prove_what_nothing_nearby_does(tour, bent, monkeypat
     monkeypatch.setattr(refinement, 'gain_over_drive', lambda *rest: Gain(-0.05, 0.01))
     found, true = Refiner(Parameters()).run(*bent), odometry_of(tour).pose
     assert found.accepted
-    assert found.reason.startswith('with places seen before, readings are predicted +')
+    assert found.reason.startswith('with recognised places, readings are predicted +')
     assert rms_after_alignment(found.trajectory.pose, true) < 0.2
     # the same without such places, and without walls that say that the yaw is off
     monkeypatch.setattr(refinement, 'gain_at_revisits', lambda *rest: Gain(0.0, 0.01))
@@ -122,7 +122,7 @@ def test_places_seen_before_prove_what_nothing_nearby_does(tour, bent, monkeypat
     monkeypatch.setattr(refinement, 'LEAST_VOTE_GAIN', 1e9)
     for outcome in (left, Refiner(Parameters()).run(*bent)):
         assert not outcome.accepted
-        assert 'not enough to tell' in outcome.reason
+        assert 'does not show that odometry is wrong' in outcome.reason
 
 
 def test_walls_are_no_proof_where_places_seen_before_say_nothing(bent, monkeypatch, solved_once) -> None:
@@ -132,13 +132,13 @@ def test_walls_are_no_proof_where_places_seen_before_say_nothing(bent, monkeypat
     monkeypatch.setattr(refinement, 'gain_at_revisits', lambda *rest: Gain(0.001, 0.01))
     left = Refiner(Parameters()).run(*bent)
     assert not left.accepted
-    assert left.reason.startswith('with places seen before, readings are predicted +')
-    assert 'not enough to tell' in left.reason
+    assert left.reason.startswith('with recognised places, readings are predicted +')
+    assert 'does not show that odometry is wrong' in left.reason
     # where the robot came to no place twice, walls are proof, unless readings are predicted worse
     monkeypatch.setattr(refinement, 'has_revisits', lambda *rest: False)
     found = Refiner(Parameters()).run(*bent)
     assert found.accepted
-    assert found.reason.startswith('that walls stand at right angles is likelier')
+    assert found.reason.startswith('with walls at right angles, the readings are more likely')
     monkeypatch.setattr(refinement, 'gain_at_revisits', lambda *rest: Gain(-0.02, 0.01))
     worse = Refiner(Parameters()).run(*bent)
     assert not worse.accepted
@@ -250,8 +250,8 @@ def nothing(readings: Readings, odometry: Odometry) -> tuple[Readings, Odometry]
         (still, '0.0 m long'),
         (silent, 'have an echo'),
         (one_sensor, 'one sensor'),
-        (late, 'no odometry'),
-        (nothing, 'not at hand'),
+        (late, 'without odometry'),
+        (nothing, 'no poses of odometry'),
     ],
 )
 def test_what_cannot_be_refined_is_left_alone(bent, spoilt, word) -> None:

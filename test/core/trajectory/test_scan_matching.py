@@ -202,7 +202,7 @@ def test_a_building_without_right_angles_is_refined(exact, bent) -> None:
     outcome = Refiner(Parameters()).run(recording.readings, odometry)
     assert rms_after_alignment(odometry.pose, true.pose) > 0.6
     assert outcome.accepted and not outcome.right_angles
-    assert outcome.reason.startswith('walls are not taken to stand at right angles; with places seen before')
+    assert outcome.reason.startswith('walls are not assumed to be at right angles; with recognised places')
     assert rms_after_alignment(outcome.trajectory.pose, true.pose) < 0.25
     assert outcome.trajectory.pose[0] == pytest.approx(odometry.pose[0], abs=1e-6)
     assert outcome.loops > 0
@@ -364,10 +364,10 @@ def test_places_seen_before_are_named_where_there_are_any(bent, scans, matched, 
     drive_of = _Drive(recording.readings, odometry, scans.windows, scans)
     found = Refiner(Parameters())._at_any_angle(drive_of, by_walls(scans, recording, odometry), 0.15)
     assert not found.right_angles
-    assert ('with places seen before' in found.reason) == again
+    assert ('with recognised places' in found.reason) == again
     # none of the places is recognised
     assert found.reason.endswith(
-        '; 0% of the way through places seen before is recognised: the drive may be bent as a whole'
+        '; 0% of the path through places seen before is recognised: the drive may be bent as a whole'
     )
     told = told._replace(part=LEAST_RECOGNISED)
     found = Refiner(Parameters())._at_any_angle(drive_of, by_walls(scans, recording, odometry), 0.15)
