@@ -127,8 +127,9 @@ def input_warnings(readings: Readings) -> list[str]:
         # the other checks compare readings in their order
         return [text]
     by_time = readings.select(np.argsort(readings.stamp, kind='stable'))
-    checks = (_copies, _shared_frame, _speed, _standing, _stuck, _ceiling, _floor, _field_of_view, _reach, _scatter, _extent)
-    return [text for check in checks if (text := check(by_time))]
+    of_drives = (_copies, _shared_frame, _speed, _standing, _stuck, _extent)
+    of_messages = (_ceiling, _floor, _field_of_view, _reach, _scatter)
+    return [text for check in (*of_drives, *of_messages) if (text := check(by_time))]
 
 
 def _sensors(readings: Readings) -> Iterable[tuple[str, Readings]]:
@@ -314,8 +315,8 @@ def _floor(readings: Readings) -> str:
         return ''
     return (
         f'{count / len(heard):.0%} of the echoes are at {shortest:.3f} m, hardly any is as short, and no reading is '
-        f'without echo: is that what the driver sends where it hears nothing? Have it send +inf (REP 117), or the robot '
-        f'is mapped as walled in'
+        f'without echo: is that what the driver sends where it hears nothing? Have it send +inf (REP 117), or the '
+        f'robot is mapped as walled in'
     )
 
 
@@ -331,7 +332,7 @@ def _echoes_of_all_that_answer(readings: Readings) -> tuple[Floats, Floats]:
 def _all_around(yaw: Floats) -> bool:
     """Return whether directions are many: a robot that follows a wall sees it in the same ones for long."""
     sectors = np.bincount((np.remainder(yaw, 2 * math.pi) / (2 * math.pi) * 12).astype(np.int64))
-    return np.count_nonzero(sectors >= LEAST) >= DIRECTIONS
+    return int(np.count_nonzero(sectors >= LEAST)) >= DIRECTIONS
 
 
 def _moving(mine: Readings) -> NDArray[np.bool_]:
