@@ -32,6 +32,15 @@ __all__ = ['Drive', 'Extrinsics', 'read_drive']
 NOWHERE = {'unknown_extrinsics', 'after_odometry'}
 """Why readings are rejected where only the poses of the sensors are missing: nearly every bag ends with a range."""
 
+NO_STATIC = (
+    'the bag has no /tf_static (nodes publish it once, as they start: record it from the start; of a split bag the '
+    'first file has it, so give the whole folder)'
+)
+"""What is said where no transform is known."""
+
+NAMED = 3
+"""Frames that are named as examples."""
+
 MOST_OPTIONS = 24
 """Sensors whose options a message spells out, to be copied."""
 
@@ -104,17 +113,39 @@ class Extrinsics:
     def advice(self, base_frame: str, frames: Sequence[str]) -> str:
         """Say what to do about frames without a pose."""
         known = self._transforms.frames
-        joined = f'/tf_static connects {", ".join(known[:12])}' if known else 'the bag has no /tf_static'
+        joined = f'/tf_static connects {", ".join(known[:12])}' if known else NO_STATIC
         if not base_frame:
             joined += '; odometry has no child_frame_id, which is needed to look up transforms'
         reasons = ''.join(f' {self.unusable[frame]}' for frame in frames if frame in self.unusable)
-        reasons += self._on_joints(frames)
+        reasons += self._on_joints(frames) + self._other_names(base_frame, frames)
         options = ' '.join(f'--sensor {quoted(f"{frame}=x,y,yaw")}' for frame in frames[:MOST_OPTIONS])
         more = ', and so on' if len(frames) > MOST_OPTIONS else ''
         return (
             f'no pose on the robot (frame {base_frame or "?"}) is known for {", ".join(frames)}: {joined}.{reasons} '
             f'Give {options}{more}, in metres and radians (or 90deg), or sensors.{frames[0]}.pose in --params'
         )
+
+    def _other_names(self, base_frame: str, frames: Sequence[str]) -> str:
+        """Say which frames the transforms have with another prefix, or that they lack the robot's."""
+        known = self._transforms.frames
+        by_end = {name.rpartition('/')[2]: name for name in reversed(known)}
+        unknown = [frame for name in (base_frame, *frames) if (frame := name.lstrip('/')) and frame not in known]
+        pairs = [(by_end[end], frame) for frame in unknown if (end := frame.rpartition('/')[2]) in by_end]
+        # where both have a prefix, they are of two robots
+        found = [f'{name}, not {frame}' for name, frame in pairs if '/' not in name or '/' not in frame]
+        if found:
+            more = f', and {len(found) - NAMED} more' if len(found) > NAMED else ''
+            return (
+                f' The transforms have {"; ".join(found[:NAMED])}{more}: set the same prefix in the drivers of ranges '
+                f'and odometry as in the publisher of the transforms.'
+            )
+        tops = sorted({self._transforms.top_of(frame) for frame in frames} & set(known))
+        if tops and base_frame.lstrip('/') in unknown:
+            return (
+                f' {base_frame} is the child_frame_id of odometry, and the transforms do not join it to {tops[0]}: '
+                f'publish that transform, or have odometry name {tops[0]}.'
+            )
+        return ''
 
     def _on_joints(self, frames: Sequence[str]) -> str:
         """Say which frames hang on others that may move."""
@@ -298,8 +329,12 @@ def _nothing_associated(
             f'{why} the same clock (use_sim_time)?'
         )
     reasons = '; '.join(f'{count} {reason} ({REASONS[reason]})' for reason, count in associator.rejected.most_common())
-    for reason, count in associator.odometry_rejected.most_common():
-        reasons += f'; {count} odometry messages were rejected too: {ODOMETRY_REASONS[reason]}'
+    refused = associator.odometry_rejected
+    if set(associator.rejected) == {'no_odometry'} and refused.total() == associator.odometry_received > 0:
+        # the clocks have no part in it
+        reasons = f'none of {counted(refused.total(), "odometry message")} could be used'
+    for reason, count in refused.most_common():
+        reasons += f'; {count} odometry messages were rejected: {ODOMETRY_REASONS[reason]}'
     hints = ''.join(f'; {warning}' for warning in (*lookup.steep.values(), *associator.limits.warnings()))
     if associator.unknown_frames:
         hints += f'; {lookup.advice(associator.base_frame, sorted(associator.unknown_frames))}'

@@ -182,6 +182,7 @@ def test_no_frame_has_a_pose(tmp_path: Path, capsys: pytest.CaptureFixture[str])
     said = refused_drive(capsys, tmp_path, tape()._replace(extrinsics=()))
     assert all(frame in said for frame in FRAMES)
     assert 'no /tf_static' in said and f'--sensor {FRAMES[0]}=x,y,yaw' in said and f'sensors.{FRAMES[0]}.pose' in said
+    assert 'of a split bag the first file has it, so give the whole folder' in said
 
 
 def test_a_bag_that_ends_with_a_range_is_told_the_same(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -213,6 +214,17 @@ def test_names_that_would_write_on_the_terminal_are_rejected_and_shown_as_text(t
 def test_frames_that_do_not_join_the_robot(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     said = refused_drive(capsys, tmp_path, tape().with_odometry(child_frame_id='base_footprint'))
     assert 'base_footprint' in said and 'base_link' in said and '--sensor' in said
+    assert 'do not join it to base_link: publish that transform, or have odometry name base_link' in said
+
+
+def test_frames_with_another_prefix_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    drive = tape().with_odometry(child_frame_id='robot1/base_link')
+    said = refused_drive(capsys, tmp_path, drive)
+    assert 'The transforms have base_link, not robot1/base_link: set the same prefix' in said
+    ranges = [m._replace(frame_id=f'robot1/{m.frame_id}') for m in drive.ranges]
+    (tmp_path / 'all').mkdir()
+    said = refused_drive(capsys, tmp_path / 'all', drive._replace(ranges=ranges))
+    assert f'base_link, not robot1/base_link; {FRAMES[0]}, not robot1/{FRAMES[0]}' in said and 'and 6 more: set' in said
 
 
 def test_odometry_that_does_not_name_the_robot(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -259,6 +271,7 @@ def test_quaternions_that_are_not_normalised(tmp_path: Path, capsys: pytest.Capt
     said = refusal(capsys, tmp_path, bag, '-o', tmp_path / 'maps')
     assert f'all {COUNT} readings were rejected' in said
     assert f'{len(tape().odometry)} odometry messages' in said and 'quaternion is not normalised' in said
+    assert 'cos(yaw/2)' in said and 'clocks' not in said
 
 
 def test_some_odometry_without_a_pose(tmp_path: Path) -> None:

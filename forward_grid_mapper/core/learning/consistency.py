@@ -73,6 +73,13 @@ ALIGNED, AWRY = 0.9, 0.7
 SAME_YAW = 0.01
 """Radians within which the yaw of odometry never changes."""
 
+SPINNING = 10.0
+"""Radians a second in which no robot does half of its turning: a quarter turn a second seems to be 90 in degrees."""
+
+TURNED, TURNING = 2 * math.pi, 0.05
+"""Radians that the robot must turn altogether before that is said, and part of the time in which it must turn so fast:
+odometry may jump now and then."""
+
 REP_103 = 'REP 103 has x forward, y to the left and yaw counter-clockwise'
 
 
@@ -127,7 +134,8 @@ def consistency_warnings(
     drive = _drive(readings, extrinsics)
     if drive is None:
         return []
-    if told := _axes(drive):
+    # a yaw in degrees points anywhere, and so may look like any other fault
+    if told := _spinning(drive) or _axes(drive):
         return [told]
     drive = _stretch(drive)
     p = _coarse(parameters or Parameters(), drive.readings)
@@ -270,6 +278,22 @@ def _travel(drive: _Drive) -> tuple[NDArray[np.int64], Floats]:
     at = np.searchsorted(driven, np.arange(STEP, driven[-1], STEP))
     at = at[np.diff(at, prepend=-1) > 0]
     return at[:-1], np.arctan2(np.diff(y[at]), np.diff(x[at]))
+
+
+def _spinning(drive: _Drive) -> str:
+    """Look for a yaw in another unit than radians: the robot seems to turn far too fast, whenever it turns."""
+    known, first = np.unique(drive.readings.stamp, return_index=True)
+    seconds = np.diff(known) / NANOSECONDS
+    turned = np.abs(np.remainder(np.diff(drive.robot[2, first]) + math.pi, 2 * math.pi) - math.pi)
+    fast = turned > SPINNING * seconds
+    total = float(turned.sum())
+    if total < TURNED or turned[fast].sum() < total / 2 or seconds[fast].sum() < TURNING * seconds.sum():
+        return ''
+    speed = float(np.median(turned[fast] / seconds[fast]))
+    return (
+        f'the yaw of the robot turns at {speed:.0f} rad/s: is it in degrees? Odometry has it as a quaternion, whose '
+        f'z is the sine, and w the cosine, of half the yaw in radians: correct its driver, or the file of poses'
+    )
 
 
 def _axes(drive: _Drive) -> str:

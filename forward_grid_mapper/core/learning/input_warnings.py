@@ -96,9 +96,18 @@ CEILING, ABOVE = 0.05, 0.005
 NONE = 0.01
 """Part of the readings that are without echo then, at the most."""
 
+SAME = 0.0005
+"""Metres by which ranges that a driver sends for one and the same may differ."""
+
 BELOW, DIRECTIONS = 0.05, 3
 """Metres below that range in which there are few echoes, unlike those of a wall; and twelfths of the circle, at least,
 in which it is sent."""
+
+FLOOR = 0.1
+"""Metres above the shortest range of all in which there are few echoes, where it stands for 'no echo'."""
+
+SCATTER = 0.5
+"""Metres by which the ranges of no sonar scatter."""
 
 HANDFUL, SWEEPS = 0.02, 2
 """Part of readings, and rounds of all sensors, that may not make the map much larger; a wild pose places a round."""
@@ -118,8 +127,9 @@ def input_warnings(readings: Readings) -> list[str]:
         # the other checks compare readings in their order
         return [text]
     by_time = readings.select(np.argsort(readings.stamp, kind='stable'))
-    checks = (_copies, _shared_frame, _speed, _standing, _stuck, _ceiling, _field_of_view, _reach, _extent)
-    return [text for check in checks if (text := check(by_time))]
+    of_drives = (_copies, _shared_frame, _speed, _standing, _stuck, _extent)
+    of_messages = (_ceiling, _floor, _field_of_view, _reach, _scatter)
+    return [text for check in (*of_drives, *of_messages) if (text := check(by_time))]
 
 
 def _sensors(readings: Readings) -> Iterable[tuple[str, Readings]]:
@@ -271,30 +281,58 @@ def _drove(mine: Readings) -> bool:
 
 def _ceiling(readings: Readings) -> str:
     """Look for a range that stands for 'no echo', below max_range: the longest one of all, ever again."""
-    echo = readings.echo
-    if np.count_nonzero(~echo) > NONE * len(readings):
-        return ''
-    # a robot that stands sees one range for long
-    parts = [mine.select(mine.echo & _moving(mine)) for _, mine in _sensors(readings)]
-    heard: Floats = np.concatenate([mine.z for mine in parts]) if parts else np.zeros(0)
+    heard, towards = _echoes_of_all_that_answer(readings)
     if len(heard) < ECHOES:
         return ''
     longest = round(float(np.quantile(heard, 1.0 - ABOVE)), 3)
-    same = np.abs(heard - longest) < 0.0005
+    same = np.abs(heard - longest) < SAME
     nearly = (heard > longest - BELOW) & (heard < longest) & ~same
     count, almost = int(np.count_nonzero(same)), int(np.count_nonzero(nearly))
-    if count < CEILING * len(heard) or count < 2 * almost:
-        return ''
-    # a robot that follows a wall sees it in the same directions for long
-    towards = np.remainder(np.concatenate([mine.yaw for mine in parts])[same], 2 * math.pi)
-    sectors = np.bincount((towards / (2 * math.pi) * 12).astype(np.int64))
-    if np.count_nonzero(sectors >= LEAST) < DIRECTIONS:
+    if count < CEILING * len(heard) or count < 2 * almost or not _all_around(towards[same]):
         return ''
     return (
         f'{count / len(heard):.0%} of the echoes are at {longest:.3f} m, hardly any is longer, and no reading is '
         'without an echo: does the driver send this range if there is no echo? Then set the parameter max_range to '
         f'{0.98 * longest:.2g}, otherwise a wall is mapped at that range'
     )
+
+
+def _floor(readings: Readings) -> str:
+    """Look for the same below all other ranges, as where a driver raises its 0 for 'no echo' to min_range."""
+    heard, towards = _echoes_of_all_that_answer(readings)
+    if len(heard) < ECHOES:
+        return ''
+    shortest = round(float(np.quantile(heard, ABOVE)), 3)
+    same = np.abs(heard - shortest) < SAME
+    nearly = (heard < shortest + FLOOR) & (heard > shortest) & ~same
+    count, almost = int(np.count_nonzero(same)), int(np.count_nonzero(nearly))
+    if count < CEILING * len(heard) or count < 2 * almost or not _all_around(towards[same]):
+        return ''
+    # what a single sensor hears, or others all the time, may be the robot
+    parts = [float(np.mean(np.abs(mine.z - shortest) < SAME)) for _, mine in _sensors(readings)]
+    at_it = [part for part in parts if part >= CEILING]
+    if len(at_it) < min(2, len(parts)) or min(at_it) > 0.5:
+        return ''
+    return (
+        f'{count / len(heard):.0%} of the echoes are at {shortest:.3f} m, hardly any is as short, and no reading is '
+        f'without echo: is that what the driver sends where it hears nothing? Have it send +inf (REP 117), or the '
+        f'robot is mapped as walled in'
+    )
+
+
+def _echoes_of_all_that_answer(readings: Readings) -> tuple[Floats, Floats]:
+    """Return ranges and directions, radians, of the echoes of a robot that moves; none where echoes are missing."""
+    # a robot that stands sees one range for long
+    parts = [mine.select(mine.echo & _moving(mine)) for _, mine in _sensors(readings)]
+    if not parts or np.count_nonzero(~readings.echo) > NONE * len(readings):
+        return np.zeros(0), np.zeros(0)
+    return np.concatenate([mine.z for mine in parts]), np.concatenate([mine.yaw for mine in parts])
+
+
+def _all_around(yaw: Floats) -> bool:
+    """Return whether directions are many: a robot that follows a wall sees it in the same ones for long."""
+    sectors = np.bincount((np.remainder(yaw, 2 * math.pi) / (2 * math.pi) * 12).astype(np.int64))
+    return int(np.count_nonzero(sectors >= LEAST)) >= DIRECTIONS
 
 
 def _moving(mine: Readings) -> NDArray[np.bool_]:
@@ -327,10 +365,7 @@ def _field_of_view(readings: Readings) -> str:
 
 
 def _reach(readings: Readings) -> str:
-    # what a fixed-distance ranger says of an echo (`rep117.measure`) is half of its max_range
-    echo = readings.echo & ~(
-        np.isclose(2 * readings.z, readings.z_max) & np.isclose(12 * readings.sigma, readings.z_max)
-    )
+    echo = readings.echo & ~_of_fixed_distance(readings)
     heard: Floats = readings.z[echo]
     if max(np.ptp(readings.x), np.ptp(readings.y)) < JUDGED:
         return ''
@@ -348,6 +383,27 @@ def _reach(readings: Readings) -> str:
         f'max_range is {limit:g} m, and no echo is from beyond {metres:.1f} m: {unit} A reading without an echo is '
         'evidence for free space up to max_range; set the parameter max_range to the range of the sensor'
     )
+
+
+def _scatter(readings: Readings) -> str:
+    """Look for a variance by which ranges would say next to nothing."""
+    stated = readings.echo & (readings.sigma > 0.0) & ~_of_fixed_distance(readings)
+    if np.count_nonzero(stated) < max(ENOUGH, 0.5 * np.count_nonzero(readings.echo)):
+        return ''
+    sigma = float(np.median(readings.sigma[stated]))
+    if sigma < SCATTER:
+        return ''
+    return (
+        f'the messages state a variance of {sigma * sigma:.3g} m², as if ranges scattered by {sigma:.2g} m: is it in '
+        f'another unit, or the deviation? Correct the driver: variance is in square metres, and 0 where it is not known'
+    )
+
+
+def _of_fixed_distance(readings: Readings) -> NDArray[np.bool_]:
+    """Return what `rep117.measure` makes of the echoes of a fixed-distance ranger: half of its max_range."""
+    z, z_max, sigma = readings.z, readings.z_max, readings.sigma
+    found: NDArray[np.bool_] = np.isclose(2 * z, z_max) & np.isclose(12 * sigma, z_max)
+    return found
 
 
 def _extent(readings: Readings) -> str:

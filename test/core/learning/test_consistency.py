@@ -163,6 +163,38 @@ def test_wrong_poses_are_warned_of(name: str) -> None:
     assert re.search(expected, warnings[0]), warnings
 
 
+def in_a_room(turns: Callable[[float], float]) -> Messages:
+    """A robot that turns by 0.5 rad/s and drives in turn, in a room of 8 by 6 metres; `turns` changes its yaw.
+
+    Eight sensors measure one after the other, 80 times a second, and odometry has 20 messages.
+    """
+    rng = np.random.default_rng(4)
+    extrinsics = {f'sonar_{n}': Pose2(0.0, 0.0, n * math.pi / 4) for n in range(8)}
+    pose, odometry, ranges = Pose2(0.0, 0.0, 0.0), [], []
+    for k in range(3201):
+        stamp = k * NANOSECONDS // 80
+        if k % 4 == 0:
+            odometry.append(OdometryMessage(stamp, 'odom', 'base_link', pose._replace(yaw=turns(pose.yaw))))
+        yaw = pose.yaw + k % 8 * math.pi / 4
+        c, s = math.cos(yaw), math.sin(yaw)
+        z = min((math.copysign(4, c) - pose.x) / (c or 1e-9), (math.copysign(3, s) - pose.y) / (s or 1e-9))
+        ranges.append(RangeMessage(stamp, f'sonar_{k % 8}', z + rng.normal(0, 0.02), 0.1, 8.0, 0.26))
+        pose = pose.compose(Pose2(0.0, 0.0, 0.5 / 80) if k // 250 % 2 else Pose2(0.004, 0.0, 0.0))
+    return Messages(extrinsics, odometry, ranges)
+
+
+def test_yaw_in_degrees() -> None:
+    assert told(in_a_room(lambda yaw: yaw)) == []
+    (warning,) = told(in_a_room(lambda yaw: math.remainder(math.degrees(yaw), math.tau)))
+    assert re.search(r'the yaw of the robot turns at \d\d rad/s: is it in degrees\?.*half the yaw in radians', warning)
+
+
+def test_odometry_that_jumps_or_trembles_is_not_in_degrees() -> None:
+    rng = np.random.default_rng(0)
+    assert told(in_a_room(lambda yaw: yaw + rng.normal(0, 0.01))) == []
+    assert told(in_a_room(lambda yaw: yaw + 2.0 * (rng.random() < 0.01))) == []
+
+
 def drives() -> Iterator[tuple[str, Callable[[], Recording]]]:
     """Every simulated world, with either array."""
     for sonars in (front_array, sonar_ring):

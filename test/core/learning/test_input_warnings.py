@@ -185,6 +185,14 @@ SCENARIOS: dict[str, tuple[Callable[[], Messages], str]] = {
         r'of the echoes are at 3\.000 m.*if there is no echo.*set the parameter max_range to 2\.9,',
     ),
     'no echo is a float below max_range': (lambda: own_silence(4.9999995), r'of the echoes are at 5\.000 m'),
+    'no echo is min_range': (
+        lambda: drive().with_ranges(lambda m: m._replace(range=m.min_range if m.range >= m.max_range else m.range)),
+        r'of the echoes are at 0\.100 m.*where it hears nothing\? Have it send \+inf',
+    ),
+    'variance in square millimetres': (
+        lambda: drive().with_ranges(lambda m: m._replace(variance=9.0)),
+        r'state a variance of 9 m², as if ranges scattered by 3 m.*square metres',
+    ),
     'no limit stated': (
         lambda: drive().with_ranges(
             lambda m: m._replace(max_range=3.4e38, range=math.inf if m.range >= m.max_range else m.range)
@@ -322,6 +330,17 @@ def test_echoes_of_fixed_distance_rangers_are_no_fault() -> None:
         return m._replace(range=-math.inf if m.range < 1.5 else math.inf, min_range=1.5, max_range=1.5)
 
     assert told(drive().with_ranges(fixed)) == []
+
+
+def test_a_sensor_that_hears_the_robot_is_no_silence() -> None:
+    """One that answers min_range all the time, in whatever direction it looks; it has a verdict of its own."""
+    frame = next(iter(circling().extrinsics))
+    near = circling().with_ranges(lambda m: m._replace(range=0.1 if m.frame_id == frame and m.stamp % 7 else m.range))
+    assert not [text for text in told(near) if 'hears nothing' in text]
+
+
+def test_a_variance_that_ranges_may_have_is_no_fault() -> None:
+    assert told(drive().with_ranges(lambda m: m._replace(variance=0.04))) == []
 
 
 def test_a_wall_that_is_far_and_always_as_far_is_no_silence() -> None:
