@@ -112,18 +112,18 @@ def only_if_validated(
     """
     if not found.accepted:
         return found
-    seen = cross_validated(readings, parameters, rounds, watch)
-    if seen is None:
+    validation = cross_validated(readings, parameters, rounds, watch)
+    if validation is None:
         short = f'the drive is shorter than {FOLDS * BLOCK:.0f} s: no readings could be held out to judge the values by'
         return dataclasses.replace(found, warnings=(*found.warnings, short))
-    if seen.better:
-        return dataclasses.replace(found, cross_validation=seen)
-    at_first, at_learned = seen.gains
+    if validation.better:
+        return dataclasses.replace(found, cross_validation=validation)
+    at_first, at_learned = validation.gains
     why = (
         f'the learned values are refused, and the values from the start are kept: the map of the learned values does '
         f'not predict readings that were held out better than the map of the values from the start. Its gain, with the '
-        f'standard error, is {at_first:+.3f} ± {seen.error_at_first:.3f} nats a reading by the first model and '
-        f'{at_learned:+.3f} ± {seen.error_at_learned:.3f} by the learned one; both must be larger than {SURE:g} '
+        f'standard error, is {at_first:+.3f} ± {validation.error_at_first:.3f} nats a reading by the first model and '
+        f'{at_learned:+.3f} ± {validation.error_at_learned:.3f} by the learned one; both must be larger than {SURE:g} '
         f'standard error. --keep-going writes the learned values all the same'
     )
     return dataclasses.replace(
@@ -133,5 +133,5 @@ def only_if_validated(
         accepted=0,
         maps=Mapper(parameters).run(readings, watch),
         warnings=(*found.warnings, why),
-        cross_validation=seen,
+        cross_validation=validation,
     )

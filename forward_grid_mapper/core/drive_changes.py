@@ -65,17 +65,17 @@ def _of(maps: MapSet, number: int) -> Iterator[Change]:
     inside = (row >= 0) & (row < maps.grid.height) & (column >= 0) & (column < maps.grid.width)
     odd = maps.unexplained & readings.echo & (readings.drive == number) & inside
     odd[odd] = maps.ml[row[odd], column[odd]] == 0
-    left = end[odd]
+    remaining = end[odd]
     # the densest place first, and then the remaining echoes
-    while len(left) >= UNEXPLAINED:
-        bins, counts = np.unique(np.floor(left / EDGE), axis=0, return_counts=True)
+    while len(remaining) >= UNEXPLAINED:
+        bins, counts = np.unique(np.floor(remaining / EDGE), axis=0, return_counts=True)
         if counts.max() < UNEXPLAINED / 2:
             return
-        place = _densest(left, (bins[counts.argmax()] + 0.5) * EDGE)
-        change = _judged(readings, number, place)
+        place = _densest(remaining, (bins[counts.argmax()] + 0.5) * EDGE)
+        change = _change_at(readings, number, place)
         if change is not None:
             yield change
-        left = left[(np.abs(left - place) > EDGE).any(axis=1)]
+        remaining = remaining[(np.abs(remaining - place) > EDGE).any(axis=1)]
 
 
 def _densest(points: NDArray[np.float64], place: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -86,21 +86,21 @@ def _densest(points: NDArray[np.float64], place: NDArray[np.float64]) -> NDArray
     return place
 
 
-def _judged(readings: Readings, number: int, place: NDArray[np.float64]) -> Change | None:
+def _change_at(readings: Readings, number: int, place: NDArray[np.float64]) -> Change | None:
     """Return the change at a place; None if there is none."""
     away = place - np.stack([readings.x, readings.y], axis=1)
     axis = np.stack([np.cos(readings.yaw), np.sin(readings.yaw)], axis=1)
     along, beside = (away * axis).sum(axis=1), np.abs(away[:, 0] * axis[:, 1] - away[:, 1] * axis[:, 0])
-    looks = readings.echo & (along > 0) & (beside <= BESIDE)
-    ends = looks & (np.abs(readings.z - along) <= MARGIN)
-    goes_on = looks & (readings.z > along + MARGIN)
+    towards = readings.echo & (along > 0) & (beside <= BESIDE)
+    ends = towards & (np.abs(readings.z - along) <= MARGIN)
+    goes_on = towards & (readings.z > along + MARGIN)
     own = readings.drive == number
     echoes = int((ends & own).sum())
     if echoes < ENOUGH or (goes_on & own).sum() > AGAINST * echoes:
         return None
     # directions are modulo a half turn
-    way = np.angle(np.exp(2j * readings.yaw[ends & own]).sum()) / 2
-    alike = np.abs(np.angle(np.exp(2j * (readings.yaw - way)))) / 2 <= SLANT
+    direction = np.angle(np.exp(2j * readings.yaw[ends & own]).sum()) / 2
+    alike = np.abs(np.angle(np.exp(2j * (readings.yaw - direction)))) / 2 <= SLANT
     passed = int((goes_on & alike & ~own).sum())
     if passed < PASSED or (ends & alike & ~own).sum() > SHARE * passed:
         return None
@@ -110,12 +110,12 @@ def _judged(readings: Readings, number: int, place: NDArray[np.float64]) -> Chan
 def change_warnings(maps: MapSet, names: Sequence[str]) -> list[str]:
     """Return warnings about changed places, at most `NAMED` of them; empty if there is none."""
     found = changes(maps, len(names)) if len(names) > 1 else []
-    told = [
+    texts = [
         f'something stood at x = {change.x:.1f} m, y = {change.y:.1f} m during {names[change.drive]} ({change.echoes} '
         f'echoes) and not during other drives ({change.passed} readings of theirs go on): was a door shut, or '
         f'something moved? The map shows the place free'
         for change in found[:NAMED]
     ]
     if len(found) > NAMED:
-        told.append(f'and drives contradict each other at {len(found) - NAMED} more places')
-    return told
+        texts.append(f'and drives contradict each other at {len(found) - NAMED} more places')
+    return texts

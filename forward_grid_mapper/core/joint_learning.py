@@ -236,7 +236,7 @@ def learn_jointly(
     if len(accepted) > 1:
         found = estimates(learned_from.forward_model().at(last.parameters.model), learned_from.ml)
     number = len(accepted) - 1
-    warnings = (*_quality_warnings(history, number, converged), *_weak(found, last.parameters.model))
+    warnings = (*_quality_warnings(history, number, converged), *_value_warnings(found, last.parameters.model))
     return Learned(last.parameters, found, tuple(history), number, converged, last, warnings)
 
 
@@ -303,7 +303,7 @@ def _quality_warnings(rounds: list[Round], accepted: int, converged: bool) -> li
     return warnings
 
 
-def _weak(found: dict[str, Estimate], model: ModelParameters) -> list[str]:
+def _value_warnings(found: dict[str, Estimate], model: ModelParameters) -> list[str]:
     """Return warnings about values with little information."""
     warnings = []
     for name, estimate in found.items():

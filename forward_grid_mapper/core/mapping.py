@@ -121,8 +121,8 @@ class Mapper:
         evidence = self._index(given, start)
         try:
             found = self._search(given, evidence)
-            told = self._hand_out(given, evidence)
-            return self._judge(given, evidence, found, live, told)
+            final = self._hand_out(given, evidence)
+            return self._evaluate(given, evidence, found, live, final)
         finally:
             # it may take gigabytes, and callers may keep this object
             self._evidence = None
@@ -159,16 +159,16 @@ class Mapper:
         return hand_out(evidence, self._parameters.search, given.traversed)
 
     @_stage('uncertainty')
-    def _judge(
+    def _evaluate(
         self,
         given: _Given,
         evidence: Evidence,
         found: SearchResult,
         live: NDArray[np.float32],
-        told: HandedOut,
+        final: HandedOut,
     ) -> MapSet:
         """Return the maps, with the likelihoods of the readings on them."""
-        ml, p, prior = told.ml, self._parameters, found.prior
+        ml, p, prior = final.ml, self._parameters, found.prior
         occupied = (ml == 1).astype(np.uint8)
         forward = ForwardModel(given.readings, given.grid, p.model, evidence.state.normals, evidence.cones)
         e = forward.expectations(ml)
@@ -178,7 +178,7 @@ class Mapper:
             grid=given.grid,
             live=live,
             ml=ml,
-            uncertainty=told.uncertainty,
+            uncertainty=final.uncertainty,
             readings=given.readings,
             unexplained=unexplained,
             log_likelihood=log_likelihood,

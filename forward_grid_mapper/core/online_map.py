@@ -355,5 +355,5 @@ class OnlineMap:
             return self.grid, np.zeros((0, 0), np.int8), np.zeros((0, 0), np.float32)
         evidence, search = self._evidence, self._parameters.search
         window = evidence.grid.window(self.grid)
-        told = hand_out(evidence, search, self._traversed)
-        return self.grid, told.ml[window], told.uncertainty[window]
+        final = hand_out(evidence, search, self._traversed)
+        return self.grid, final.ml[window], final.uncertainty[window]

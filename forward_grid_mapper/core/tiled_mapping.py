@@ -138,7 +138,7 @@ class TiledMapper:
             mosaic.take_first(number, found)
             count(found.progress, found.converged)
 
-        def again(number: int, found: Any) -> None:
+        def improve(number: int, found: Any) -> None:
             mosaic.take(number, found)
             count(found.progress, found.converged)
 
@@ -146,7 +146,7 @@ class TiledMapper:
         while mosaic.schedule.stale:
             for colour in mosaic.tiling.colours:
                 if numbers := mosaic.schedule.of(colour):
-                    self._visit('search', mosaic, numbers, improved, again)
+                    self._visit('search', mosaic, numbers, improved, improve)
         return not open_ends
 
     def _finish(self, mosaic: Mosaic) -> Callable[[int, Any], None]:

@@ -193,8 +193,8 @@ def sensor_rejections(
     for frame, counts in by_frame.items():
         received = sum(counts.values()) + accepted.get(frame, (0, 0))[0]
         reason = max(counts, key=lambda each: counts[each])
-        told = not frame or reason in CHOSEN or reason in known or rejected[reason] > many
-        if counts[reason] >= max(NEARLY_ALL * received, ENOUGH) and not told:
+        reported = not frame or reason in CHOSEN or reason in known or rejected[reason] > many
+        if counts[reason] >= max(NEARLY_ALL * received, ENOUGH) and not reported:
             lost.setdefault(reason, []).append(frame)
     if not set(accepted).difference(*lost.values()):
         return []

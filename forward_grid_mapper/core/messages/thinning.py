@@ -48,9 +48,9 @@ def kept(readings: Readings, bound: int) -> NDArray[np.int64]:
     level = int(np.count_nonzero(remaining >= 0))
     stay = rank < level
     last = np.flatnonzero(rank == level)
-    left = bound - int(np.count_nonzero(stay))
+    free = bound - int(np.count_nonzero(stay))
     # bins are hashes, so the smallest are a random sample, and the same one in each call
-    stay[last[np.argsort(bins[last], kind='stable')[:left]]] = True
+    stay[last[np.argsort(bins[last], kind='stable')[:free]]] = True
     return np.sort(order[stay])
 
 
