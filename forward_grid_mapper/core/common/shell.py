@@ -1,4 +1,4 @@
-"""Commands that are printed for the user: quoted so that they run as printed, whatever the names of files."""
+"""Commands that are printed for the user: quoted so that they run as printed for any file names."""
 
 from __future__ import annotations
 

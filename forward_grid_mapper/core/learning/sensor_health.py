@@ -82,7 +82,7 @@ class SensorHealth:
         return self.verdict in ('never hears anything', 'always short', 'mostly random')
 
     @property
-    def told(self) -> str:
+    def verdict_text(self) -> str:
         """The verdict, with the range that a short sensor repeats."""
         return f'{self.verdict}: {self.common:.2f} m' if self.verdict == 'always short' else self.verdict
 
@@ -271,7 +271,7 @@ def _verdict(number: int, usual: float, mine: dict[str, float], others: dict[str
 
 def health_warning(table: dict[str, SensorHealth]) -> str:
     """Return one line that names the suspect sensors, or ''."""
-    suspects = [f'{name} ({row.told})' for name, row in table.items() if row.suspect]
+    suspects = [f'{name} ({row.verdict_text})' for name, row in table.items() if row.suspect]
     if not suspects:
         return ''
     return (

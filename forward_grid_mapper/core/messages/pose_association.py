@@ -290,7 +290,7 @@ class PoseAssociator:
         """Drop the newest pose, whose stamp was ahead of those before and after it; readings placed by it stay."""
         self._history.drop_newest()
         self.odometry_rejected['ahead_of_others'] += 1
-        # time goes on by the stamps that are left
+        # time is that of the remaining stamps
         self._next_try = self._next_look = 0
 
     def _jump_back(self) -> None:
@@ -336,7 +336,7 @@ class PoseAssociator:
             return left
         clock = self._clock()
         oldest = clock - patience
-        # odometry that goes on is merely behind, or else `_drop_the_future` notices
+        # odometry whose stamps increase is only late; otherwise `_drop_the_future` rejects the readings
         waiting = self._waiting if newest is None or self._odometry_arrival < oldest else []
         while left and waiting and waiting[0].stamp < limit and waiting[0].arrival < oldest:
             self._reject(heapq.heappop(waiting).frame_id, 'no_odometry')
@@ -374,7 +374,7 @@ class PoseAssociator:
         if len(stay) < len(self._waiting):
             self._waiting = stay
             heapq.heapify(self._waiting)
-            # time goes on by the stamps that are left
+            # time is that of the remaining stamps
             self._newest_range, self._next_try = max((measured.stamp for measured in stay), default=None), 0
 
     def _settle_up_to(self, stamp: int, left: int = sys.maxsize) -> int:
