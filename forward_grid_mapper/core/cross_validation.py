@@ -1,11 +1,11 @@
-"""Cross-validation of learned values, by readings that had no part in learning them.
+"""Cross-validation of learned values by held-out readings.
 
-The drive is cut into blocks of `BLOCK` seconds, and every fifth block is held out in turn. From the rest, values are
-learned and two maps made, one with the values from the start and one with the learned values. Both maps are asked how
-likely the readings held out are. Values that fit the noise raise the likelihood of any map, also of one that shows less
-of the walls; so the maps are compared at the same values, once at those from the start and once at those learned. The
-learned values are accepted if their map is the better one by both, by more than a standard error. It is that of the
-differences between blocks, since the readings of one are of one place.
+The drive is divided into blocks of `BLOCK` seconds, and every fifth block is held out in turn. Values are learned from
+the rest, and two maps are made, one with the initial values and one with the learned ones. On both, the likelihood of
+the held-out readings is evaluated. Values that fit the noise increase the likelihood of any map, also of one with fewer
+walls. So the maps are compared at the same values, once at the initial and once at the learned ones. The learned values
+are accepted if their map is better in both cases by more than a standard error. This is computed from differences of
+blocks, since the readings within a block are correlated.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ from .sensor.forward_model import ForwardModel
 from .sensor.surface_normals import on_larger_grid
 
 BLOCK = 2.0
-"""Seconds: within them, readings of a sensor see nearly the same."""
+"""Length of a block, seconds: readings within it are correlated."""
 
 FOLDS = 5
 
 
 def folds_of(readings: Readings) -> NDArray[np.int64]:
-    """Return in which fold each reading is held out, shape (N,)."""
+    """Return the fold in which each reading is held out, shape (N,)."""
     return blocks_of(readings) % FOLDS
 
 
@@ -47,22 +47,22 @@ def blocks_of(readings: Readings) -> NDArray[np.int64]:
 def cross_validated(
     readings: Readings, parameters: Parameters, rounds: int, watch: Watch = lambda stage, progress: None
 ) -> CrossValidation | None:
-    """Return how likely readings are that had no part in learning; None if the drive is too short to hold any out.
+    """Return the cross-validation of learning; None if the drive is too short for held-out readings.
 
     Parameters
     ----------
     readings : Readings
     parameters : Parameters
-        Where learning starts.
+        With the initial values.
     rounds : int
-        Of learning, at most.
+        Most rounds of learning.
     watch : callable
         Receives stages and progress, as in `Mapper.run`.
     """
     fold = folds_of(readings)
     if len(np.unique(fold)) < FOLDS:
         return None
-    # of each reading: by the map, and by the values that judge
+    # of each reading: by map, and by the values that it is evaluated with
     log_likelihood = np.zeros((2, 2, len(readings)))
     for k in range(FOLDS):
         watch(f'held-out readings, {k + 1} of {FOLDS}', None)
@@ -77,7 +77,7 @@ def cross_validated(
 
 
 def standard_error(readings: Readings, differences: Floats) -> float:
-    """Return the standard error of the mean of differences, shape (N,), that are alike within a block; inf for one."""
+    """Return the standard error of the mean of differences, shape (N,), correlated within blocks; inf for one block."""
     _, block = np.unique(blocks_of(readings), return_inverse=True)
     sums, sizes = np.bincount(block, differences), np.bincount(block)
     count = len(sums)
@@ -88,7 +88,7 @@ def standard_error(readings: Readings, differences: Floats) -> float:
 
 
 def log_likelihoods(held: Readings, maps: MapSet, values: ModelParameters) -> Floats:
-    """Return log p(z | map) in nats of readings that the map was not made of; beyond its edges nothing stands."""
+    """Return log p(z | map) of held-out readings, nats; outside of the map all is free."""
     whole = grid_of(held, values, maps.parameters.grid, maps.grid)
     ml = np.full(whole.shape, UNKNOWN, np.int8)
     ml[whole.window(maps.grid)] = maps.ml
@@ -106,24 +106,24 @@ def only_if_validated(
     rounds: int,
     watch: Watch = lambda stage, progress: None,
 ) -> Learned:
-    """Return what learning found, or the values from the start where held-out readings do not speak for it.
+    """Return the result of learning, or the initial values if cross-validation does not support it.
 
-    The parameters are those of `learn_jointly`, and what it found.
+    The parameters are those of `learn_jointly`, and its result `found`.
     """
     if not found.accepted:
         return found
-    seen = cross_validated(readings, parameters, rounds, watch)
-    if seen is None:
+    validation = cross_validated(readings, parameters, rounds, watch)
+    if validation is None:
         short = f'the drive is shorter than {FOLDS * BLOCK:.0f} s: no readings could be held out to test the values'
         return dataclasses.replace(found, warnings=(*found.warnings, short))
-    if seen.better:
-        return dataclasses.replace(found, cross_validation=seen)
-    at_first, at_learned = seen.gains
+    if validation.better:
+        return dataclasses.replace(found, cross_validation=validation)
+    at_first, at_learned = validation.gains
     why = (
         'the learned values are refused, and the initial values are kept: the map of the learned values does not '
         'predict held-out readings better than the map of the initial values. Its gain, with the standard error, is '
-        f'{at_first:+.3f} ± {seen.error_at_first:.3f} nats a reading by the initial model and {at_learned:+.3f} ± '
-        f'{seen.error_at_learned:.3f} by the learned one; both must be larger than {SURE:g} standard error. '
+        f'{at_first:+.3f} ± {validation.error_at_first:.3f} nats a reading by the initial model and '
+        f'{at_learned:+.3f} ± {validation.error_at_learned:.3f} by the learned one; both must be larger than {SURE:g} standard error. '
         '--keep-going writes the learned values in any case'
     )
     return dataclasses.replace(
@@ -133,5 +133,5 @@ def only_if_validated(
         accepted=0,
         maps=Mapper(parameters).run(readings, watch),
         warnings=(*found.warnings, why),
-        cross_validation=seen,
+        cross_validation=validation,
     )

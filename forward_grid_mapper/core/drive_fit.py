@@ -1,7 +1,7 @@
-"""Whether each of several drives fits the map of all: a drive in another frame contradicts the others.
+"""Checks whether each of several drives fits the map of all: a drive in another frame contradicts the others.
 
-Stretches of every drive are mapped by themselves. Of drives that fit, the map of all explains the readings of a stretch
-as well as its own map does. Where it explains them much worse, the others say that something else stands there.
+Parts of each drive are mapped by themselves. If a drive fits, the map of all explains the readings of a part as well as
+its own map does. If it explains them much worse, readings of the other drives contradict them.
 """
 
 from __future__ import annotations
@@ -16,24 +16,24 @@ from .maps.map_set import MapSet
 from .sensor.forward_model import ForwardModel
 
 STRETCHES, LENGTH = 3, 2000
-"""Stretches of a drive that are mapped, and the readings of each: they bound the cost."""
+"""Most parts of a drive that are mapped, and readings of each: they limit the cost."""
 
 ENOUGH = 300
-"""Readings of a drive below which nothing is said of it."""
+"""Fewest readings of a drive that is checked."""
 
 WORSE = 0.15
-"""Nats a reading by which the map of all must be worse. Of drives that fit it is by .09 at the most; an offset of 0.3 m
-makes more than .2 of it, one of 0.1 m is not told."""
+"""Nats a reading by which the map of all must be worse for a warning. It is at most 0.09 for drives that fit, and more
+than 0.2 for an offset of 0.3 m; one of 0.1 m is not found."""
 
 ALIKE = 0.5
-"""Part of the worst drive's misfit from where on a drive is named with it: those that fit are disturbed as well."""
+"""Other drives are named if their misfit is at least this fraction of the largest; those that fit are affected, too."""
 
 NAMED = 6
 
 
 def misfits(maps: MapSet, drives: int) -> list[float]:
-    """Return by how many nats a reading the map of all is worse for each drive than its own, in its worst stretch."""
-    # which are in order of time
+    """Return how much worse the map of all is than its own map for the worst part of each drive, nats a reading."""
+    # these are sorted by time
     readings = maps.readings
     return [_misfit(maps, readings.select(np.flatnonzero(readings.drive == number))) for number in range(drives)]
 
@@ -52,7 +52,7 @@ def _misfit(maps: MapSet, drive: Readings) -> float:
 
 
 def fit_warnings(maps: MapSet, names: Sequence[str]) -> list[str]:
-    """Return a warning that names the drives that do not fit the others; empty if all fit, or there is but one."""
+    """Return a warning with the drives that do not fit the others; empty if all fit, or there is only one."""
     if len(names) < 2:
         return []
     found = misfits(maps, len(names))

@@ -1,8 +1,8 @@
-"""Learning of the model together with the map: rounds of map search and updates, and warnings about what came out.
+"""Learning of the model together with the map: rounds of map search and updates, and warnings about the result.
 
-Each round makes the map of the values so far and updates them, on that map, until they stay. The next round's map shows
-whether the new values are any good: where it has lost walls that the first map showed, they are refused, and learning
-ends with those of the round before.
+Each round makes the map for the present values, and updates these on that map until they converge. The map of the next
+round shows whether the new values are good: if it has lost walls of the first map, they are rejected, and learning ends
+with those of the round before.
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ from .sensor.forward_model import ForwardModel
 Watch = Callable[[str, Progress | None], None]
 
 FEW_READINGS = 200
-"""So few informing readings are worth a warning."""
+"""Fewer readings with information about a value give a warning."""
 MUCH_CHANCE = 0.3
-"""A larger learned p_rand is worth a warning."""
+"""A larger learned p_rand gives a warning."""
 LIKELIHOOD_DROP = 0.01
-"""Nats a reading by which a new map may be less likely than the one before, at the same values."""
+"""Nats a reading by which a new map may be less likely than the one before, at the same values, without a warning."""
 SURE = 1.0
 """Standard errors by which held-out readings must be likelier with the map of learned values: the rule of one standard
 error in cross-validation, by which the simpler model is kept unless another one is better by more than that."""
@@ -63,9 +63,9 @@ class Round:
     occupied : int
         Occupied cells of the map.
     unexplained : int
-        Echoes that this map takes for random measurements.
+        Echoes that are random measurements by this map.
     lost : tuple of Stretch
-        Walls of the first map that this one has given up.
+        Walls of the first map that are missing on this one.
     """
 
     model: ModelParameters
@@ -78,15 +78,15 @@ class Round:
 
     @property
     def lost_length(self) -> float:
-        """Metres of wall that were given up."""
+        """Total length of lost walls, metres."""
         return sum(stretch.length for stretch in self.lost)
 
 
 class CrossValidation(NamedTuple):
-    """Mean log-likelihood of a reading held out, nats: of the map of the first values and of that of the learned ones.
+    """Mean log-likelihood of a held-out reading, nats, on the map of the first values and on that of the learned ones.
 
-    Each is judged at the first values and at the learned ones; `error_at_…` is the standard error of the difference of
-    the two maps.
+    Each map is evaluated with the first values and with the learned ones; `error_at_…` is the standard error of the
+    difference between the two maps.
     """
 
     first_at_first: float
@@ -98,37 +98,37 @@ class CrossValidation(NamedTuple):
 
     @property
     def better(self) -> bool:
-        """Whether the map of the learned values is the better one, whichever values judge, by more than chance."""
+        """Whether the map of the learned values is significantly better, with both the first and the learned values."""
         at_first, at_learned = self.gains
         return at_first > SURE * self.error_at_first and at_learned > SURE * self.error_at_learned
 
     @property
     def gains(self) -> tuple[float, float]:
-        """What the map of the learned values gains, at the first values and at the learned ones, nats a reading."""
+        """Gains of the map of the learned values, with the first values and with the learned ones, nats a reading."""
         return self.learned_at_first - self.first_at_first, self.learned_at_learned - self.first_at_learned
 
 
 @dataclass(frozen=True)
 class Learned:
-    """What learning found.
+    """The result of learning.
 
     Attributes
     ----------
     parameters : Parameters
-        Those given, with the learned values.
+        The given ones with the learned values.
     estimates : dict of str to Estimate
-        The learned values with their standard errors; empty if the very first update was refused.
+        The learned values with their standard errors; empty if already the first update was rejected.
     rounds : tuple of Round
-        From round 0, which learned nothing yet, to the last, refused or not.
+        From round 0, with the initial values, to the last one, rejected or not.
     accepted : int
-        The round whose values are handed out.
+        The round whose values are the result.
     converged : bool
-        Whether the values had come to rest.
+        Whether the values converged.
     maps : MapSet
         Of the accepted round.
     warnings : tuple of str
     cross_validation : CrossValidation, optional
-        What readings that were held out say of the values, where they were asked (`cross_validated`).
+        Result of the cross-validation, if it was made (`cross_validated`).
     """
 
     parameters: Parameters
@@ -142,13 +142,13 @@ class Learned:
 
 
 def settle(forward: ForwardModel, occupied: NDArray[Any]) -> ModelParameters:
-    """Return the model after as many updates on one map as it takes until its values stay."""
+    """Return the model after updates on one map until its values converge."""
     model = forward.model
     for _ in range(_UPDATES):
         before, model = model, learn(forward.at(model), occupied)
         if _change(before, model) < _SETTLED:
             break
-    # the updates approach 0 for ever
+    # the updates approach 0 only asymptotically
     return dataclasses.replace(model, p_lost=0.0) if model.p_lost < _NO_LOSS else model
 
 
@@ -166,9 +166,9 @@ def map_and_learn(
     watch: Watch = lambda stage, progress: None,
     mapper: Callable[[Parameters], Runs] = Mapper,
 ) -> MapSet:
-    """Return the maps after so many rounds of one update of the model each, without any check of what comes out.
+    """Return the maps after `rounds` rounds with one update of the model each, without checks of the result.
 
-    The seconds of a stage are those of all rounds together. `mapper` makes what makes the maps.
+    The seconds of a stage are the sum over all rounds. `mapper` returns the object that makes the maps.
 
     Raises
     ------
@@ -202,11 +202,11 @@ def learn_jointly(
     ----------
     readings : Readings
     parameters : Parameters
-        Where to start; p_lost stays 0 if it is 0.
+        With the initial values; p_lost stays 0 if it is 0.
     rounds : int
-        At most.
+        Most rounds.
     keep_going : bool
-        Accept values although their map loses walls.
+        Whether to accept values even if their map loses walls.
     watch : callable
         Receives stages and progress, as in `Mapper.run`.
 
@@ -236,23 +236,23 @@ def learn_jointly(
     if len(accepted) > 1:
         found = estimates(learned_from.forward_model().at(last.parameters.model), learned_from.ml)
     number = len(accepted) - 1
-    warnings = (*_quality_warnings(history, number, converged), *_weak(found, last.parameters.model))
+    warnings = (*_quality_warnings(history, number, converged), *_value_warnings(found, last.parameters.model))
     return Learned(last.parameters, found, tuple(history), number, converged, last, warnings)
 
 
 def _change(before: ModelParameters, after: ModelParameters) -> float:
-    """Return the largest change: of the probabilities as they are, of σ in parts of it."""
+    """Return the largest change: absolute for probabilities, relative for σ."""
     changes = [abs(getattr(after, name) - getattr(before, name)) for name in LEARNED]
     changes[LEARNED.index('sigma')] /= before.sigma
     return float(max(changes))
 
 
 def _round(first: MapSet, maps: MapSet, before: MapSet | None) -> Round:
-    """Return what is to be known of a round, whose values were learned from the map of `before`."""
+    """Return the data of a round, whose values were learned from the map `before`."""
     forward = maps.forward_model()
     same_values = math.nan
     if before is not None:
-        # on the new grid, since the normals are those of its cells
+        # on the new grid, since the normals belong to its cells
         same_values = forward.log_likelihood(part_of(before.grid, before.ml, maps.grid))
     return Round(
         maps.parameters.model,
@@ -266,7 +266,7 @@ def _round(first: MapSet, maps: MapSet, before: MapSet | None) -> Round:
 
 
 def _quality_warnings(rounds: list[Round], accepted: int, converged: bool) -> list[str]:
-    """Say what speaks against the way that learning took."""
+    """Return warnings about the rounds of learning."""
     warnings = []
     start, last = rounds[0], rounds[-1]
     if last.lost:
@@ -303,8 +303,8 @@ def _quality_warnings(rounds: list[Round], accepted: int, converged: bool) -> li
     return warnings
 
 
-def _weak(found: dict[str, Estimate], model: ModelParameters) -> list[str]:
-    """Say which values are not worth much."""
+def _value_warnings(found: dict[str, Estimate], model: ModelParameters) -> list[str]:
+    """Return warnings about values with little information."""
     warnings = []
     for name, estimate in found.items():
         if estimate.bound and not (name == 'p_lost' and model.p_lost == 0):

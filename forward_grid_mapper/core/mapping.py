@@ -1,4 +1,4 @@
-"""From readings in the map frame to the three maps: the one function that the offline tool and the node call."""
+"""From readings in the map frame to the three maps, for both the offline tool and the node."""
 
 from __future__ import annotations
 
@@ -29,14 +29,14 @@ from .search.search import Progress, Search, SearchResult
 from .sensor.forward_model import ForwardModel
 
 Watch = Callable[[str, Progress | None], None]
-"""Receives the name of each stage as it begins, and the progress of every iteration of the search."""
+"""Receives the name of each stage at its begin, and the progress after each iteration of the search."""
 
 P = ParamSpec('P')
 R = TypeVar('R')
 
 
 def _stage(name: str) -> Callable[[Callable[Concatenate[Mapper, P], R]], Callable[Concatenate[Mapper, P], R]]:
-    """Make a method of `Mapper` a stage of its runs: announced, not begun after `cancel`, and timed."""
+    """Make a method of `Mapper` a stage of its runs: it is reported and timed, and does not begin after `cancel`."""
 
     def wrap(step: Callable[Concatenate[Mapper, P], R]) -> Callable[Concatenate[Mapper, P], R]:
         def timed(self: Mapper, /, *args: P.args, **kwargs: P.kwargs) -> R:
@@ -54,7 +54,7 @@ def _stage(name: str) -> Callable[[Callable[Concatenate[Mapper, P], R]], Callabl
 
 @dataclass(frozen=True)
 class _Given:
-    """What all stages of a run need, made once.
+    """The input of all stages of a run.
 
     Attributes
     ----------
@@ -63,7 +63,7 @@ class _Given:
     grid : Grid
         Of all maps.
     traversed : bool, shape `grid.shape`
-        Cells that sensors were moved over.
+        Cells that the robot traversed.
     """
 
     readings: Readings
@@ -87,7 +87,7 @@ class Mapper:
         self._stop[0] = 1
 
     def so_far(self) -> tuple[Grid, NDArray[np.int8]] | None:
-        """Return the grid and a copy of the map that the search has reached, or None before it; any thread."""
+        """Return the grid and a copy of the present map of the search, or None before it; for any thread."""
         evidence = self._evidence
         return None if evidence is None else (evidence.grid, evidence.observed())
 
@@ -103,9 +103,9 @@ class Mapper:
         ----------
         readings : Readings
         watch : callable
-            Called from this thread as the work goes on.
+            Called from this thread during the work.
         start : Grid and int8, optional
-            A map to start the search from, 1 where occupied, as in `MapSet.searched`; by default the empty one.
+            Initial map of the search, 1 if occupied, like `MapSet.searched`; by default the empty map.
 
         Raises
         ------
@@ -116,20 +116,20 @@ class Mapper:
         """
         self._watch, self._seconds = watch, {}
         given = self._prepare(readings)
-        # first, since it needs as much memory for a while as the evidence does
+        # first, since for a while it needs as much memory as the evidence
         live = self._standard_map(given)
         evidence = self._index(given, start)
         try:
             found = self._search(given, evidence)
-            told = self._hand_out(given, evidence)
-            return self._judge(given, evidence, found, live, told)
+            final = self._hand_out(given, evidence)
+            return self._evaluate(given, evidence, found, live, final)
         finally:
-            # it takes gigabytes, and whoever ran this may be kept
+            # it may take gigabytes, and callers may keep this object
             self._evidence = None
 
     def _prepare(self, readings: Readings) -> _Given:
         readings, p = in_canonical_order(readings), self._parameters
-        # the grid of the standard map, so that all three maps are of one shape
+        # the grid of the standard map, so that all three maps have the same shape
         grid = map_grid(readings, p)
         return _Given(readings, grid, traversed_cells(readings, grid))
 
@@ -159,16 +159,16 @@ class Mapper:
         return hand_out(evidence, self._parameters.search, given.traversed)
 
     @_stage('uncertainty')
-    def _judge(
+    def _evaluate(
         self,
         given: _Given,
         evidence: Evidence,
         found: SearchResult,
         live: NDArray[np.float32],
-        told: HandedOut,
+        final: HandedOut,
     ) -> MapSet:
-        """Return the maps with what they say of the readings, and the readings of them."""
-        ml, p, prior = told.ml, self._parameters, found.prior
+        """Return the maps, with the likelihoods of the readings on them."""
+        ml, p, prior = final.ml, self._parameters, found.prior
         occupied = (ml == 1).astype(np.uint8)
         forward = ForwardModel(given.readings, given.grid, p.model, evidence.state.normals, evidence.cones)
         e = forward.expectations(ml)
@@ -178,7 +178,7 @@ class Mapper:
             grid=given.grid,
             live=live,
             ml=ml,
-            uncertainty=told.uncertainty,
+            uncertainty=final.uncertainty,
             readings=given.readings,
             unexplained=unexplained,
             log_likelihood=log_likelihood,

@@ -1,13 +1,13 @@
-"""The forward map kept up to date while the robot drives.
+"""The online map: the forward map, updated while the robot drives.
 
-New readings change the evidence of the cells of their cones. Only there, and as far around as flips reach, cells are
-flipped until nothing gains any more. From time to time the map is refined: surface normals are estimated from all
-readings again, the pairs that this changes are made anew, and the surroundings are searched in all ways that a batch
-has, at first as if cells were independent: lines would hold on to what few readings seemed to say.
+New readings change the evidence of the cells in their cones. Cells there, and around as far as flips have effects, are
+flipped until nothing gains. From time to time the map is refined: surface normals are estimated again from all
+readings, the affected pairs are made again, and the surroundings are searched with all moves of a batch. This begins
+with independent cells, since the prior for walls would keep walls that rest on few readings.
 
-Readings that say the same, from the same place, are counted and not kept: the same sensor, its pose within a fraction
-of a cell and of its half angle, and the range within a fraction of σ. So a robot that stands still for hours adds
-weight to what is known, but no memory and no time.
+Equal readings are only counted: those of the same sensor, with poses within a fraction of a cell and of the half angle,
+and ranges within a fraction of σ. So a robot that stands still for hours adds evidence, but needs no more memory and
+time.
 """
 
 from __future__ import annotations
@@ -36,43 +36,44 @@ from .search.search import LEAST, Search
 from .sensor.cone_table import effective_sigma, grid_of
 
 SAME_PLACE = 0.5
-"""Cells, and fraction of the half angle, by which poses may differ."""
+"""Poses of equal readings differ by less than so many cells, and this fraction of the half angle."""
 
 SAME_RANGE = 0.5
-"""Fraction of σ by which ranges may differ."""
+"""Ranges of equal readings differ by less than this fraction of σ."""
 
 MARGIN = 64
-"""Cells by which the grid outgrows what is needed, and a quarter of its size more."""
+"""Cells that are added to each side of the grid when it grows, besides a quarter of its size."""
 
 MOST_UPDATES = 50
-"""Bound on the sequential updates after one call; what is left then is done after the next."""
+"""Most sequential updates in one call; the rest is done in the next."""
 
 REFINE_EVERY = 1000
-"""Readings after which the map is refined, at most."""
+"""Most new readings before the map is refined."""
 
 REFINE_SHARE = 0.05
-"""Of the readings kept, how many may come until the map is refined: while they are few, each says much about surface
-normals, and it takes little time."""
+"""The map is refined after new readings of this fraction of all: while there are few, each affects the surface normals
+much, and refining is fast."""
 
 REFINE_LEAST = 50
-"""Readings below which it is not refined."""
+"""Fewest new readings for it."""
 
 MANY = 5000
-"""New readings for which a whole search is faster."""
+"""With more new readings, a search of the whole map is faster."""
 
 
 PORTION = 2000
-"""Readings that are looked up between two chances of other threads to get the GIL."""
+"""Readings that are looked up before other threads can get the GIL."""
 
 PARTS = 512
-"""Dictionaries that share the numbers of readings: a large one keeps the GIL for long whenever it grows or goes."""
+"""Number of dictionaries for the indices of readings: a single large one would hold the GIL for long when it grows or
+is deleted."""
 
 Key = bytes
-"""What a reading says; of these, the collector of garbage need not look at any."""
+"""The discretised values of a reading; the garbage collector does not traverse bytes."""
 
 
 class _Numbers(MutableMapping[Key, int]):
-    """Numbers of the readings that are kept, by what they say."""
+    """Indices of the stored readings, by key."""
 
     def __init__(self) -> None:
         self._parts: list[dict[Key, int]] = [{} for _ in range(PARTS)]
@@ -98,20 +99,20 @@ class _Numbers(MutableMapping[Key, int]):
         return self._count
 
     def clear(self) -> None:
-        """Forget all, bit by bit."""
+        """Remove all keys in small steps."""
         self._count = 0
         for part in self._parts:
             part.clear()
 
 
 OF_THE_ROBOT = 1000
-"""Readings from which it is known how far apart the sensors of a robot are (`traversed.longest_step`)."""
+"""Readings from which the distances of the sensors on the robot are estimated (`traversed.longest_step`)."""
 
 NO_READINGS = Readings.from_columns(x=[], y=[], yaw=[], z=[], z_max=[], half_angle=[])
 
 
 class _Traversed(NamedTuple):
-    """What new readings say about the cells that the robot traversed: some of the grid; and about its size."""
+    """Cells of a part of the grid that the robot traversed, after new readings, and data about the robot's size."""
 
     near: tuple[slice, slice]
     cells: NDArray[np.bool_]
@@ -121,7 +122,7 @@ class _Traversed(NamedTuple):
 
 
 class OnlineMap:
-    """A maximum likelihood map and its evidence that follow the readings."""
+    """A maximum likelihood map and its evidence, updated with each set of new readings."""
 
     def __init__(self, parameters: Parameters) -> None:
         self._parameters = parameters
@@ -129,7 +130,7 @@ class OnlineMap:
         self.clear()
 
     def clear(self) -> None:
-        """Forget everything."""
+        """Make the map empty."""
         self._evidence: Evidence | None = None
         self._kept = _Numbers()
         self._traversed = np.zeros((0, 0), np.bool_)
@@ -140,31 +141,31 @@ class OnlineMap:
         self._begun, self._longest = NO_READINGS, LONGEST_STEP
         self.grid = Grid(self._parameters.grid.resolution, 0, 0, 0, 0)
         self.taken = 0
-        """Readings added, those that were merged with others included."""
+        """Number of readings added, including those merged with equal ones."""
 
     def cancel(self) -> None:
-        """Give the map up: calls end soon, with `Cancelled`; may be called from any thread."""
+        """Make all calls raise `Cancelled` soon; the map is of no more use. May be called from any thread."""
         self._stop[0] = 1
 
     def dismantle(self) -> None:
-        """Free the memory of a map that nobody needs any more, bit by bit: at once, it would keep the GIL for long."""
+        """Free the memory of a map that is not needed any more, in small steps: at once would hold the GIL for long."""
         self._evidence = None
         self._kept.clear()
 
     def __len__(self) -> int:
-        """Return the number of readings kept."""
+        """Return the number of stored readings."""
         return 0 if self._evidence is None else len(self._evidence)
 
     @property
     def waiting(self) -> int:
-        """Number of readings added since the map was refined."""
+        """Number of readings added since the last refinement."""
         return self._count
 
     def add(self, readings: Readings) -> None:
-        """Add readings and bring the map up to date.
+        """Add readings and update the map.
 
-        The readings are taken all or not at all; `taken` says which. In either case the map can go on: what an error
-        leaves undone of the search is done after the next call.
+        Either all readings are added or none; `taken` shows which. After an error the map stays usable: the rest of the
+        search is done in the next call.
 
         Raises
         ------
@@ -196,7 +197,7 @@ class OnlineMap:
             self._settle(evidence, window)
 
     def _insert(self, evidence: Evidence, readings: Readings) -> None:
-        """Add readings to the evidence, those that say the same as another one as its multiplicity; all or none."""
+        """Add readings to the evidence; equal ones increase the multiplicity. Either all are added or none."""
         new: list[NDArray[np.int64]] = []
         known: list[NDArray[np.int64]] = []
         fresh: list[list[Key]] = []
@@ -220,7 +221,7 @@ class OnlineMap:
             raise
 
     def _keys(self, readings: Readings) -> list[Key]:
-        """Return a key for each reading, the same for those that say the same."""
+        """Return a key for each reading; equal readings have the same one."""
         p = self._parameters
         sigma = effective_sigma(readings, p.model, p.grid.resolution)
         place = SAME_PLACE * p.grid.resolution
@@ -235,49 +236,49 @@ class OnlineMap:
             readings.half_angle,
             sigma,
         )
-        # 0 is added since -0 has other bytes
+        # + 0.0 maps −0 to 0, which has other bytes
         rows = np.column_stack(columns).astype(np.float64) + 0.0
         data, size = rows.tobytes(), rows.shape[1] * rows.itemsize
         return [data[i : i + size] for i in range(0, len(data), size)]
 
     def _search(self, evidence: Evidence) -> None:
-        """Search the whole map as a batch does."""
+        """Search the whole map like a batch."""
         evidence.renew_normals()
         Search(evidence, self._parameters.search, self._traversed.ravel()).run()
         self._since, self._count = None, 0
 
     def _refine(self, evidence: Evidence) -> None:
-        """Renew the surface normals, and search around what changed since in all ways that a search has."""
+        """Renew the surface normals, and search around all changes since the last time, with all moves."""
         self._since = united(self._since, evidence.renew_normals())
         Search(evidence, self._parameters.search, self._traversed.ravel(), self._since).refine()
         self._since, self._count = None, 0
 
     def adopt(self, grid: Grid, searched: NDArray[np.int8]) -> None:
-        """Go on from another map of the same readings.
+        """Replace the map by another one of the same readings.
 
         Parameters
         ----------
         grid : Grid
         searched : int8, shape `grid.shape`
-            1 where occupied, as in `MapSet.searched`; cells that it does not have are free.
+            1 if occupied, like `MapSet.searched`; cells outside of it are free.
         """
         if self._evidence is not None:
             self._evidence.state.maps.occupied[:] = (part_of(grid, searched, self._evidence.grid) == 1).ravel()
             self._evidence.rebuild()
 
     def searched(self) -> tuple[Grid, NDArray[np.int8]]:
-        """Return the grid and the map to start another search from, as in `MapSet.searched`."""
+        """Return the grid and the map as the start of another search, like `MapSet.searched`."""
         if self._evidence is None:
             return self.grid, np.zeros((0, 0), np.int8)
         return self.grid, self._evidence.observed()[self._evidence.grid.window(self.grid)]
 
     def _newly_traversed(self, readings: Readings, grid: Grid) -> _Traversed:
-        """Return the cells that sensors were moved over, from the last reading on; nothing is changed yet."""
+        """Return the cells that the robot traversed since the last reading; nothing is changed yet."""
         x, y, stamp = (
             np.r_[old, new] for old, new in zip(self._last, (readings.x, readings.y, readings.stamp), strict=True)
         )
         rows, columns = grid.cells_of(x, y)
-        # the last reading may be one of before a jump, off this grid
+        # the last reading may be from before a jump, and outside of this grid
         rows, columns = rows.clip(0, grid.height - 1), columns.clip(0, grid.width - 1)
         bottom, left = int(rows.min()), int(columns.min())
         near = (slice(bottom, int(rows.max()) + 1), slice(left, int(columns.max()) + 1))
@@ -287,14 +288,14 @@ class OnlineMap:
         if len(begun) < OF_THE_ROBOT:
             begun = of_drives([begun, readings])
             longest = longest_step(begun)
-            # from here on only their number matters, and they may be half a million
+            # later only their number matters, and there may be half a million
             begun = begun.select(np.arange(min(len(begun), OF_THE_ROBOT)))
         mark_traversed(x, y, stamp, part, cells, longest)
         n = STRIDES[-1]
         return _Traversed(near, cells, (x[-n:], y[-n:], stamp[-n:]), begun, longest)
 
     def _with_room(self, g: Grid) -> Evidence:
-        """Return the evidence, on a grid that holds `g`."""
+        """Return the evidence on a grid that contains `g`."""
         evidence = self._evidence
         if evidence is not None and evidence.grid.union(g) == evidence.grid:
             return evidence
@@ -303,7 +304,7 @@ class OnlineMap:
         wide, high = MARGIN + g.width // 4, MARGIN + g.height // 4
         larger = Grid(g.resolution, g.column - wide, g.row - high, g.width + 2 * wide, g.height + 2 * high).union(known)
         if larger.size > p.grid.max_cells:
-            # room to grow must not take what the map itself may
+            # the margin must not make the map exceed max_cells
             larger = known
         traversed = np.zeros(larger.shape, np.bool_)
         if evidence is not None:
@@ -326,7 +327,7 @@ class OnlineMap:
         """Return the window of all cells that flips near new readings may change."""
         p = self._parameters
         box = grid_of(readings, p.model, p.grid)
-        # flips change the readings that see a cell, and these reach that far
+        # flips affect the readings that observe a cell, and these reach that far
         around = math.ceil(float(readings.z_max.max()) / grid.resolution)
         row, column = box.row - grid.row, box.column - grid.column
         return (
@@ -337,7 +338,7 @@ class OnlineMap:
         )
 
     def _settle(self, evidence: Evidence, window: Window) -> None:
-        """Flip cells around the new readings until none gains any more."""
+        """Flip cells around the new readings until none gains."""
         prior = self._prior
         room = (window[1] - window[0]) * (window[3] - window[2])
         cells, gains = np.empty(room, np.int64), np.empty(room)
@@ -354,5 +355,5 @@ class OnlineMap:
             return self.grid, np.zeros((0, 0), np.int8), np.zeros((0, 0), np.float32)
         evidence, search = self._evidence, self._parameters.search
         window = evidence.grid.window(self.grid)
-        told = hand_out(evidence, search, self._traversed)
-        return self.grid, told.ml[window], told.uncertainty[window]
+        final = hand_out(evidence, search, self._traversed)
+        return self.grid, final.ml[window], final.uncertainty[window]

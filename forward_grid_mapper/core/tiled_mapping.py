@@ -1,15 +1,15 @@
 """From readings to the three maps in tiles: block coordinate ascent over windows of the map.
 
-    normals        of each tile's core, from the readings that reach into it; they are those of the whole map
-    first maps     each tile and its halo by itself, all at once; the cores are put together
-    rounds         colour by colour, each stale tile is searched on with all others held, until no tile changes
-    maps           of each core, from the readings that reach into it
-    judgement      of each reading, by the tile in whose core its sensor was
+    normals        of the core of each tile, from the readings that reach into it; equal to those of the whole map
+    first maps     of each tile with its halo, independently and in parallel; the cores are put together
+    rounds         colour by colour, each stale tile is searched with all others fixed, until no tile changes
+    final maps     of each core, from the readings that reach into it
+    evaluation     of each reading, by the tile in whose core its sensor was
 
-The objective is a sum over readings and a local prior. So what a window gains is what the whole map gains, it rises
-with every change, and where no tile changes any more no single flip gains. Tiles of one colour do not see each other:
-the maps do not depend on how many are searched at once. They depend on the size of the tiles, as a search depends on
-where it starts.
+The objective is a sum over readings and a local prior. So the gain of a window is that of the whole map, which
+increases with each change, and when no tile changes any more, no single flip gains. Tiles of one colour do not affect
+each other, so the maps do not depend on how many are searched in parallel. They depend on the size of the tiles, like
+any local search on its initial map.
 """
 
 from __future__ import annotations
@@ -48,11 +48,11 @@ class TiledMapper:
         ----------
         parameters : Parameters
         size : float
-            Edge of a tile, metres. The smaller the tiles, the more readings belong to several of them.
+            Side of a tile, metres. The smaller the tiles, the more readings belong to several of them.
         each : callable, optional
-            How tiles are worked on; `map`, one after the other, or the `map` of an executor.
+            `map`, which processes tiles one after the other, or the `map` of an executor.
         at_once : int
-            How many tiles `each` works on at once, which share the cores.
+            Number of tiles that `each` processes in parallel; they share the cores.
         """
         self._size, self._each = size, each
         threads = max((parameters.search.threads or cores()) // at_once, 1)
@@ -67,7 +67,7 @@ class TiledMapper:
         self._watch: Watch = lambda stage, progress: None
 
     def cancel(self) -> None:
-        """Make `run` raise `Cancelled` when the tiles at work are done; may be called from any thread."""
+        """Make `run` raise `Cancelled` after the tiles in progress; may be called from any thread."""
         self._stop[0] = 1
 
     def run(self, readings: Readings, watch: Watch = lambda stage, progress: None) -> MapSet:
@@ -106,7 +106,7 @@ class TiledMapper:
         take: Callable[[int, T], None],
         given: Callable[[int], Given] | None = None,
     ) -> None:
-        """Have tiles worked on, and keep what comes out."""
+        """Process tiles, and store the results."""
         check(self._stop)
         self._watch(stage, None)
         begun = time.perf_counter()
@@ -138,7 +138,7 @@ class TiledMapper:
             mosaic.take_first(number, found)
             count(found.progress, found.converged)
 
-        def again(number: int, found: Any) -> None:
+        def improve(number: int, found: Any) -> None:
             mosaic.take(number, found)
             count(found.progress, found.converged)
 
@@ -146,7 +146,7 @@ class TiledMapper:
         while mosaic.schedule.stale:
             for colour in mosaic.tiling.colours:
                 if numbers := mosaic.schedule.of(colour):
-                    self._visit('search', mosaic, numbers, improved, again)
+                    self._visit('search', mosaic, numbers, improved, improve)
         return not open_ends
 
     def _finish(self, mosaic: Mosaic) -> Callable[[int, Any], None]:

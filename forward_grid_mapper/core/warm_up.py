@@ -1,7 +1,6 @@
-"""Compilation of every kernel before the first reading comes, so that nothing has to wait for it.
+"""Compilation of all kernels before the first reading, so that nothing has to wait for it later.
 
-What is needed first is compiled first: the kernels of the live map, then those of the online map, then those of EM,
-and at last those that find a trajectory.
+The order is that in which they are needed: live map, online map, EM, and trajectories.
 """
 
 from __future__ import annotations
@@ -35,7 +34,7 @@ def _square_room() -> Readings:
 
 
 def _flip_at_once(readings: Readings) -> None:
-    # the search of so small a room flips too few cells at once
+    # the search of such a small room makes no parallel updates
     parameters = Parameters()
     evidence = Evidence(map_grid(readings, parameters), parameters.model)
     evidence.extend(readings)
@@ -52,7 +51,7 @@ def warm_up_live_map() -> None:
 def warm_up_online_map() -> None:
     """Compile the kernels of the online map."""
     readings, online = _square_room(), OnlineMap(Parameters())
-    # twice the same, then a place so far away that the grid grows
+    # twice the same readings, then others so far away that the grid grows
     for moved in (0.0, 0.0, 40.0):
         online.add(dataclasses.replace(readings, x=readings.x + moved))
     online.maps()
@@ -60,7 +59,7 @@ def warm_up_online_map() -> None:
 
 
 def warm_up_em() -> MapSet:
-    """Compile the kernels of EM and of what comes after it."""
+    """Compile the kernels of EM and of the steps after it."""
     _flip_at_once(_square_room())
     maps = Mapper(Parameters()).run(_square_room())
     sensor_health(maps)
@@ -68,7 +67,7 @@ def warm_up_em() -> MapSet:
 
 
 def warm_up_trajectory() -> None:
-    """Compile the kernels that find a trajectory, those of EM apart: on two metres of a corridor without end."""
+    """Compile the kernels for trajectories, besides those of EM, on a drive of two metres."""
     room, steps = _square_room(), 20
     at, sensor = np.repeat(np.arange(steps), len(room)), np.tile(np.arange(len(room)), steps)
     readings = dataclasses.replace(
@@ -79,7 +78,7 @@ def warm_up_trajectory() -> None:
     windows = cut(readings, Odometry.of(np.arange(steps) * 10**8, path))
     scans = Scans(windows, Parameters(), np.zeros(1, np.uint8), held_out(len(windows)))
     wall_votes(windows, scans.held_out)
-    # so short a drive has too few votes for a heading
+    # such a short drive has too few votes for a heading
     smooth(np.ones((2, 1, 4)), np.full((1, 4), 0.25), np.zeros(1), np.full(4, 0.25))
     around = scans.map(np.arange(len(windows)), windows.node[0], windows.node)
     assert around is not None
@@ -92,11 +91,11 @@ STEPS: dict[str, Callable[[], object]] = {
     'EM': warm_up_em,
     'trajectory': warm_up_trajectory,
 }
-"""What there is to compile, in this order."""
+"""The steps of the compilation, in this order."""
 
 
 def warm_up() -> MapSet:
-    """Map a square room in every way, which calls every kernel with the types that real work has."""
+    """Map a square room in all ways, which calls all kernels with the types of real data."""
     warm_up_live_map()
     warm_up_online_map()
     warm_up_trajectory()

@@ -1,4 +1,4 @@
-"""Exceptions whose text says to the user what is wrong and what to do."""
+"""Exceptions with messages for the user: what is wrong, and what to do."""
 
 
 class MapperError(Exception):

@@ -1,4 +1,4 @@
-"""Names of parameters that the version before had, and what became of them."""
+"""Parameters of the previous version that were removed or renamed."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ DEPRECATED = {
     'surface_offset': _CONSTANT,
     'uncertainty_prior': _CALIBRATED,
 }
-"""Parameters of the version before: what became of each. They are accepted with a warning and have no effect."""
+"""Removed parameters of the previous version, with explanations. They are accepted with a warning and ignored."""
 
 
 RENAMED = {
     'grazing_angle': 'max_incidence_angle',
     'max_sweeps': 'max_iterations',
 }
-"""Parameters of the version before that have another name now. They are accepted with a warning."""
+"""Renamed parameters of the previous version, with the new names. They are accepted with a warning."""
 
 
 def deprecation(name: str) -> str:

@@ -1,7 +1,7 @@
-"""The lattice of cells: where a cell lies, and the smallest grid that covers a set of cones.
+"""Grids: rectangles of cells of one lattice.
 
-Every grid of one resolution is cut from the same lattice, whose cell (0, 0) has a corner at the origin of the map
-frame. So grids that grow, shrink or are made from other readings agree cell for cell where they overlap.
+All grids of one resolution are parts of the same lattice, whose cell (0, 0) has a corner at the origin of the map
+frame. So grids that grow, shrink or are made from other readings have the same cells where they overlap.
 """
 
 from __future__ import annotations
@@ -83,12 +83,12 @@ class Grid:
         return x, y
 
     def union(self, other: Grid) -> Grid:
-        """Return the smallest grid that holds both.
+        """Return the smallest grid that contains both.
 
         Raises
         ------
         ValueError
-            If they differ in resolution, and so are not of one lattice.
+            If they differ in resolution, and so are not parts of one lattice.
         """
         self._check_lattice(other)
         if not self.size or not other.size:
@@ -99,7 +99,7 @@ class Grid:
         return Grid(self.resolution, column, row, right - column, top - row)
 
     def window(self, inner: Grid) -> tuple[slice, slice]:
-        """Return the (rows, columns) of this grid that are `inner`.
+        """Return the slices (rows, columns) of this grid that are `inner`.
 
         Raises
         ------
@@ -156,11 +156,11 @@ def cone_boxes(
 UNKNOWN = -1
 
 Window = tuple[int, int, int, int]
-"""Some cells of a grid: first row, last one plus one, first column, last one plus one."""
+"""A rectangle of cells of a grid: first row, last one plus one, first column, last one plus one."""
 
 
 def united(*windows: Window | None) -> Window | None:
-    """Return the smallest window that holds all of `windows`; None stands for no cell."""
+    """Return the smallest window that contains all of `windows`; None is an empty one."""
     bounds = [window for window in windows if window]
     if not bounds:
         return None
@@ -169,7 +169,7 @@ def united(*windows: Window | None) -> Window | None:
 
 
 def part_of(grid: Grid, values: NDArray[np.int8], wanted: Grid) -> NDArray[np.int8]:
-    """Return a map on another grid of its lattice; cells that it does not have are unknown.
+    """Return a map on another grid of the same lattice; cells outside of `grid` are unknown.
 
     Parameters
     ----------

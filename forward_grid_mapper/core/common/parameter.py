@@ -1,4 +1,4 @@
-"""One row of the table of parameters: its type, bounds and words, and the check of a value; and constants beside it."""
+"""A row of the table of parameters: its type, bounds and help text, and the check of a value; and constants."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class Constant:
 
 @dataclass(frozen=True)
 class Parameter:
-    """One row of the table; `low` and `high` are infinite where there is no bound.
+    """One row of the table; `low` and `high` are infinite without bounds.
 
     `type` is float, int, bool, str or tuple (of str); `read_only` rows cannot change while the node is configured.
     """
@@ -72,7 +72,7 @@ class Parameter:
 
     @property
     def range(self) -> str:
-        """The admitted values, for people."""
+        """The admitted values as text."""
         if self.choices:
             return ' | '.join(self.choices)
         if self.type is bool:

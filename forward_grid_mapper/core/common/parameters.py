@@ -1,8 +1,8 @@
-"""The parameter table: every name, default, unit, range and help text, once.
+"""The table of parameters: the single source of their names, defaults, units, ranges and help texts.
 
 The dataclasses below are the table. The YAML file, the command line, the ROS parameters and `docs/parameters.md` are
-made from `TABLE`, which is read off their fields. Fields that are `CONSTANTS` are no parameters: they have two values,
-the default and that of `plain_model`, the paper's.
+made from `TABLE`, which is collected from their fields. Fields in `CONSTANTS` are no parameters: they have two values,
+the default, and that of `plain_model`, which is that of the paper.
 """
 
 from __future__ import annotations
@@ -338,7 +338,8 @@ class Parameters:
     def from_flat(cls, values: Mapping[str, Any], base: Parameters | None = None) -> Parameters:
         """Return `base` (the defaults, unless given) with the named values changed.
 
-        Names of `DEPRECATED` are left out, and those of `RENAMED` stand for the new ones, with a warning in the log.
+        Names in `DEPRECATED` are ignored, and those in `RENAMED` are replaced by the new ones, with a warning in the
+        log.
 
         Raises
         ------
@@ -356,26 +357,26 @@ class Parameters:
 
     @classmethod
     def restored(cls, values: Mapping[str, Any]) -> Parameters:
-        """Return what `complete` returned, of this version or of one whose constants were parameters.
+        """Return the parameters from a result of `complete`, of this version or of one whose constants were parameters.
 
         Raises
         ------
         ParameterError
-            As `from_flat`.
+            As in `from_flat`.
         """
         constants = {name: value for name, value in values.items() if name in _CONSTANTS}
         for name, value in constants.items():
             kind = type(_CONSTANTS[name].default)
             if type(value) is not kind or not math.isfinite(value):
                 raise ParameterError(f'{name}: {value!r} is not a finite {kind.__name__}')
-        # what no longer is there was none that a user chose for this version
+        # removed parameters are ignored: users of this version did not set them
         others = {name: value for name, value in values.items() if name not in constants and name not in DEPRECATED}
         return cls.from_flat(others).varied(constants)
 
     def varied(self, values: Mapping[str, Any]) -> Parameters:
-        """Return these with the named values changed, constants among them; nothing is checked but how they fit.
+        """Return the parameters with the named values changed, which may be constants.
 
-        Another `plain_model` changes all constants that are not named.
+        Only combinations of values are checked. Another `plain_model` changes all constants that are not named.
 
         Raises
         ------
@@ -393,11 +394,11 @@ class Parameters:
         )
 
     def flat(self) -> dict[str, Any]:
-        """Return every parameter's value by name, in the table's order."""
+        """Return the values of all parameters by name, in the order of the table."""
         return {row.name: getattr(getattr(self, row.group), row.name) for row in TABLE}
 
     def complete(self) -> dict[str, Any]:
-        """Return every value by name, those of constants too."""
+        """Return the values of all parameters and constants by name."""
         return self.flat() | {row.name: getattr(getattr(self, row.group), row.name) for row in CONSTANTS}
 
 
@@ -421,12 +422,12 @@ _CONSTANTS = {row.name: row for row in CONSTANTS}
 
 
 def find(name: str) -> Parameter:
-    """Return the row of the table called `name`, or called so in the version before (`RENAMED`).
+    """Return the row of a parameter by its name, or by that of the previous version (`RENAMED`).
 
     Raises
     ------
     ParameterError
-        If there is none; names the nearest ones.
+        If there is none; the message names similar ones.
     """
     name = RENAMED.get(name, name)
     if name in _BY_NAME:

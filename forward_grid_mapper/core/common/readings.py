@@ -1,4 +1,4 @@
-"""Readings in the map frame: the columns that everything downstream works on."""
+"""Readings in the map frame, as columns: the input of all mapping."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ class Readings:
     x, y, yaw : float64, shape (N,)
         Pose of the sensor in the map frame: metres, radians.
     z : float64, shape (N,)
-        Measured range in metres; `z_max` where there was no echo.
+        Measured range in metres; `z_max` without echo.
     z_max : float64, shape (N,)
         Largest range the sensor reports, metres.
     half_angle : float64, shape (N,)
         Half the field of view, radians, in (0, π/2).
     sigma : float64, shape (N,)
-        Standard deviation of the range in metres as the message states it; 0 where it does not.
+        Standard deviation of the range by the message, metres; 0 if not stated.
     stamp : int64, shape (N,)
         Nanoseconds.
     sensor : int32, shape (N,)
@@ -34,7 +34,7 @@ class Readings:
     sensor_names : tuple of str
         The `frame_id` of each sensor.
     drive : int32, shape (N,)
-        Which drive it is of; 0 where there is only one.
+        Number of the drive; 0 if there is only one.
     """
 
     x: Floats
@@ -51,7 +51,7 @@ class Readings:
 
     def __post_init__(self) -> None:
         if len(self.drive) != len(self.z):
-            # takes no memory
+            # a broadcast view takes no memory
             object.__setattr__(self, 'drive', np.broadcast_to(np.int32(0), self.z.shape))
 
     def __len__(self) -> int:
@@ -63,20 +63,20 @@ class Readings:
         return self.z < self.z_max
 
     def counts(self) -> tuple[list[int], list[int]]:
-        """Return how many readings each of `sensor_names` has, and how many of them are without echo."""
+        """Return the number of readings of each of `sensor_names`, and of those without echo."""
         total = np.bincount(self.sensor, minlength=len(self.sensor_names))
         silent = np.bincount(self.sensor[~self.echo], minlength=len(self.sensor_names))
         return total.tolist(), silent.tolist()
 
     def select(self, which: NDArray[np.generic] | slice) -> Readings:
-        """Return the readings that `which` (mask, indices or slice) picks."""
+        """Return the readings selected by `which` (mask, indices or slice)."""
         columns = {f.name: getattr(self, f.name) for f in fields(self)}
         names = columns.pop('sensor_names')
         return Readings(**{k: v[which] for k, v in columns.items()}, sensor_names=names)
 
     @classmethod
     def from_columns(cls, names: tuple[str, ...] = (), **columns: object) -> Readings:
-        """Build from anything array-like; absent `sigma`, `stamp`, `sensor` and `drive` are zero.
+        """Build from array-like columns; missing `sigma`, `stamp`, `sensor` and `drive` are zero.
 
         Raises
         ------
@@ -99,9 +99,9 @@ class Readings:
 
 
 def in_canonical_order(readings: Readings) -> Readings:
-    """Return the readings ordered by stamp, sensor name, values and drive, so that the maps do not depend on arrival.
+    """Return the readings sorted by stamp, sensor name, values and drive, so that maps do not depend on arrival.
 
-    Sums of floating point numbers depend on their order; two readings that are still equal are interchangeable.
+    The order matters because sums of floating point numbers depend on it. Readings with equal keys are identical.
     """
     rank = np.argsort(np.argsort(np.array(readings.sensor_names or ('',))))
     r = readings
@@ -110,7 +110,7 @@ def in_canonical_order(readings: Readings) -> Readings:
 
 
 def of_drives(drives: Sequence[Readings]) -> Readings:
-    """Return the readings of several drives, numbered in their order; sensors of one name are one sensor."""
+    """Return the readings of several drives, which are numbered in order; sensors with the same name are the same."""
     names = tuple(sorted({name for readings in drives for name in readings.sensor_names or ('',)})) or ('',)
     number = {name: k for k, name in enumerate(names)}
     columns: dict[str, list[NDArray[np.generic]]] = {}

@@ -1,4 +1,4 @@
-"""Commands that are printed for the user to run: they run as they are printed, whatever the files are called."""
+"""Commands that are printed for the user: quoted so that they run as printed for any file names."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from pathlib import Path
 
 
 def quoted(word: Path | str) -> str:
-    """Return a word as a POSIX shell takes it; what cannot be shown is written as bash, ksh and zsh read it.
+    """Return a word quoted for a POSIX shell; unprintable ones in the $'…' syntax of bash, ksh and zsh.
 
-    A path that begins with a dash is led by `./`, so that no program takes it for an option.
+    A path that begins with a dash gets a leading `./`, so that no program takes it for an option.
     """
     text = os.fspath(word)
     if isinstance(word, Path) and text.startswith('-'):
@@ -29,7 +29,7 @@ def quoted(word: Path | str) -> str:
 
 
 def _interpreter() -> str:
-    """Return what a shell in this folder calls the interpreter that runs: `python3`, where that is the same one."""
+    """Return the command of the running interpreter for a shell in this folder: `python3`, if that is the same one."""
     found = shutil.which('python3')
     if not sys.executable or (found and Path(found).absolute() == Path(sys.executable).absolute()):
         return 'python3'
@@ -38,10 +38,10 @@ def _interpreter() -> str:
 
 
 def command_line(command: str, *words: Path | str) -> str:
-    """Return the line that runs one of our commands with these arguments, also where no environment is activated."""
+    """Return the line that runs one of our commands with these arguments, also without an activated environment."""
     return module_line('forward_grid_mapper', command, *words)
 
 
 def module_line(module: str, *words: Path | str) -> str:
-    """Return the line that runs a module with the interpreter that runs."""
+    """Return the line that runs a module with the running interpreter."""
     return ' '.join([_interpreter(), '-m', module, *map(quoted, words)])

@@ -1,1 +1,1 @@
-"""All readings against one map: what flipping each cell gains, kept up to date."""
+"""The evidence of all readings, given a map: the gain of flipping each cell, kept up to date."""

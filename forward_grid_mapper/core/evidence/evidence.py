@@ -1,4 +1,4 @@
-"""The evidence of every cell, given readings and a map: built once, extended by new readings, kept right by flips."""
+"""The evidence of each cell, given readings and a map; updated incrementally by new readings and by flips."""
 
 from __future__ import annotations
 
@@ -30,16 +30,16 @@ from .tile_index import more_chunks, no_tiles
 from .updates import add_multiplicity, evaluate_all, evaluate_flipped, forget
 
 MOST_UNUSED = 0.25
-"""Part of the words given to readings that may be out of use before all pairs are packed anew."""
+"""Fraction of the allocated words that may be unused before all pairs are packed again."""
 
 BYTES_A_CONE_CELL = 64
-"""Of a workspace, for each cell of the largest cone."""
+"""Bytes of a workspace for each cell of the largest cone."""
 
 NOBODY = np.zeros(0, np.int64)
 
 
 class _Before(NamedTuple):
-    """What is kept for readings by cells, and must be put back if readings are not taken after all."""
+    """State that must be restored if adding readings fails."""
 
     head: NDArray[np.int32]
     fill: NDArray[np.int32]
@@ -50,7 +50,7 @@ class _Before(NamedTuple):
 
 
 def _maps(grid: Grid, occupied: NDArray[np.uint8]) -> Maps:
-    """Return what is kept for the cells of a grid, without readings, on the map `occupied`, shape `grid.shape`."""
+    """Return the state of the cells of a grid without readings; `occupied` is the map, shape `grid.shape`."""
     seen, evidence = np.zeros(grid.size, np.int32), np.zeros(grid.size, np.int64)
     pattern = np.zeros(grid.size, np.uint8)
     set_patterns(occupied.ravel(), grid.shape, pattern)
@@ -58,16 +58,16 @@ def _maps(grid: Grid, occupied: NDArray[np.uint8]) -> Maps:
 
 
 class Evidence:
-    """Readings, a map, and what flipping each of its cells would gain.
+    """Readings, a map, and the gain of flipping each of its cells.
 
-    Whatever fails (no memory, or `stop` was set), the evidence is that of the map and of the readings which it has.
+    If a method fails (no memory, or `stop` was set), the evidence stays consistent with the map and the readings.
 
     Attributes
     ----------
     grid : Grid
     model : ModelParameters
     state : State
-        What the kernels work on; arrays that grow are replaced, so it must not be kept.
+        For the kernels. Arrays that grow are replaced, so callers must not store it.
     """
 
     def __init__(
@@ -89,16 +89,16 @@ class Evidence:
             Cells outside of it are left out.
         model : ModelParameters
         memory : float
-            Bytes that the stored pairs may take.
+            Limit for the stored pairs, bytes.
         threads : int
-            Threads to use where it pays; the result does not depend on it.
+            Most threads; the result does not depend on it.
         stop : uint8, shape (1,), optional
             Set to 1 from any thread to cancel.
         renewable : bool
-            Keep what it takes to renew the surface normals as readings come, 24 bytes a cell. Otherwise the first
-            readings added decide about the normals.
+            Whether surface normals can be renewed with later readings, which needs 24 bytes a cell. Otherwise they are
+            estimated from the readings that are added first.
         normals : SurfaceNormals, optional
-            Those of the cells of `grid`, where they are known beforehand; then the grid cannot grow.
+            Of the cells of `grid`, if known beforehand; then the grid cannot grow.
         """
         self.grid, self.model, self._threads = grid, model, threads
         self._words = int(min(memory / WORD, 2.0**60))
@@ -137,19 +137,19 @@ class Evidence:
 
     @property
     def unstored(self) -> int:
-        """Number of readings whose pairs found no memory."""
+        """Number of readings whose pairs are not stored, for lack of memory."""
         return int(self._totals[UNSTORED])
 
     @property
     def nbytes(self) -> int:
-        """Memory of the pairs and of what is kept for readings and cells, without surface normals, bytes."""
+        """Memory of pairs, readings and cells, without surface normals, bytes."""
         s = self.state
         kept = (s.cones, s.reading_states, s.pairs.cell, s.tiles.chunks, s.observing, *s.maps)
         return sum(int(array.nbytes) for array in kept)
 
     @property
     def tempered_log_likelihood(self) -> float:
-        """What the readings count in the objective: the likelihood exponent times log p(Z | m), in nats."""
+        """The part of the readings in the objective: likelihood exponent times log p(Z | m), nats."""
         return self.model.likelihood_exponent * self.log_likelihood
 
     @property
@@ -160,25 +160,25 @@ class Evidence:
 
     @property
     def log_likelihoods(self) -> Floats:
-        """Log p(z | m) of each reading, shape (N,), in nats; one that stands for several says it several times."""
+        """Log p(z | m) of each reading, times its multiplicity, shape (N,), nats."""
         s = self.state.reading_states[: self._size]
         out: Floats = s['likelihood'].astype(np.int64) * s['multiplicity'] * QUANTUM
         return out
 
     def log_likelihood_of(self, which: NDArray[np.bool_]) -> float:
-        """Return the log-likelihood of some readings, shape (N,), in nats; sums of parts add up without rounding."""
+        """Return the log-likelihood of the readings in a mask, shape (N,), nats; sums of subsets are exact."""
         reading_states = self.state.reading_states[: self._size][which]
         return float((reading_states['likelihood'].astype(np.int64) * reading_states['multiplicity']).sum() * QUANTUM)
 
     @property
     def cones(self) -> Cones:
-        """The cones of the readings, shape (N,); until readings are added or the grid grows."""
+        """The cones of the readings, shape (N,); valid until readings are added or the grid grows."""
         return self.state.cones[: self._size]
 
     def of_occupancy(self) -> Floats:
-        """Return γ [log p(Z | cell occupied, rest of the map) − log p(Z | cell free, rest of the map)] in nats.
+        """Return γ [log p(Z | cell occupied, rest of the map) − log p(Z | cell free, rest of the map)], nats.
 
-        Shape (cells,); 0 where no reading sees the cell. γ is the likelihood exponent.
+        Shape (cells,); 0 for cells without readings. γ is the likelihood exponent.
         """
         maps, nats = self.state.maps, self.state.model.nats
         out: Floats = np.where(maps.occupied == 1, -nats, nats) * maps.evidence
@@ -186,25 +186,24 @@ class Evidence:
 
     @property
     def z_max(self) -> Floats:
-        """The largest range of every reading in metres, shape (N,)."""
+        """The largest range of each reading, metres, shape (N,)."""
         far = self.state.cones['z_max'][: self._size] - self.model.surface_offset
         out: Floats = far * self.grid.resolution
         return out
 
     def observed(self) -> NDArray[np.int8]:
-        """Return a copy of the map, shape `grid.shape`: 1 occupied, 0 free, -1 where no reading sees the cell."""
+        """Return a copy of the map, shape `grid.shape`: 1 occupied, 0 free, -1 without readings."""
         maps = self.state.maps
         return np.where(maps.seen > 0, maps.occupied.astype(np.int8), np.int8(UNKNOWN)).reshape(self.grid.shape)
 
     def extend(self, readings: Readings, again: NDArray[np.int64] = NOBODY) -> None:
-        """Add readings, all of them or, if that fails, none.
+        """Add readings; if it fails, none is added.
 
         Parameters
         ----------
         readings : Readings
         again : int64, shape (M,)
-            Indices of readings, those that are added now among them, each of which stands for one more reading that
-            says the same.
+            Indices of readings, including those that are added now, whose multiplicity increases by one.
 
         Raises
         ------
@@ -221,7 +220,7 @@ class Evidence:
         self._reserve(end)
         s = self.state
         s.cones[begin:end], s.reading_states[begin:end] = cones, reading_states
-        # what the first ones say about normals is known before their pairs are made
+        # the bearings of the first readings are added before their pairs are made
         later = s.cones[begin:end] if begin else s.cones[:0], s.cones[again]
         since = united(self._since, *(box_of(cones, self.grid) for cones in later))
         before = self._index_so_far()
@@ -246,7 +245,7 @@ class Evidence:
             self._since = since
 
     def add_multiplicity(self, readings: NDArray[np.int64]) -> None:
-        """Let each of `readings` (indices, shape (N,)) stand for one more reading that says the same."""
+        """Increase the multiplicity of each of `readings` (indices, shape (N,)) by one."""
         self._check_indices(readings, self._size)
         repeated = self.state.cones[readings]
         since = united(self._since, box_of(repeated, self.grid))
@@ -261,12 +260,12 @@ class Evidence:
             raise ValueError(f'readings {readings.min()} to {readings.max()} are asked for, and there are {size}')
 
     def grow(self, grid: Grid) -> None:
-        """Go on with a larger grid, whose new cells are free; nothing is changed if that fails.
+        """Change to a larger grid, whose new cells are free; if it fails, nothing is changed.
 
         Parameters
         ----------
         grid : Grid
-            Holds the old one. Where normals are renewable they stay as they are, and the old grid must hold all cones.
+            Contains the old one. Renewable normals are not changed, and then the old grid must contain all cones.
 
         Raises
         ------
@@ -304,7 +303,7 @@ class Evidence:
         except BaseException:
             self.grid, self.state, self._totals, self._sums = old, s, totals, sums
             if evaluating:
-                # pairs of the larger grid stand where those of the old one were
+                # pairs of the larger grid were written over those of the old one
                 self._evaluate_again(self._size, new=True)
             raise
         if self._since:
@@ -313,7 +312,7 @@ class Evidence:
             self._since = bottom + up, top + up, left + right, end + right
 
     def rebuild(self) -> None:
-        """Evaluate all readings anew, after the map was changed in many places."""
+        """Evaluate all readings again, after the map was changed from outside."""
         maps = self.state.maps
         set_patterns(maps.occupied, self.grid.shape, maps.pattern)
         maps.evidence[:] = 0
@@ -324,7 +323,7 @@ class Evidence:
             raise
 
     def flip(self, cells: NDArray[np.int64]) -> None:
-        """Flip cells, all different, at once, and evaluate the readings that see any of them anew.
+        """Flip different cells at once, and evaluate the readings that observe any of them again.
 
         Parameters
         ----------
@@ -333,14 +332,14 @@ class Evidence:
         Raises
         ------
         Cancelled
-            If `stop` was set; the cells are flipped all the same.
+            If `stop` was set; the cells are flipped nevertheless.
         MemoryError
         """
         maps, flipped = self.state.maps, np.zeros(self.grid.size, np.uint8)
         flipped[cells] = 1
         maps.occupied[cells] ^= 1
         if self.unstored:
-            # what such a reading said of the map before is not known any more
+            # the terms of such readings for the map before are not stored
             self.rebuild()
             return
         note_flips(maps.pattern, cells, self.grid.shape)
@@ -355,9 +354,9 @@ class Evidence:
             raise
 
     def renew_normals(self) -> Window | None:
-        """Estimate the surface normals from all readings so far; make anew the pairs of the readings that this changes.
+        """Estimate the surface normals from all readings so far, and make the pairs of affected readings again.
 
-        Afterwards all is as if the readings had come at once. Needs `renewable`.
+        The result is the same as if all readings had been added at once. Needs `renewable`.
 
         Returns
         -------
@@ -367,15 +366,15 @@ class Evidence:
         if self._sums is None or self._since is None:
             return None
         s, shape = self.state, self.grid.shape
-        # what changed is seen in the normals around it, and these in the incidence angles around them
+        # readings affect the normals around them, and these the limits of the incidence angle around them
         around = touched(touched(self._since, self.grid), self.grid)
         normals = renewed_normals(s, self._size, self.grid, self.model, self._sums, around)
         differ = np.zeros(shape, np.uint8)
-        sees = np.zeros(self._size, np.uint8)
-        find_changed(s, normals, around, differ, sees)
-        readings = np.flatnonzero(sees)
+        changed = np.zeros(self._size, np.uint8)
+        find_changed(s, normals, around, differ, changed)
+        readings = np.flatnonzero(changed)
         window = box_of(s.cones[readings], self.grid)
-        # nothing fails from here on: where there is no memory for pairs they are not stored
+        # nothing can fail from here on: without memory, pairs are not stored
         done, words = 0, self._words
         while True:
             done = renew(self.state, normals, readings, (done, words), self._totals)
@@ -388,24 +387,24 @@ class Evidence:
         self.state = self.state._replace(normals=normals)
         self._since = None
         if self._totals[UNUSED] > MOST_UNUSED * self._totals[WORDS]:
-            # it saves memory, so it may be left undone where there is none
+            # packing only saves memory, so it is skipped if there is none
             with suppress(MemoryError):
                 self.grow(self.grid)
         return window
 
     def summed(self, begin: int, end: int, work: Work, total: NDArray[np.int64], beside: int = 0) -> None:
-        """Have several threads go over parts of the readings `begin` to `end`, and sum up what they find.
+        """Run work on several threads, each for a part of the readings `begin` to `end`, and sum the results.
 
-        Each has a workspace and an array of its own. Sums of whole numbers do not depend on how many there are.
+        Each thread has its own workspace and array. Integer sums do not depend on the number of threads.
 
         Parameters
         ----------
         begin, end : int
         work : callable
         total : int64
-            Added to.
+            The results are added to it.
         beside : int
-            Bytes that each thread takes for itself.
+            Additional memory of each thread, bytes.
 
         Raises
         ------
@@ -421,7 +420,7 @@ class Evidence:
                 s = self.state._replace(workspace=workspace_for(largest))
                 own.append((s, np.zeros_like(total)))
         except MemoryError:
-            # fewer threads come to the same
+            # with fewer threads, the result is the same
             pass
         portions = zip(own, parts(begin, end, len(own)), strict=True)
         run_each([partial(work, s, first, last, array) for (s, array), (first, last) in portions])
@@ -436,7 +435,7 @@ class Evidence:
         self.summed(begin, end, work, self.state.maps.evidence)
 
     def _evaluate_again(self, end: int, new: bool = False) -> None:
-        """Do so for the readings up to `end` in a way that cannot fail: on one thread, whatever `stop` says."""
+        """Evaluate the readings up to `end` from scratch. It cannot fail: it is single-threaded and ignores `stop`."""
         self.state.maps.evidence[:] = 0
         evaluate_all(self.state._replace(stop=NEVER), 0, end, new)
 
@@ -447,7 +446,7 @@ class Evidence:
         return _Before(*lists, int(tiles.used[0]), self._totals.copy(), s.normals)
 
     def _insert(self, begin: int, end: int) -> None:
-        """Index readings whose cones are in place, and make room for their pairs."""
+        """Index readings whose cones are set, and allocate memory for their pairs."""
         self._indexed = begin
         while self._indexed < end:
             s = self.state
@@ -458,7 +457,7 @@ class Evidence:
         self._make_room(int(self._totals[WORDS]))
 
     def _take_out(self, begin: int, before: _Before) -> None:
-        """Undo what was indexed from reading `begin` on."""
+        """Undo the indexing from reading `begin` on."""
         s = self.state
         forget(s, begin, self._indexed)
         s.tiles.head[:], s.tiles.fill[:], s.tiles.latest[:] = before.head, before.fill, before.latest
@@ -470,14 +469,14 @@ class Evidence:
             self._sums[:] = 0
 
     def _learn_normals(self, end: int) -> None:
-        """Learn from the first readings which way surfaces face, and up to which incidence they return echoes."""
+        """Estimate normals and limits of the incidence angle from the first readings."""
         self._indexed = 0
         sums = np.zeros((3, self.grid.size), np.int64) if self._sums is None else self._sums
         normals = first_normals(self.state, end, self.grid, self.model, sums, self.summed)
         self.state = self.state._replace(normals=normals)
 
     def _reserve(self, size: int) -> None:
-        """Make room for `size` readings; more than that where they come in small numbers."""
+        """Allocate memory for `size` readings, and for half as many more if there are readings already."""
         s = self.state
         if size <= len(s.reading_states):
             return
@@ -487,7 +486,7 @@ class Evidence:
         self.state = s._replace(cones=cones, reading_states=reading_states, observing=np.empty((room, 2), np.int32))
 
     def _make_room(self, words: int) -> None:
-        """Make room for so many words of pairs, and to work on the largest cone."""
+        """Allocate so many words of pairs, and a workspace for the largest cone."""
         s = self.state
         largest, words = int(self._totals[LARGEST]), min(words, self._words)
         if words > len(s.pairs.cell):

@@ -1,8 +1,7 @@
-"""Logarithms of likelihood ratios as whole numbers, so that sums of them are exact.
+"""Log-likelihood ratios in fixed point, so that sums of them are exact.
 
-A sum of whole numbers does not depend on its order, and what was added can be taken away again without a trace. So the
-evidence of a cell, kept up to date through millions of changes, is always what a new sum would be, and two threads come
-to the same as one.
+Integer sums do not depend on their order, and terms can be subtracted again exactly. So the evidence of a cell equals a
+new sum even after millions of updates, and results do not depend on the number of threads.
 """
 
 from __future__ import annotations
@@ -23,7 +22,7 @@ _EXPONENT = np.int32(23)
 
 
 class RatioWorkspace(NamedTuple):
-    """Room for the likelihood ratios of one cone, and the bits that they are stored as; arrays of one length."""
+    """Workspace for the likelihood ratios of one cone, and views of their bits; arrays of the same length."""
 
     ratio: NDArray[np.float32]
     ratio_bits: NDArray[np.int32]
@@ -32,7 +31,7 @@ class RatioWorkspace(NamedTuple):
 
 
 def ratio_workspace_for(largest: int) -> RatioWorkspace:
-    """Return room for cones of up to `largest` cells."""
+    """Return a workspace for cones of up to `largest` cells."""
     ratio, mantissa = np.empty(largest + 3, np.float32), np.empty(largest + 3, np.float32)
     return RatioWorkspace(ratio, ratio.view(np.int32), mantissa, mantissa.view(np.int32))
 
@@ -42,7 +41,7 @@ def quantise_logs(ratios: RatioWorkspace, m: int, out: Any) -> None:
     """Write the logs of the first m ratios (positive, normal) into `out` (int32), in units of QUANTUM.
 
     The method is that of Cephes' logf: the number's bits give x = 2ᵉ (1 + f) with 1 + f in [√½, √2), and a polynomial
-    gives log(1 + f) to 3e-8. Loops of plain arithmetic, which the compiler turns into vector instructions.
+    gives log(1 + f) to 3e-8. The loops are plain arithmetic, so that the compiler vectorises them.
     """
     for k in range(m):
         bits = ratios.ratio_bits[k]
@@ -60,5 +59,5 @@ def quantise_logs(ratios: RatioWorkspace, m: int, out: Any) -> None:
         y = y * f - 2.4999993993e-1
         y = y * f + 3.3333331174e-1
         y = f + f * f * (y * f - 0.5) + 0.6931471805599453 * out[k]
-        # numpy's floor stays a float: vector instructions for 64-bit integers are not to be had everywhere
+        # np.floor returns a float: vector instructions for 64-bit integers are not available on all processors
         out[k] = np.int32(np.floor(y * _SCALE + 0.5))

@@ -1,4 +1,4 @@
-"""How readings enter: what no map changes of each, the words that its pairs take, and its place in the tiles."""
+"""Indexing of new readings: their terms independent of the map, the memory for their pairs, and their tiles."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from .state import READING_STATE, State
 from .tile_index import SHIFT, insert
 
 FREE, BAND, LARGEST, WORDS, UNSTORED, UNUSED = range(6)
-"""Of the totals: pairs in free zones and in bands, cells of the largest cone, words given to readings, readings not
-stored, and those of the words that no reading uses any more."""
+"""Indices of totals: pairs in free zones and in bands, cells of the largest cone, words allocated to readings, readings
+that are not stored, and allocated words that are no longer used."""
 
 
 @kernel
 def insert_readings(s: State, limits: tuple[int, int, int], totals: Any) -> int:
-    """Count the pairs of readings, and insert these into the tiles; return the reading at which chunks ran out.
+    """Count the pairs of readings, and insert readings into tiles; return the reading at which there was no free chunk.
 
     Parameters
     ----------
@@ -54,7 +54,7 @@ def insert_readings(s: State, limits: tuple[int, int, int], totals: Any) -> int:
                 inside = max(outer - inner + 1, 0)
                 count += inside > 0
                 if s.normals.cos2_limit > 0.0 and inside > 0:
-                    # a cell that is left out may cut a run in two
+                    # a cell that is left out may divide a run
                     count += before[row, outer + 1] - before[row, inner]
                 for c in range(np.uint64(row * lattice.width + left), np.uint64(row * lattice.width + right + 1)):
                     seen[c] += times
@@ -78,7 +78,7 @@ def insert_readings(s: State, limits: tuple[int, int, int], totals: Any) -> int:
 def reading_state_table(
     readings: Readings, sigma: Floats, model: ModelParameters, resolution: float
 ) -> NDArray[np.void]:
-    """Return records of `READING_STATE`, shape (N,), with what no map changes; arguments are those of `causes_of`."""
+    """Return records of `READING_STATE` with the terms independent of the map, shape (N,); arguments of `causes_of`."""
     reading_states = np.zeros(len(readings), READING_STATE)
     causes = causes_of(readings, sigma, model, resolution)
     reading_states['floor'] = causes.random + causes.lost

@@ -1,4 +1,4 @@
-"""What all readings together say about surface normals, and up to which incidence each surface returns echoes."""
+"""Surface normals from all readings, and the limit of the incidence angle of each surface."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ from .renewal import near
 from .state import State, Work
 
 Summed = Callable[[int, int, Work, NDArray[np.int64]], None]
-"""Has several threads do such work for the readings from one to another, and sums up what they find."""
+"""Runs such work on several threads for a range of readings, and sums the results (`Evidence.summed`)."""
 
 NO_INCIDENCE_LIMIT = 1.5707
-"""Radians off the normal from where on no reading exceeds the incidence angle."""
+"""Largest incidence angle, radians, from which on there is no limit."""
 
 
 def has_limit(model: ModelParameters) -> bool:
-    """Return whether there is an incidence angle at all; without one, normals do not matter."""
+    """Return whether there is a limit of the incidence angle; without one, normals do not matter."""
     return model.max_incidence_angle < NO_INCIDENCE_LIMIT
 
 
 def first_normals(
     s: State, end: int, grid: Grid, model: ModelParameters, sums: NDArray[np.int64], summed: Summed
 ) -> SurfaceNormals:
-    """Return the normals that the readings up to `end` say.
+    """Return the normals from the readings up to `end`.
 
     Parameters
     ----------
@@ -39,7 +39,7 @@ def first_normals(
     grid : Grid
     model : ModelParameters
     sums : int64, shape (3, cells)
-        Filled as by `gather`; must be 0.
+        Output of `gather`; must be 0 before.
     summed : callable
     """
 
@@ -65,14 +65,14 @@ def first_normals(
 def renewed_normals(
     s: State, size: int, grid: Grid, model: ModelParameters, sums: NDArray[np.int64], window: Window
 ) -> SurfaceNormals:
-    """Return the normals as they are with other sums and readings, which change them in a window alone.
+    """Return the normals for new sums and readings, which differ from those before only in a window.
 
     Parameters
     ----------
     s : State
         With the normals before.
     size : int
-        Readings that count.
+        Number of readings.
     grid : Grid
     model : ModelParameters
     sums : int64, shape (3, cells)
@@ -86,7 +86,7 @@ def renewed_normals(
     readings = np.flatnonzero(near(s.cones[:size], around))
     weights = s.reading_states['multiplicity'][readings]
     with_own_angles(normals, s.cones[readings], weights, grid, window, edges)
-    # around the window nothing changed
+    # outside of the window nothing changed
     outside = np.ones(grid.shape, np.bool_)
     outside[window[0] : window[1], window[2] : window[3]] = False
     for new, old in ((normals.x, s.normals.x), (normals.y, s.normals.y)):
@@ -95,5 +95,5 @@ def renewed_normals(
 
 
 def keep_bearings(cones: NDArray[np.void], grid: Grid, sums: NDArray[np.int64]) -> None:
-    """Add what readings say about normals to `sums`; it cannot fail: on one thread, whatever anyone's `stop` says."""
+    """Add the bearings of readings to `sums`. It cannot fail: it is single-threaded and ignores `stop`."""
     gather(cones, grid.shape, (0, len(cones)), sums, NEVER)

@@ -1,7 +1,7 @@
-"""The eight neighbours of a cell, and which of them are occupied: one bit of a pattern for each.
+"""The eight neighbours of a cell, and the pattern of the occupied ones: one bit for each.
 
-Neighbour k lies k eighths of a turn counterclockwise from east; rows count upward. Bit k of a cell's pattern is set
-where its neighbour k is occupied.
+Neighbour k lies k eighths of a turn counterclockwise from east (the x axis); row numbers increase with y. Bit k of the
+pattern of a cell is set if its neighbour k is occupied.
 """
 
 from __future__ import annotations
@@ -24,26 +24,26 @@ DY = (0, 1, 1, 1, 0, -1, -1, -1)
 
 @kernel
 def offset(k: int, width: int) -> int:
-    """Return what is to be added to the index of a cell for that of its neighbour k."""
+    """Return the difference between the indices of neighbour k and the cell."""
     return DY[k] * width + DX[k]
 
 
 @kernel
 def neighbour(c: int, k: int, height: int, width: int) -> int:
-    """Return neighbour k of cell c; -1 if it is off the grid."""
+    """Return neighbour k of cell c; -1 outside of the grid."""
     x, y = c % width + DX[k], c // width + DY[k]
     return y * width + x if 0 <= x < width and 0 <= y < height else -1
 
 
 @kernel
 def opposite(k: int) -> int:
-    """Return what number a cell has as a neighbour of its neighbour k."""
+    """Return the number of the opposite direction: that of a cell as a neighbour of its neighbour k."""
     return (k + 4) & 7
 
 
 @kernel
 def note_flip(pattern: NDArray[np.uint8], c: int, height: int, width: int) -> None:
-    """Bring the patterns of the neighbours of cell c, which was flipped, up to date."""
+    """Update the patterns of the neighbours of cell c after its flip."""
     for k in range(NEIGHBOURS):
         o = neighbour(c, k, height, width)
         if o >= 0:
@@ -52,7 +52,7 @@ def note_flip(pattern: NDArray[np.uint8], c: int, height: int, width: int) -> No
 
 @kernel
 def set_patterns(occupied: NDArray[np.uint8], shape: tuple[int, int], out: NDArray[np.uint8]) -> None:
-    """Write the pattern of occupied neighbours of every cell into `out`, shape (cells,); takes no memory."""
+    """Write the pattern of each cell to `out`, shape (cells,); allocates no memory."""
     out[:] = 0
     for c in range(len(occupied)):
         if occupied[c]:
@@ -61,13 +61,13 @@ def set_patterns(occupied: NDArray[np.uint8], shape: tuple[int, int], out: NDArr
 
 @kernel
 def note_flips(pattern: NDArray[np.uint8], cells: NDArray[np.int64], shape: tuple[int, int]) -> None:
-    """Bring the patterns of the neighbours of cells, which were flipped, up to date."""
+    """Update the patterns of the neighbours of cells after their flips."""
     for c in cells:
         note_flip(pattern, c, shape[0], shape[1])
 
 
 def patterns(occupied: NDArray[np.uint8], shape: tuple[int, int]) -> NDArray[np.uint8]:
-    """Return the pattern of occupied neighbours of every cell, shape (cells,)."""
+    """Return the pattern of each cell, shape (cells,)."""
     out = np.zeros(shape[0] * shape[1], np.uint8)
     set_patterns(occupied.ravel(), shape, out)
     return out

@@ -1,11 +1,12 @@
-"""The cells of every reading, as the search wants them: runs of the free zone, and the band from near to far.
+"""Pairs of readings and cells for the search: runs of cells in the free zone, and the band sorted by distance.
 
-In the free zone it only matters how many occupied cells there are, so rows of cells are kept as runs. Each cell of the
-band is kept with its density and with its term of the evidence. Everything of one reading lies together in one block
-of memory, since readings are come upon at random: 12 bytes a band pair and 8 a run, which is about one a free pair.
+In the free zone, only the number of occupied cells matters, so rows of cells are stored as runs. Each cell of the band
+is stored with its density and its term of the evidence. All data of a reading are in one block of memory, since
+readings are accessed in random order: 12 bytes for each band pair, and 8 for each run, which is about one for each free
+pair.
 
-Readings for which there is no memory are kept as nothing but their cone: their pairs are made anew each time that they
-are wanted, which takes longer and comes to the same.
+If memory is short, only the cone of a reading is stored, and its pairs are made each time that they are needed; this is
+slower, and the result is the same.
 """
 
 from __future__ import annotations
@@ -27,14 +28,14 @@ WORD = 4
 """Bytes in a word of a block."""
 
 LEAST_SPREAD = 1e-100
-"""Cells between the nearest and the farthest key of a sort, below which they are left to the insertion sort."""
+"""Smallest range of the keys of a bucket sort, cells; below it, insertion sort alone is used."""
 
 WORDS_PER_RUN = 2
 WORDS_PER_BAND_PAIR = 3
 
 
 class Lattice(NamedTuple):
-    """The grid as kernels see it: cells up and across, metres a cell."""
+    """The grid for the kernels: numbers of rows and columns, and cell size, metres."""
 
     height: int
     width: int
@@ -42,11 +43,11 @@ class Lattice(NamedTuple):
 
 
 class Pairs(NamedTuple):
-    """The pairs of readings, one array of words under three names; `READING_STATE` says where those of a reading begin.
+    """The pairs of readings: three views of one array of words. `READING_STATE` has the index of those of each reading.
 
-    A reading with r runs and m band pairs has 2 r words for the first and last cells of its runs, each in one row and
-    ascending; then, from near to far, m cells, m densities N(z; d, σ) in 1/m, and m logs of the likelihood ratio of
-    flipping the cell, in units of `fixed_point.QUANTUM`.
+    A reading with r runs and m band pairs has 2 r words for the first and last cells of its runs, each within one row
+    and in ascending order; then, by increasing distance, m cells, m densities N(z; d, σ), 1/m, and m logs of the
+    likelihood ratio of flipping the cell, in units of `fixed_point.QUANTUM`.
     """
 
     cell: NDArray[np.uint32]
@@ -55,22 +56,22 @@ class Pairs(NamedTuple):
 
 
 def empty_pairs(words: int) -> Pairs:
-    """Return pairs of so many words, not yet written."""
+    """Return uninitialised pairs of so many words."""
     block = np.empty(words, np.uint32)
     return Pairs(block, block.view(np.float32), block.view(np.int32))
 
 
 class Workspace(NamedTuple):
-    """Arrays to work on one reading at a time; every thread has its own.
+    """Arrays for the work on one reading; each thread has its own.
 
     Attributes
     ----------
     pairs : Pairs
-        For its pairs, where they are not stored.
+        For its pairs, if they are not stored.
     ratios : RatioWorkspace
         For the likelihood ratios of its cells.
     new : int32
-        For the logs of these, and of three more ratios (`updates.evaluate`).
+        For their logs, and those of three more ratios (`updates.evaluate`).
     cell, key, unsorted, unsorted_key, tally, bucket
         For sorting its band.
     """
@@ -109,12 +110,12 @@ def make(
 ) -> tuple[int, int]:
     """Write the runs, cells and densities of reading t into `pairs` from `at`; return its runs and band pairs.
 
-    Cells at which the reading exceeds the incidence angle are left out, which may cut a run in two.
+    Cells at which the reading exceeds the incidence angle are left out, which may divide a run.
     """
     reading = cones[t]
     cone = cone_of(reading)
     n = at
-    # of one type from the start, so that what is called is compiled once
+    # always of the same type, so that callees are compiled once
     m: Any = np.int64(0)
     for row in range(*rows_of(cone, lattice.height)):
         runs = runs_of(cone, row, lattice.width)
@@ -157,14 +158,14 @@ def make(
 def _sort(workspace: Workspace, m: int) -> None:
     """Sort the first m of `unsorted` by key, into `cell` and `key`; equal keys keep their order.
 
-    The keys of a band are spread evenly, so that m buckets leave next to nothing to the insertion sort.
+    The keys of a band are distributed evenly, so that after sorting into m buckets little remains for insertion sort.
     """
     if m == 0:
         return
     low, high = math.inf, -math.inf
     for k in range(m):
         low, high = min(low, workspace.unsorted_key[k]), max(high, workspace.unsorted_key[k])
-    # what is nearer than any two cells would make the scale infinite
+    # avoid an infinite scale
     scale = (m - 1) / (high - low) if high - low > LEAST_SPREAD else 0.0
     workspace.tally[: m + 1] = 0
     for k in range(m):

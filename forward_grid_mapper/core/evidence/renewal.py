@@ -1,8 +1,8 @@
-"""Renewal of surface normals: the readings whose pairs it changes, and their pairs made anew.
+"""Renewal of surface normals: finding the readings whose pairs change, and making their pairs again.
 
-A pair is left out where the reading exceeds the incidence angle of the cell. When more readings say more about the
-normals, some pairs come and some go. What a reading said so far is taken off the evidence, exactly, since all of it is
-whole numbers; then its pairs are made with the new normals, and what it says now is added.
+A pair is left out if the reading exceeds the incidence angle of the cell. With more readings, normals change, and so do
+pairs. The old terms of a reading are subtracted from the evidence, which is exact in fixed point; then its pairs are
+made with the new normals, and its new terms are added.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ from .indexing import UNSTORED, UNUSED, WORDS
 from .pairs import WORDS_PER_BAND_PAIR, WORDS_PER_RUN, make
 from .state import State
 from .tile_index import CHUNK, SHIFT
-from .updates import evaluate_and_add, take_off
+from .updates import evaluate_and_add, subtract
 
 
 def box_of(cones: NDArray[np.void], grid: Grid) -> Window | None:
-    """Return a window that holds all cells of cones, None if there is no cone."""
+    """Return a window that contains all cells of cones; None if there is none on the grid."""
     if not len(cones):
         return None
     far = float(cones['reach'].max()) + 1.0
@@ -52,7 +52,7 @@ def near(cones: NDArray[np.void], window: Window) -> NDArray[np.bool_]:
 
 @kernel
 def _mark_cells(old: SurfaceNormals, new: SurfaceNormals, window: Window, width: int, differ: Any) -> None:
-    """Mark the cells of a window whose normals differ in `differ`, uint8, shape (height, width)."""
+    """Set the cells of a window whose normals differ in `differ`, uint8, shape (height, width)."""
     for row in range(window[0], window[1]):
         for column in range(window[2], window[3]):
             c = row * width + column
@@ -63,7 +63,7 @@ def _mark_cells(old: SurfaceNormals, new: SurfaceNormals, window: Window, width:
 
 @kernel
 def _changes(s: State, new: SurfaceNormals, t: int, window: Window, differ: Any) -> bool:
-    """Return whether reading t exceeds the incidence angle at other cells than before, of those in `differ`."""
+    """Return whether the incidence angle of reading t is exceeded at other cells among `differ` than before."""
     reading = s.cones[t]
     cone = cone_of(reading)
     bottom, top = rows_of(cone, s.lattice.height)
@@ -82,15 +82,15 @@ def _changes(s: State, new: SurfaceNormals, t: int, window: Window, differ: Any)
 
 
 @kernel
-def find_changed(s: State, new: SurfaceNormals, window: Window, differ: Any, sees: Any) -> None:
-    """Set `sees` (uint8, shape (N,), all 0) of the readings whose pairs are others with the normals `new`.
+def find_changed(s: State, new: SurfaceNormals, window: Window, differ: Any, changed: Any) -> None:
+    """Set `changed` (uint8, shape (N,), all 0) for the readings whose pairs change with the normals `new`.
 
     Parameters
     ----------
     window
         Where the normals may differ: first row, last one plus one, and columns likewise.
     differ : uint8, shape (height, width)
-        Room to work in, all 0.
+        Workspace, all 0.
     """
     height, width = s.lattice.height, s.lattice.width
     _mark_cells(s.normals, new, window, width, differ)
@@ -108,16 +108,16 @@ def find_changed(s: State, new: SurfaceNormals, window: Window, differ: Any, see
             while chunk >= 0:
                 for k in range(end):
                     t = tiles.chunks[chunk, k]
-                    if sees[t] == 0:
-                        sees[t] = 1 if _changes(s, new, t, window, differ) else 2
+                    if changed[t] == 0:
+                        changed[t] = 1 if _changes(s, new, t, window, differ) else 2
                 chunk, end = tiles.chunks[chunk, CHUNK], CHUNK
-    for t in range(len(sees)):
-        sees[t] &= 1
+    for t in range(len(changed)):
+        changed[t] &= 1
 
 
 @kernel
 def _move(reading_state: Any, size: int, words: int, totals: Any) -> None:
-    """Give a reading room for `size` words after all others, or none if these would be more than `words` then."""
+    """Give a reading `size` words behind all others; if they would exceed `words` in total, it is not stored."""
     totals[UNUSED] += reading_state.room
     reading_state.stored = totals[WORDS] + size <= words
     if reading_state.stored:
@@ -129,19 +129,19 @@ def _move(reading_state: Any, size: int, words: int, totals: Any) -> None:
 
 @kernel
 def renew(s: State, new: SurfaceNormals, readings: Any, limits: tuple[int, int], totals: Any) -> int:
-    """Make the pairs of some readings with the normals `new`; return the index of the one for which there is no room.
+    """Make the pairs of some readings with the normals `new`; return the index of the first that needs more memory.
 
     Parameters
     ----------
     readings : int64
-        Which readings.
+        Indices of the readings.
     limits
-        The index into them to begin with, and the words that stored pairs may take.
+        The index into `readings` to begin with, and the words that stored pairs may take.
     totals : int64
         Those of the evidence.
     """
     workspace, words = s.workspace, limits[1]
-    # of one type, so that what is called is compiled once
+    # always of the same type, so that callees are compiled once
     start: Any = np.int64(0)
     for i in range(limits[0], len(readings)):
         t = readings[i]
@@ -151,11 +151,11 @@ def renew(s: State, new: SurfaceNormals, readings: Any, limits: tuple[int, int],
             size = WORDS_PER_RUN * runs + WORDS_PER_BAND_PAIR * bands
             if size > reading_state.room and len(s.pairs.cell) < totals[WORDS] + size <= words:
                 return i
-            take_off(s, t)
+            subtract(s, t)
             if size > reading_state.room:
                 _move(reading_state, size, words, totals)
         else:
-            take_off(s, t)
+            subtract(s, t)
             runs, bands = make(s.cones, s.lattice, new, t, workspace.pairs, start, workspace)
         reading_state.runs, reading_state.bands = runs, bands
         pairs, at = workspace.pairs, start

@@ -1,4 +1,4 @@
-"""What is kept for every reading and every cell while a map is searched: the arrays that all kernels work on."""
+"""The state of a search: arrays for each reading and each cell, on which all kernels work."""
 
 from __future__ import annotations
 
@@ -32,39 +32,39 @@ READING_STATE = np.dtype(
     ],
     align=True,
 )
-"""What is kept for a reading beside its cone.
+"""The state of a reading, besides its cone.
 
 floor, max_range
-    The densities p_rand / z_max, with p_lost · N(z; z_max, σ) where there is no echo, and N(z; z_max, σ) in 1/m, which
-    no map changes.
+    The densities that do not depend on the map, 1/m: p_rand / z_max, plus p_lost · N(z; z_max, σ) without echo; and
+    N(z; z_max, σ).
 blocking, through
-    Occupied cells in the free zone, and the mixture weight that they leave to the band,
+    Number of occupied cells in the free zone, and the mixture weight that remains for the band,
     (1 − p_rand − p_lost) (1 − p_hit)^blocking.
 stored, at, room, runs, bands
-    Whether its pairs are stored, where in `Pairs`, how many words they may take there, and how many runs and band pairs
-    there are.
+    Whether its pairs are stored; their index in `Pairs`, and the words that they may take; numbers of runs and of band
+    pairs.
 multiplicity
-    How many equal readings this one stands for.
+    Number of equal readings that this one represents.
 occupy, release
     Log of the likelihood ratio of occupying, or freeing, a cell of the free zone, in units of `fixed_point.QUANTUM`.
 likelihood
     log p(z | m), in the same units.
 changed
-    The clock when it was last recomputed.
+    The clock at the last evaluation.
 """
 
 
 class Model(NamedTuple):
-    """What the kernels need of the sensor model.
+    """The values of the sensor model that the kernels need.
 
     Attributes
     ----------
     p_hit : float
         Probability that an occupied cell returns the echo.
     mixture_weight : float
-        That of the causes that the map explains, 1 − p_rand − p_lost.
+        Weight of the causes that depend on the map, 1 − p_rand − p_lost.
     nats : float
-        What one unit of evidence (`fixed_point.QUANTUM`) counts in the objective: the likelihood exponent times it.
+        Nats of the objective for each unit of evidence: likelihood exponent times `fixed_point.QUANTUM`.
     """
 
     p_hit: float
@@ -73,7 +73,7 @@ class Model(NamedTuple):
 
 
 class Maps(NamedTuple):
-    """What is kept for every cell.
+    """The state of the cells.
 
     Attributes
     ----------
@@ -82,10 +82,10 @@ class Maps(NamedTuple):
     evidence : int64
         Log-likelihood gain of flipping the cell, in units of `fixed_point.QUANTUM`.
     seen : int32
-        Number of readings in whose cone the cell is. Merged ones count as often as they came; those that exceed the
-        incidence angle there count as well.
+        Number of readings in whose cone the cell is, with their multiplicity, including those that exceed the incidence
+        angle there.
     pattern : uint8
-        Which of its neighbours are occupied (`neighbourhood`).
+        Pattern of its occupied neighbours (`neighbourhood`).
     """
 
     occupied: NDArray[np.uint8]
@@ -101,7 +101,7 @@ class State(NamedTuple):
     ----------
     cones, reading_states : records of `CONE` and `READING_STATE`, shape (N,)
     observing : int32, shape (N, 2)
-        The readings that see the cell at hand, and 1 if it is in their free zone.
+        The readings that observe the current cell, and 1 if it is in their free zone.
     clock : int64, shape (1,)
         Counts flips.
     stop : uint8, shape (1,)
@@ -123,4 +123,4 @@ class State(NamedTuple):
 
 
 Work = Callable[[State, int, int, NDArray[np.int64]], None]
-"""Takes the readings from one to another, and adds to an array."""
+"""Processes a range of readings, and adds the results to an array."""

@@ -1,7 +1,7 @@
-"""Which readings may see a cell: lists of readings by square tiles of cells.
+"""Spatial index: lists of the readings that may observe the cells of each square tile.
 
-A tile's list is a chain of chunks that grows at its head, so readings can be added at any time. It costs some four
-bytes for every fifteen pairs; which of its readings see a given cell is left to their own pairs to say.
+The list of a tile is a linked list of chunks that grows at its head, so readings can be added at any time. It needs
+about four bytes for fifteen pairs. Which of its readings observe a certain cell must be tested for each of them.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ class Tiles(NamedTuple):
     across : int
         Tiles in a row of them.
     head, fill, latest : int32, shape (tiles,)
-        The first chunk of each list or -1, how many ids that chunk holds, and the reading entered last.
+        The first chunk of each list or -1, the number of ids in that chunk, and the reading inserted last.
     chunks : int32, shape (capacity, CHUNK + 1)
         Ids, and the next chunk or -1.
     used : int64, shape (1,)
@@ -50,7 +50,7 @@ def no_tiles(height: int, width: int) -> Tiles:
 
 
 def more_chunks(tiles: Tiles) -> Tiles:
-    """Return the same lists with room to grow."""
+    """Return the same lists with more free chunks."""
     kept = len(tiles.chunks)
     chunks = np.empty((kept + max(kept // 2, len(tiles.head) + 1024), CHUNK + 1), np.int32)
     chunks[:kept] = tiles.chunks
@@ -59,7 +59,7 @@ def more_chunks(tiles: Tiles) -> Tiles:
 
 @kernel
 def insert(tiles: Tiles, row: int, first: int, last: int, t: Any) -> None:
-    """Enter reading t for the cells `first` to `last` of a row; there must be room for a chunk a tile."""
+    """Insert reading t for the cells `first` to `last` of a row; there must be a free chunk for each tile."""
     line = (row >> SHIFT) * tiles.across
     for tile in range(line + (first >> SHIFT), line + (last >> SHIFT) + 1):
         if tiles.latest[tile] == t:

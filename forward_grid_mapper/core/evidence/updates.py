@@ -1,19 +1,19 @@
-"""Flips of single cells: the M-step with an exact E-step in both directions, and what every cell would gain by it.
+"""Flips of single cells: the M-step with an exact E-step in both directions, and the gain of flipping each cell.
 
-Write p(z_t | m) = c + T, where c gathers the causes that no map changes and T the obstacles and max range. For a cell
-at distance d, let A be the part of T from occupied cells before it, n the number of these,
-W = (1 − p_rand − p_lost) (1 − p_hit)ⁿ and g = N(z; d, σ). Then flipping the cell makes of T
+Let p(z_t | m) = c + T, where c is the density of the causes independent of the map, and T that of obstacles and max
+range. For a cell at distance d, let A be the part of T from occupied cells before it, n the number of these,
+W = (1 − p_rand − p_lost) (1 − p_hit)ⁿ and g = N(z; d, σ). Flipping the cell changes T to
 
     occupy   T' = A + W p_hit g + (T − A) (1 − p_hit)
     free     T' = A + (T − A − W p_hit g) / (1 − p_hit)
 
-and multiplies p(z_t | m) by (c + T') / (c + T) (it takes the place of (39) and (40) of the paper). The log
-of this ratio is the same for all free cells of the free zone (A = 0, g = 0). For the free cells between two occupied
-ones of the band it is that of a straight line in g.
+and multiplies p(z_t | m) by (c + T') / (c + T), in place of (39) and (40) of the paper. The log of this ratio is the
+same for all free cells of the free zone (A = 0, g = 0). For the free cells between two occupied ones of the band, the
+ratio is linear in g.
 
-The sum of these logs over the readings of a cell is its evidence: what flipping it gains. The evidence of all cells is
-kept up to date. A flip evaluates the readings that see the cell anew, and adds the differences to the evidence of their
-cells. So the gain of any flip is a table lookup.
+The evidence of a cell is the sum of these logs over its readings: the gain of flipping it. The evidence of all cells is
+kept up to date. After a flip, the readings that observe the cell are evaluated again, and the differences are added to
+the evidence of their cells. So the gain of any flip is a table lookup.
 """
 
 from __future__ import annotations
@@ -33,26 +33,28 @@ from .state import Maps, Model, State
 from .tile_index import CHUNK, SHIFT
 
 EDGE = 1e-6
-"""Cells; nearer to a cone's edge than this, only the cone's own arithmetic decides which side a cell is on."""
+"""Within this distance of the edge of a cone, cells, the exact arithmetic of the cone decides whether a cell is in
+it."""
 
 LEAST_RATIO = 1e-30
-"""What rounding must leave of a likelihood ratio."""
+"""Smallest likelihood ratio, because of rounding."""
 
 
 @kernel
 def evaluate(model: Model, reading_state: Any, occupied: Any, pairs: Pairs, at: int, workspace: Workspace) -> None:
-    """Compute the log ratios of a reading from the map (E-step) into `workspace.new`, in the order of its band.
+    """Write the log ratios of a reading on the map (E-step) to `workspace.new`, in the order of its band.
 
-    After them come those of occupying and of freeing a cell of the free zone, and the log-likelihood of the reading.
+    They are followed by those of occupying and of freeing a cell of the free zone, and the log-likelihood of the
+    reading.
 
     Parameters
     ----------
     reading_state : record of READING_STATE
-        Of which `through` must be right.
+        Its `through` must be up to date.
     pairs, at
-        Where its pairs begin.
+        Its pairs, from index `at` on.
     """
-    # unsigned, so that an index need not be asked whether it counts from the end
+    # unsigned, so that numba does not test for negative indices
     one, m = np.uint64(1), np.uint64(reading_state.bands)
     cell = np.uint64(at + WORDS_PER_RUN * reading_state.runs)
     density = cell + m
@@ -62,7 +64,7 @@ def evaluate(model: Model, reading_state: Any, occupied: Any, pairs: Pairs, at: 
     obstacles = np.uint64(0)
     for k in range(m):
         if occupied[pairs.cell[cell + k]]:
-            # the places of obstacles, which are needed until their logs are written here
+            # indices of obstacles, stored here until their logs are written
             out[obstacles] = k
             obstacles += one
             total += weight * p * pairs.density[density + k]
@@ -91,7 +93,7 @@ def evaluate(model: Model, reading_state: Any, occupied: Any, pairs: Pairs, at: 
 
 @kernel
 def _make_pairs(s: State, t: int) -> None:
-    """Make the pairs of reading t where they are to be stored, or in the workspace; logs are not written."""
+    """Make the pairs of reading t in their memory, or in the workspace if they are not stored; without logs."""
     reading_state = s.reading_states[t]
     pairs, at = (s.pairs, reading_state.at) if reading_state.stored else (s.workspace.pairs, 0)
     reading_state.runs, reading_state.bands = make(s.cones, s.lattice, s.normals, t, pairs, at, s.workspace)
@@ -99,7 +101,7 @@ def _make_pairs(s: State, t: int) -> None:
 
 @kernel
 def pairs_of(s: State, t: int) -> tuple[Pairs, int]:
-    """Return the pairs of reading t and where they begin; where they are not stored, they are made, without logs."""
+    """Return the pairs of reading t and their index; if they are not stored, they are made, without logs."""
     reading_state = s.reading_states[t]
     if not reading_state.stored:
         _make_pairs(s, t)
@@ -108,7 +110,7 @@ def pairs_of(s: State, t: int) -> tuple[Pairs, int]:
 
 @kernel
 def pairs_with_logs(s: State, t: int) -> tuple[Pairs, int]:
-    """Do as `pairs_of` does, with the logs of the map as it is."""
+    """Do the same as `pairs_of`, with the logs for the present map."""
     pairs, at = pairs_of(s, t)
     reading_state = s.reading_states[t]
     if not reading_state.stored:
@@ -129,7 +131,7 @@ def _add_to_free_zone(reading_state: Any, pairs: Pairs, at: int, maps: Maps, ste
 
 @kernel
 def _add_difference(reading_state: Any, pairs: Pairs, at: int, maps: Maps, new: Any) -> None:
-    """Bring the evidence from the logs that were kept of a reading to those that `evaluate` left, and keep these."""
+    """Replace the logs of a reading by those of `evaluate`, and add the differences to the evidence."""
     m, multiplicity = reading_state.bands, reading_state.multiplicity
     cell = np.uint64(at + WORDS_PER_RUN * reading_state.runs)
     log = cell + np.uint64(2 * m)
@@ -143,7 +145,7 @@ def _add_difference(reading_state: Any, pairs: Pairs, at: int, maps: Maps, new: 
 
 @kernel
 def evaluate_and_add(s: State, t: int, pairs: Pairs, at: int) -> None:
-    """Evaluate reading t on the map, and add all that it says to the evidence; `pairs` are its own, from `at`."""
+    """Evaluate reading t on the map, and add its terms to the evidence; its pairs begin at `at`."""
     maps = s.maps
     reading_state = s.reading_states[t]
     log = at + WORDS_PER_RUN * reading_state.runs + 2 * reading_state.bands
@@ -161,8 +163,8 @@ def evaluate_and_add(s: State, t: int, pairs: Pairs, at: int) -> None:
 
 
 @kernel
-def take_off(s: State, t: int) -> None:
-    """Take what reading t says off the evidence."""
+def subtract(s: State, t: int) -> None:
+    """Subtract the terms of reading t from the evidence."""
     maps = s.maps
     pairs, at = pairs_with_logs(s, t)
     reading_state = s.reading_states[t]
@@ -176,9 +178,9 @@ def take_off(s: State, t: int) -> None:
 
 @kernel
 def evaluate_all(s: State, begin: int, end: int, new: bool) -> None:
-    """Evaluate the readings `begin` to `end` on the map, and add all that they say to the evidence.
+    """Evaluate the readings `begin` to `end` on the map, and add their terms to the evidence.
 
-    The pairs of `new` ones are made first.
+    If they are `new`, their pairs are made first.
     """
     for t in range(begin, end):
         if s.stop[0]:
@@ -190,8 +192,8 @@ def evaluate_all(s: State, begin: int, end: int, new: bool) -> None:
 
 
 @kernel
-def _sees_flipped(reading_state: Any, pairs: Pairs, at: int, flipped: Any) -> bool:
-    """Return whether any cell of a reading is one of those that are 1 in `flipped`."""
+def _observes_flipped(reading_state: Any, pairs: Pairs, at: int, flipped: Any) -> bool:
+    """Return whether any cell of a reading is set in `flipped`."""
     begin = np.uint64(at + WORDS_PER_RUN * reading_state.runs)
     for k in range(begin, begin + np.uint64(reading_state.bands)):
         if flipped[pairs.cell[k]]:
@@ -205,7 +207,7 @@ def _sees_flipped(reading_state: Any, pairs: Pairs, at: int, flipped: Any) -> bo
 
 @kernel
 def evaluate_flipped(s: State, begin: int, end: int, flipped: Any) -> None:
-    """Bring the evidence up to date with what those of the readings `begin` to `end` say that see flipped cells.
+    """Update the evidence by those of the readings `begin` to `end` that observe flipped cells.
 
     Their pairs must be stored.
 
@@ -220,10 +222,10 @@ def evaluate_flipped(s: State, begin: int, end: int, flipped: Any) -> None:
             break
         reading_state = s.reading_states[t]
         pairs, at = pairs_of(s, t)
-        if not _sees_flipped(reading_state, pairs, at, flipped):
+        if not _observes_flipped(reading_state, pairs, at, flipped):
             continue
         times = reading_state.multiplicity
-        # a flipped cell of the free zone goes from one ratio to the other: what it had comes off before they change
+        # a flipped cell of the free zone changes from one ratio to the other; this uses the ratios before the update
         for k in range(np.uint64(at), np.uint64(at + WORDS_PER_RUN * reading_state.runs), np.uint64(WORDS_PER_RUN)):
             for c in range(np.uint64(pairs.cell[k]), np.uint64(pairs.cell[k + np.uint64(1)]) + np.uint64(1)):
                 if flipped[c]:
@@ -238,7 +240,7 @@ def evaluate_flipped(s: State, begin: int, end: int, flipped: Any) -> None:
 
 @kernel
 def _add_seen(s: State, t: int, times: int) -> None:
-    """Count reading t so many times more, or fewer, at every cell of its cone."""
+    """Add `times`, which may be negative, to the number of readings of each cell in the cone of reading t."""
     cone = cone_of(s.cones[t])
     for row in range(*rows_of(cone, s.lattice.height)):
         runs = runs_of(cone, row, s.lattice.width)
@@ -250,14 +252,14 @@ def _add_seen(s: State, t: int, times: int) -> None:
 
 @kernel
 def forget(s: State, begin: int, end: int) -> None:
-    """Uncount the readings `begin` to `end` at every cell."""
+    """Subtract the readings `begin` to `end` from the numbers of readings of all cells."""
     for t in range(begin, end):
         _add_seen(s, t, -s.reading_states[t].multiplicity)
 
 
 @kernel
 def add_multiplicity(s: State, readings: Any) -> None:
-    """Let each of `readings` stand for one more that says the same."""
+    """Increase the multiplicity of each of `readings` by one."""
     maps = s.maps
     for t in readings:
         pairs, at = pairs_with_logs(s, t)
@@ -290,7 +292,7 @@ def _zone(reading: Any, lattice: Lattice, row: int, column: int) -> int:
             return 2
         if away < (reading.reach - EDGE) ** 2 and (reading.free < 0.0 or away > (reading.free + EDGE) ** 2):
             return 1
-    # a cell at an edge, or one that only the axis crosses
+    # a cell at the edge, or one that only the axis crosses
     cone = cone_of(reading)
     runs = runs_of(cone, row, lattice.width)
     bottom, top = rows_of(cone, lattice.height)
@@ -301,7 +303,7 @@ def _zone(reading: Any, lattice: Lattice, row: int, column: int) -> int:
 
 @kernel
 def find_observing(s: State, c: int) -> int:
-    """List the readings that see cell c in `observing`; return their number."""
+    """List the readings that observe cell c in `observing`; return their number."""
     row, column = c // s.lattice.width, c % s.lattice.width
     tile = (row >> SHIFT) * s.tiles.across + (column >> SHIFT)
     chunk, end = s.tiles.head[tile], s.tiles.fill[tile]
@@ -326,7 +328,7 @@ def find_observing(s: State, c: int) -> int:
 
 @kernel
 def flip(s: State, c: int) -> None:
-    """Flip cell c and bring the evidence of all cells up to date."""
+    """Flip cell c and update the evidence of all cells."""
     n = find_observing(s, c)
     maps = s.maps
     own = 0
@@ -334,7 +336,7 @@ def flip(s: State, c: int) -> None:
         if s.observing[i, 1]:
             reading_state = s.reading_states[s.observing[i, 0]]
             own += reading_state.multiplicity * (reading_state.release - reading_state.occupy)
-    # where the cell is in the free zone, its own ratio is that of an occupied cell from now on, or of a free one
+    # for readings with the cell in the free zone, its ratio changes between that of a free and of an occupied cell
     maps.evidence[c] += -own if maps.occupied[c] else own
     maps.occupied[c] ^= 1
     note_flip(maps.pattern, c, s.lattice.height, s.lattice.width)
@@ -342,7 +344,7 @@ def flip(s: State, c: int) -> None:
     s.clock[0] += 1
     for i in range(n):
         t: Any = np.int64(s.observing[i, 0])
-        # logs that are not stored are those of the map before the flip
+        # logs that are not stored must be computed for the map before the flip
         maps.occupied[c] ^= 1
         pairs, at = pairs_with_logs(s, t)
         maps.occupied[c] ^= 1

@@ -1,1 +1,1 @@
-"""What a map says of the sensors: model parameters with their standard errors, and the health of each sensor."""
+"""What follows from a map about sensors: model parameters with standard errors, and the health of each sensor."""

@@ -1,14 +1,13 @@
-"""What contradicts the readings: extrinsics or odometry mirrored, turned or out of scale, cones too wide, stamps late.
+"""Consistency checks: extrinsics or odometry that are mirrored, rotated or wrongly scaled, wrong cones, late stamps.
 
-Such input gives a map without any error, only a wrong one. But each of these faults can be undone: mirrored sensors
-are mirrored back, stamps are shifted back. So a small map is made of a stretch of the drive for each assumed fault,
-with the fault undone, and all are compared with the map of the readings as they are. Of a sound drive, no map with a
-fault undone explains the readings better.
+Such faults cause no error message, only a wrong map. Each of them can be undone: mirrored sensors are mirrored back,
+stamps are shifted back. So a small map of a part of the drive is made for each assumed fault, with the fault undone,
+and compared with the map of the unchanged readings. If the input is sound, none of them explains the readings better.
 
 Poses and cones are changed, never ranges, so the likelihoods of all these maps can be compared. Ranges that are too
 large by a factor look like odometry that is too small by it.
 
-The cost is that of some twenty maps of at most `MOST` readings each, whatever the length of the drive.
+It costs some twenty maps of at most `MOST` readings each, however long the drive is.
 """
 
 from __future__ import annotations
@@ -34,61 +33,60 @@ from ..runtime.threads import cores
 from ..search.search import Search
 
 MOST, ENOUGH = 800, 300
-"""Readings of the stretch that is mapped, and those below which nothing is said."""
+"""Most readings of the part that is mapped; with fewer than the second, no check is made."""
 
 CELL, REACH = 0.1, 60.0
-"""Metres of a cell of these maps at least, and the cells that most ranges reach at most: they bound the cost."""
+"""Smallest cells of these maps, metres, and most cells that the 0.9 quantile of ranges spans: they limit the cost."""
 
 GAIN = 0.1
-"""Nats a reading by which the map with a fault undone must be better. Of sound drives, none is by more than .05."""
+"""Nats a reading by which the map with a fault undone must be better. In sound drives it is at most 0.05."""
 
 LEAST_SHIFT, SHIFT_GAIN = 0.2, 0.15
-"""Seconds by which the stamps of real sensors may be late, and nats that a shift by so little must gain; in a sound
-drive it gains .11 at the most."""
+"""Smallest shift of stamps that is tried, seconds: stamps of real sensors may be that late. Nats a reading that it must
+gain; in sound drives it gains at most 0.11."""
 
 TOTAL = 50.0
-"""Nats by which it must be better altogether."""
+"""Nats by which it must be better in total."""
 
 SHIFTS = (LEAST_SHIFT, 0.5, 1.0)
-"""Seconds by which stamps are shifted, either way."""
+"""Seconds by which stamps are shifted, in both directions."""
 
 FACTORS = (0.3048, 0.5, 2.0, 3.281)
-"""Scales of odometry: feet, and a wheel's radius taken for its diameter, both ways."""
+"""Scale factors of odometry that are tried: feet for metres, and radius for diameter of a wheel, and their inverses."""
 
 WIDTHS = (0.25, 0.5, 2.0, 3.0)
-"""By how much the field of view is wider than stated."""
+"""Factors of the stated field of view that are tried."""
 
 WIDEST = 1.5
-"""Radians of half a field of view, at most."""
+"""Largest half field of view, radians."""
 
 STEP = 0.05
-"""Metres of driving in which the direction of travel is measured."""
+"""Metres of driving over which a direction of travel is measured."""
 
 STEPS = 40
-"""Such steps from which on directions of travel are looked at."""
+"""Fewest such steps for checks of the direction of travel."""
 
 ALIGNED, AWRY = 0.9, 0.7
-"""Mean resultant lengths: at least that of angles that are one and the same, at most that of angles that are not."""
+"""Mean resultant lengths of angles: at least the first if they agree, at most the second if they do not."""
 
 SAME_YAW = 0.01
-"""Radians within which the yaw of odometry never changes."""
+"""The yaw of odometry is constant if it varies by less than this, radians."""
 
 SPINNING = 10.0
-"""Radians a second in which no robot does half of its turning: a quarter turn a second seems to be 90 in degrees."""
+"""No robot does half of its turning faster than so many radians a second; a yaw in degrees looks so."""
 
 TURNED, TURNING = 2 * math.pi, 0.05
-"""Radians that the robot must turn altogether before that is said, and part of the time in which it must turn so fast:
-odometry may jump now and then."""
+"""Least total turn, radians, and least fraction of the time with such fast turns: odometry may jump now and then."""
 
 REP_103 = 'REP 103 has x forward, y to the left and yaw counter-clockwise'
 
 
 @dataclass(frozen=True)
 class _Drive:
-    """Readings with the robot's pose at each of them, by stamp.
+    """Readings, sorted by stamp, with the pose of the robot at each of them.
 
     `robot` and `extrinsics` have shape (3, N): x, y in metres and yaw in radians, of the robot in the map frame and of
-    the sensor in the robot's.
+    the sensor in the frame of the robot.
     """
 
     readings: Readings
@@ -118,7 +116,7 @@ class _Drive:
 def consistency_warnings(
     readings: Readings, extrinsics: Mapping[str, Pose2], parameters: Parameters | None = None
 ) -> list[str]:
-    """Return what is wrong with poses, stamps or cones of readings; empty if nothing seems to be.
+    """Return warnings about poses, stamps or cones of readings; empty if there is no suspicion.
 
     Parameters
     ----------
@@ -129,14 +127,14 @@ def consistency_warnings(
 
     Notes
     -----
-    A drive straight ahead says nothing of left and right, and a slow one little of stamps.
+    Swapped left and right are not found in a straight drive, and shifted stamps hardly in a slow one.
     """
     drive = _drive(readings, extrinsics)
     if drive is None:
         return []
-    # a yaw in degrees points anywhere, and so may look like any other fault
-    if told := _spinning(drive) or _axes(drive):
-        return [told]
+    # a yaw in degrees looks random, and so may look like any other fault
+    if warning := _spinning(drive) or _axes(drive):
+        return [warning]
     drive = _stretch(drive)
     p = _coarse(parameters or Parameters(), drive.readings)
     count, given = len(drive.readings), _objective(drive.readings, p)
@@ -144,7 +142,7 @@ def consistency_warnings(
     gain, fault = max(gains, key=itemgetter(0))
     if gain < max(fault.least, TOTAL / count):
         return []
-    return [f'{fault.told} (with this corrected, a map explains {count} readings better by {gain:.2f} nats each)']
+    return [f'{fault.warning} (with this corrected, a map explains {count} readings better by {gain:.2f} nats each)']
 
 
 def _drive(readings: Readings, extrinsics: Mapping[str, Pose2]) -> _Drive | None:
@@ -164,13 +162,13 @@ def _drive(readings: Readings, extrinsics: Mapping[str, Pose2]) -> _Drive | None
 
 
 def _stretch(drive: _Drive) -> _Drive:
-    """Return the stretch of `MOST` readings with the most driving and turning, where wrong poses show most."""
+    """Return the `MOST` consecutive readings with the most driving and turning, where wrong poses matter most."""
     count = len(drive.readings)
     if count <= MOST:
         return drive
     x, y, yaw = drive.robot
     moved = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(x), np.diff(y)) + np.abs(np.diff(np.unwrap(yaw))))])
-    # turns that are seen in the path alone count as well
+    # turns of the path count as well, in case the yaw is wrong
     at, directions = _travel(drive)
     if len(at) > 1:
         turns = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(np.unwrap(directions))))])
@@ -180,14 +178,14 @@ def _stretch(drive: _Drive) -> _Drive:
 
 
 def _coarse(parameters: Parameters, readings: Readings) -> Parameters:
-    """Return the parameters of the small maps: of coarse cells where ranges are long."""
+    """Return the parameters of the small maps, with coarse cells if ranges are long."""
     reach = float(np.quantile(readings.z, 0.9))
     cell = max(parameters.grid.resolution, CELL, reach / REACH)
     return replace(parameters, grid=replace(parameters.grid, resolution=cell))
 
 
 def _objective(readings: Readings, parameters: Parameters) -> float:
-    """Return the objective of the map of some readings, as the search leaves it; -inf if the map would be too large."""
+    """Return the objective of the map that the search finds for readings; -inf if the map would be too large."""
     readings = in_canonical_order(readings)
     try:
         grid = map_grid(readings, parameters)
@@ -201,15 +199,15 @@ def _objective(readings: Readings, parameters: Parameters) -> float:
 
 
 class _Fault(NamedTuple):
-    """What may be wrong: the text that says so, the readings with it undone, and the least gain that tells."""
+    """An assumed fault: the warning, the readings with the fault undone, and the least gain for the warning."""
 
-    told: str
+    warning: str
     undone: Readings
     least: float = GAIN
 
 
 def _faults(drive: _Drive) -> Iterator[_Fault]:
-    """Yield every fault that may be."""
+    """Yield all faults that are checked."""
     yield from _of_axes(drive)
     x, y, yaw = drive.robot
     for factor in FACTORS:
@@ -238,7 +236,7 @@ def _faults(drive: _Drive) -> Iterator[_Fault]:
 
 
 def _of_axes(drive: _Drive) -> Iterator[_Fault]:
-    """Yield the faults of signs and axes."""
+    """Yield wrong signs and axes."""
     x, y, yaw = drive.robot
     forward, left, turn = drive.extrinsics
     check = 'check the poses of the sensors on the robot (parameters, --sensor or transforms)'
@@ -272,7 +270,7 @@ def _of_axes(drive: _Drive) -> Iterator[_Fault]:
 
 
 def _travel(drive: _Drive) -> tuple[NDArray[np.int64], Floats]:
-    """Return numbers of readings between which the robot drove `STEP`, and its direction of travel there, radians."""
+    """Return indices of readings between which the robot drove `STEP`, and the direction of travel there, radians."""
     x, y, _ = drive.robot
     driven = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(x), np.diff(y)))])
     at = np.searchsorted(driven, np.arange(STEP, driven[-1], STEP))
@@ -281,7 +279,7 @@ def _travel(drive: _Drive) -> tuple[NDArray[np.int64], Floats]:
 
 
 def _spinning(drive: _Drive) -> str:
-    """Look for a yaw in another unit than radians: the robot seems to turn far too fast, whenever it turns."""
+    """Return a warning if the yaw is in another unit than radians, so that the robot seems to turn far too fast."""
     known, first = np.unique(drive.readings.stamp, return_index=True)
     seconds = np.diff(known) / NANOSECONDS
     turned = np.abs(np.remainder(np.diff(drive.robot[2, first]) + math.pi, 2 * math.pi) - math.pi)
@@ -297,16 +295,16 @@ def _spinning(drive: _Drive) -> str:
 
 
 def _axes(drive: _Drive) -> str:
-    """Compare the direction of travel with the yaw: where they turn against each other, an axis is wrong.
+    """Return a warning if the direction of travel turns against the yaw, so that an axis is wrong; otherwise ''.
 
-    A robot drives the way it looks, or backwards, or, if it is a special one, anywhere. None drives to the right
-    whenever it looks to the left, and to the left whenever it looks to the right.
+    A robot drives forwards, or backwards, or, if it is holonomic, in any direction. None drives to the right whenever
+    it turns to the left, and to the left whenever it turns to the right.
     """
     at, directions = _travel(drive)
     if len(at) < STEPS:
         return ''
     yaw = drive.robot[2, at]
-    # doubled angles, of which backwards is the same as forwards, tell nothing where all walls are at right angles
+    # doubled angles, for which backwards equals forwards, do not help if the robot drives along two axes only
     for times in (1, 2):
         with_yaw = abs(np.mean(np.exp(1j * times * (directions - yaw))))
         against_yaw = np.mean(np.exp(1j * times * (directions + yaw)))

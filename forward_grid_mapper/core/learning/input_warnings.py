@@ -1,9 +1,9 @@
-"""Input that gives a wrong map without any error: each warning names the cause and the remedy.
+"""Warnings about input that gives a wrong map without any error; each names the cause and the remedy.
 
-These look at the readings alone, so that the node and the offline tool say the same. What the messages said before they
-became readings is looked at by `messages.limit_watch`.
+The checks use the readings alone, so that the node and the offline tool give the same warnings. Messages, before they
+become readings, are checked by `messages.limit_watch`.
 
-Thresholds are far from what sound drives show: a warning that is often wrong is not read.
+Thresholds are far from the values of sound drives, since nobody reads warnings that are often wrong.
 """
 
 from __future__ import annotations
@@ -18,109 +18,114 @@ from ..common.grid import cone_boxes
 from ..common.readings import Floats, Readings
 
 ENOUGH = 30
-"""Readings of a sensor below which nothing is said of it."""
+"""Fewest readings of a sensor that is checked."""
 
 COPIES = 0.3
-"""Part of the readings that must be copies of others; a driver may send a value twice now and then."""
+"""Fraction of the readings that must be copies of others; a driver may send a value twice now and then."""
 
 COARSE, CROWDED = 1_000_000, 2.0
-"""Nanoseconds after a whole second that all stamps lie within where nanosec is not filled in, or in another unit; and
-the readings of a sensor in such a second."""
+"""All stamps are within so many nanoseconds after a whole second if nanosec is not filled in, or is in another unit;
+and a sensor has at least so many readings in each such second."""
 
 AT_ONCE = 0.3
-"""Part of a sensor's readings that share their stamp with another one of a different range."""
+"""Fraction of the readings of a sensor that have the stamp of another one with a different range."""
 
 SHARED = 100
-"""Pairs of readings of one frame from which on its ranges are searched for a period; few may have one at random."""
+"""Fewest pairs of readings of a frame whose ranges are tested for a period; few may have one at random."""
 
 LONGEST_PERIOD = 32
-"""Sensors that may have one frame; more than any ring of sonars has."""
+"""Most sensors with one frame; no ring of sonars has more."""
 
 REPEATS = 0.25
-"""A range and the one a whole round of sensors earlier differ by at most this part of what neighbours differ by: at
-the upper quartiles, since some readings are random."""
+"""A range differs from that of one round of sensors before by at most this fraction of the difference between
+neighbours. Upper quartiles are compared, since some readings are random."""
 
 DIFFERS = 0.3
-"""Metres by which the ranges of neighbouring sensors differ in a quarter of the cases; less may be noise."""
+"""Metres by which the ranges of neighbouring sensors differ in at least a quarter of the cases; less may be noise."""
 
 AS_BEFORE = 0.05
-"""Radians by which a sensor may turn from one reading to the next for a change of range to be told from what it looks
-at: one that a servo swings, or on a robot that spins, sees the same things in turn."""
+"""Steps between readings during which the sensor turned by more, radians, are ignored: a sensor on a servo, or on a
+robot that spins, detects the same objects periodically."""
 
 STILL = 0.01, 0.01
-"""Metres and radians within which a robot stands still."""
+"""Metres and radians: a robot that moves by less stands still."""
 
 STANDS = 8.0
-"""Seconds of standing from which on the ranges are looked at."""
+"""Shortest standstill whose ranges are checked, seconds."""
 
 JUDGED = 1.0
-"""Metres over which sensors have looked before their reach is judged: from one place all walls may be near or far."""
+"""Metres that sensors must have moved before their range limit is checked: from one place all walls may be near or
+far."""
 
 BLOCK = 3.0
-"""Seconds of the parts of such a time whose median ranges are looked at."""
+"""Seconds of the blocks of a standstill whose median ranges are compared."""
 
 LEAST = 5
-"""Readings of a sensor in such a part; fewer are not looked at."""
+"""Fewest readings of a sensor in such a block."""
 
 CHANGED, OFTEN = 0.4, 0.3
-"""Metres by which the medians of so large a part of them differ from the median of all where a robot drives: people who
-pass a robot that stands change a sensor's ranges now and then."""
+"""If the robot in fact drives, at least the second fraction of the medians differ from the median of all by more than
+the first, metres. People who pass a standing robot change the ranges of a sensor only now and then."""
 
 MOST_CHANGED = 0.6
-"""Part of the sensors before which they have: people walk before some, a robot that drives changes most."""
+"""Fraction of the sensors whose ranges must change: people walk in front of some, but driving changes most."""
 
 STUCK, MOVED = 0.97, 2.0
-"""A stuck sensor repeats one range to the millimetre in this part of its readings, over so many metres of driving."""
+"""A stuck sensor repeats one range to the millimetre in this fraction of its readings, over so many metres of
+driving."""
 
 TURNED = 0.5
-"""Radians that the robot turned meanwhile as well: along a straight wall a range may stay the same for long."""
+"""The robot must have turned by so many radians as well: along a straight wall, a range may stay the same for long."""
 
 FASTEST = 15.0
-"""Metres a second that no robot with sonars drives; one that does 0.2 m/s seems to do 20 in centimetres."""
+"""No robot with sonars drives so many metres a second; 0.2 m/s in centimetres look like 20 m/s."""
 
 NARROW, WIDE = math.radians(3.0), math.radians(90.0)
-"""Fields of view that no sonar has."""
+"""No sonar has a smaller or larger field of view than these."""
 
 REACHED = 0.6
-"""Part of max_range within which all echoes lie where it is too large."""
+"""max_range is too large if all echoes are within this fraction of it."""
 
 SILENT = 0.05
-"""Part of the readings that are without echo then: in a small closed room all echoes are near, and none is missing."""
+"""At least this fraction of the readings must have no echo: in a small closed room all echoes are near, but all
+readings have one."""
 
 ECHOES = 200
-"""Echoes from which on that is said."""
+"""Fewest echoes for checks of the range limit."""
 
 CEILING, ABOVE = 0.05, 0.005
-"""A driver that has a range of its own for 'no echo' sends it in this part of its echoes, and hardly any is longer."""
+"""A driver that sends a certain range for 'no echo' does so in at least the first fraction of its echoes, and at most
+the second fraction is longer."""
 
 NONE = 0.01
-"""Part of the readings that are without echo then, at the most."""
+"""Then at most this fraction of the readings has no echo."""
 
 SAME = 0.0005
-"""Metres by which ranges that a driver sends for one and the same may differ."""
+"""Metres within which two ranges are the same value of the driver."""
 
 BELOW, DIRECTIONS = 0.05, 3
-"""Metres below that range in which there are few echoes, unlike those of a wall; and twelfths of the circle, at least,
-in which it is sent."""
+"""Within so many metres below that range there are few echoes, unlike for a wall; and it is sent in at least so many
+twelfths of the circle."""
 
 FLOOR = 0.1
-"""Metres above the shortest range of all in which there are few echoes, where it stands for 'no echo'."""
+"""Within so many metres above the shortest range there are few echoes, if it stands for 'no echo'."""
 
 SCATTER = 0.5
-"""Metres by which the ranges of no sonar scatter."""
+"""The σ of no sonar is so many metres."""
 
 HANDFUL, SWEEPS = 0.02, 2
-"""Part of readings, and rounds of all sensors, that may not make the map much larger; a wild pose places a round."""
+"""Largest fraction of the readings, and of rounds of all sensors, that should not make the map much larger; one wrong
+pose affects a round."""
 
 MULTIPLE = 4.0
-"""How many times as large the map is with them."""
+"""The map is at least so many times as large with them."""
 
 LARGE = 400.0
-"""Square metres that they add at least; a small map costs nothing."""
+"""They add at least so many square metres; for small maps it does not matter."""
 
 
 def input_warnings(readings: Readings) -> list[str]:
-    """Return what is wrong with readings that have a pose; empty if nothing seems to be."""
+    """Return warnings about readings; empty if there is no suspicion."""
     if len(readings) < ENOUGH:
         return []
     if text := _whole_seconds(readings):
@@ -149,7 +154,7 @@ def _copies(readings: Readings) -> str:
     stamp, sensor, z = readings.stamp[order], readings.sensor[order], readings.z[order]
     same = (stamp[1:] == stamp[:-1]) & (sensor[1:] == sensor[:-1]) & (z[1:] == z[:-1])
     copies = int(np.count_nonzero(same))
-    # a sensor whose readings all have one stamp is another fault
+    # readings that all have one stamp are another fault
     if copies < COPIES * len(z) or len(np.unique(stamp)) < 0.1 * len(z) / max(len(readings.sensor_names), 1):
         return ''
     return (
@@ -159,7 +164,7 @@ def _copies(readings: Readings) -> str:
 
 
 def _whole_seconds(readings: Readings) -> str:
-    """Look for stamps whose nanoseconds are not filled in, or in another unit, and for those that are not at all."""
+    """Check for stamps whose nanoseconds are not filled in or in another unit, and for constant stamps."""
     if readings.stamp.min() < 0 or np.any(readings.stamp % 1_000_000_000 >= COARSE):
         return ''
     most = max((len(mine) / len(np.unique(mine.stamp // 1_000_000_000)) for _, mine in _sensors(readings)), default=0.0)
@@ -195,7 +200,7 @@ def _shared_frame(readings: Readings) -> str:
 
 
 def _speed(readings: Readings) -> str:
-    """Look for poses in other units than metres: the robot seems to drive far too fast, most of the time it drives."""
+    """Check for poses in other units than metres: most of the time, the robot seems to drive far too fast."""
     speeds = []
     for _, mine in _sensors(readings):
         seconds = np.diff(mine.stamp) / 1e9
@@ -212,7 +217,7 @@ def _speed(readings: Readings) -> str:
 
 
 def _standing(readings: Readings) -> str:
-    """Look for a time in which odometry stands still, and the ranges of most sensors change all the same."""
+    """Check for times in which odometry stands still although the ranges of most sensors change."""
     lasted = 0.0
     names, per_sensor = [], []
     for name, mine in _sensors(readings):
@@ -237,7 +242,7 @@ def _still_times(mine: Readings) -> Iterable[tuple[int, int]]:
     """Yield begin and end, in nanoseconds, of the times in which a sensor did not move."""
     cuts = np.flatnonzero(_moving(mine))
     for first, last in zip([0, *cuts.tolist()], [*cuts.tolist(), len(mine)], strict=True):
-        # steps too small to be seen one by one add up
+        # steps below the threshold may add up
         part = slice(first, last)
         wide = max(float(np.ptp(mine.x[part])), float(np.ptp(mine.y[part])))
         if mine.stamp[last - 1] - mine.stamp[first] >= STANDS * 1e9 and wide <= STILL[0]:
@@ -245,7 +250,7 @@ def _still_times(mine: Readings) -> Iterable[tuple[int, int]]:
 
 
 def _changes(mine: Readings, begin: int, end: int) -> bool | None:
-    """Return whether the ranges change as those of a robot that drives do; None if there are too few readings."""
+    """Return whether the ranges change as if the robot drives; None if there are too few readings."""
     inside = (mine.stamp >= begin) & (mine.stamp <= end)
     z, block = mine.z[inside], ((mine.stamp[inside] - begin) / (BLOCK * 1e9)).astype(np.int64)
     parts = np.split(z, np.flatnonzero(np.diff(block)) + 1)
@@ -280,7 +285,7 @@ def _drove(mine: Readings) -> bool:
 
 
 def _ceiling(readings: Readings) -> str:
-    """Look for a range that stands for 'no echo', below max_range: the longest one of all, ever again."""
+    """Check for a range below max_range that stands for 'no echo': the longest one, which occurs again and again."""
     heard, towards = _echoes_of_all_that_answer(readings)
     if len(heard) < ECHOES:
         return ''
@@ -298,7 +303,7 @@ def _ceiling(readings: Readings) -> str:
 
 
 def _floor(readings: Readings) -> str:
-    """Look for the same below all other ranges, as where a driver raises its 0 for 'no echo' to min_range."""
+    """Check for a shortest range that stands for 'no echo': a driver may raise its 0 for that to min_range."""
     heard, towards = _echoes_of_all_that_answer(readings)
     if len(heard) < ECHOES:
         return ''
@@ -315,14 +320,14 @@ def _floor(readings: Readings) -> str:
         return ''
     return (
         f'{count / len(heard):.0%} of the echoes are at {shortest:.3f} m, hardly any is as short, and no reading is '
-        f'without echo: is that what the driver sends where it hears nothing? Have it send +inf (REP 117), or the '
-        f'robot is mapped as walled in'
+        f'without an echo: does the driver send this range if there is no echo? Let it send +inf (REP 117), otherwise '
+        f'the robot is mapped as walled in'
     )
 
 
 def _echoes_of_all_that_answer(readings: Readings) -> tuple[Floats, Floats]:
-    """Return ranges and directions, radians, of the echoes of a robot that moves; none where echoes are missing."""
-    # a robot that stands sees one range for long
+    """Return ranges and directions, radians, of the echoes while the robot moves; none if readings have no echo."""
+    # during a standstill ranges are constant
     parts = [mine.select(mine.echo & _moving(mine)) for _, mine in _sensors(readings)]
     if not parts or np.count_nonzero(~readings.echo) > NONE * len(readings):
         return np.zeros(0), np.zeros(0)
@@ -330,19 +335,19 @@ def _echoes_of_all_that_answer(readings: Readings) -> tuple[Floats, Floats]:
 
 
 def _all_around(yaw: Floats) -> bool:
-    """Return whether directions are many: a robot that follows a wall sees it in the same ones for long."""
+    """Return whether directions are spread: along a wall, a constant range occurs in the same one for long."""
     sectors = np.bincount((np.remainder(yaw, 2 * math.pi) / (2 * math.pi) * 12).astype(np.int64))
     return int(np.count_nonzero(sectors >= LEAST)) >= DIRECTIONS
 
 
 def _moving(mine: Readings) -> NDArray[np.bool_]:
-    """Return which readings of a sensor are from another place, or in another direction, than the one before."""
+    """Return which readings of a sensor have another position or yaw of it than the reading before."""
     moved = (np.hypot(np.diff(mine.x), np.diff(mine.y)) > STILL[0]) | (_turned(mine) > STILL[1])
     return np.append(False, moved)
 
 
 def _turned(mine: Readings) -> Floats:
-    """Return by how much a sensor turned from each reading to the next, radians, shape (N - 1,)."""
+    """Return the absolute turn of a sensor from each reading to the next, radians, shape (N - 1,)."""
     turned: Floats = np.abs(np.remainder(np.diff(mine.yaw) + math.pi, 2 * math.pi) - math.pi)
     return turned
 
@@ -371,7 +376,7 @@ def _reach(readings: Readings) -> str:
         return ''
     if len(heard) < ECHOES or np.count_nonzero(~echo) < SILENT * len(readings):
         return ''
-    # a few wild echoes reach anywhere
+    # a few random echoes may have any range
     part: NDArray[np.float64] = heard / readings.z_max[echo]
     farthest = float(np.quantile(part, 0.995))
     if farthest > REACHED:
@@ -400,14 +405,14 @@ def _scatter(readings: Readings) -> str:
 
 
 def _of_fixed_distance(readings: Readings) -> NDArray[np.bool_]:
-    """Return what `rep117.measure` makes of the echoes of a fixed-distance ranger: half of its max_range."""
+    """Return which readings are echoes of fixed-distance rangers, at half of max_range (`rep117.measure`)."""
     z, z_max, sigma = readings.z, readings.z_max, readings.sigma
     found: NDArray[np.bool_] = np.isclose(2 * z, z_max) & np.isclose(12 * sigma, z_max)
     return found
 
 
 def _extent(readings: Readings) -> str:
-    """Look for a handful of readings without which the map would be a fraction as large."""
+    """Check for a few readings without which the map would be much smaller."""
     few = min(SWEEPS * len(readings.sensor_names), int(HANDFUL * len(readings)))
     if not few:
         return ''

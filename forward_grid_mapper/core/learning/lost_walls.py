@@ -1,9 +1,8 @@
-"""Walls that one map shows and another has given up.
+"""Walls that are on one map and missing on another.
 
-Learned together with the map, p_hit can fall into a basin that loses smooth walls: few of the readings that look at
-such a wall bring an echo; a larger p_hit makes the silent ones outweigh them; with the wall gone its echoes are
-random measurements,
-the obstacles that are left answer more often, and p_hit rises further.
+If p_hit is learned together with the map, it can converge to a local optimum without smooth walls: only few readings of
+such a wall have an echo. With a larger p_hit, those without echo outweigh them, and the wall disappears. Then its
+echoes are random measurements, the remaining obstacles return echoes more often, and p_hit grows further.
 """
 
 from __future__ import annotations
@@ -20,19 +19,19 @@ from ..maps.map_set import MapSet
 Mask = NDArray[np.bool_]
 
 LEAST_ECHOES = 3
-"""Echoes that support a cell of a wall."""
+"""Fewest echoes that support a cell of a wall."""
 LEAST_LENGTH = 0.5
-"""Metres of wall in a row that are worth a warning."""
+"""Shortest stretch of wall that is worth a warning, metres."""
 _JOINED = 2
-"""Cells of one stretch are at most so many apart, in rows and columns."""
+"""Largest distance of cells of one stretch, in rows and columns."""
 _TRAVERSED = 0.3
-"""Metres around the place of a sensor that cannot be wall: what is gone from there was somebody walking."""
+"""Metres around the positions of sensors in which no wall can be: what disappeared there was a person."""
 _CHUNK, _USUAL_FAN = 4096, 81
 
 
 @dataclass(frozen=True)
 class Stretch:
-    """A stretch of wall that was given up.
+    """A stretch of wall that was lost.
 
     Attributes
     ----------
@@ -42,7 +41,7 @@ class Stretch:
     start, end : (float, float)
         Corners of the bounding box of its cells' centres, metres in the map frame.
     echoes : int
-        Readings that were its echoes and are now random measurements or lost echoes.
+        Number of readings that were its echoes and are now random measurements or lost echoes.
     """
 
     cells: int
@@ -86,7 +85,7 @@ def lost_walls(before: MapSet, after: MapSet) -> list[Stretch]:
         row, column = np.divmod(part, whole.width)
         length = (max(np.ptp(row), np.ptp(column)) + 1) * whole.resolution
         echoes = np.unique(reading[np.isin(cell, part)])
-        # a wall whose echoes the new map explains otherwise was moved, not lost
+        # if the new map explains its echoes by other obstacles, the wall was moved, not lost
         if length >= LEAST_LENGTH and turned[echoes].sum() >= LEAST_ECHOES:
             start = float(x[column.min()]), float(y[row.min()])
             end = float(x[column.max()]), float(y[row.max()])
@@ -100,7 +99,7 @@ def _arcs(
     """Return (reading, flat cell) of the cells of `wanted` within one cell of the arcs of the readings `which`."""
     pairs: list[NDArray[np.int64]] = []
     widest = float((readings.half_angle[which] * readings.z[which]).max(initial=0.0)) / grid.resolution
-    # two points a cell
+    # two points for each cell of the arc
     fan = np.linspace(-1.0, 1.0, 2 * (2 * int(widest) + 1) + 1)
     at_once = max(_CHUNK * _USUAL_FAN // len(fan), 1)
     for begin in range(0, len(which), at_once):
@@ -135,16 +134,16 @@ def _grown(cells: Mask, by: int) -> Mask:
 def _stretches(cells: Mask) -> list[NDArray[np.int64]]:
     """Return the flat cells of each connected group."""
     width = cells.shape[1]
-    left = {(int(row), int(column)) for row, column in np.argwhere(cells)}
+    remaining = {(int(row), int(column)) for row, column in np.argwhere(cells)}
     steps = [(r, c) for r in range(-_JOINED, _JOINED + 1) for c in range(-_JOINED, _JOINED + 1)]
     groups = []
-    while left:
-        front, group = [left.pop()], []
+    while remaining:
+        front, group = [remaining.pop()], []
         while front:
             row, column = front.pop()
             group.append(row * width + column)
-            near = {(row + r, column + c) for r, c in steps} & left
-            left -= near
+            near = {(row + r, column + c) for r, c in steps} & remaining
+            remaining -= near
             front += near
         groups.append(np.array(sorted(group), np.int64))
     return groups

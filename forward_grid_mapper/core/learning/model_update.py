@@ -6,8 +6,8 @@ Given a map, the updates maximise the expected log-likelihood:
     σ²     = Σ e_k (z − d_k)² / Σ e_k over readings with an echo
     p_hit  = Σ e_k / (Σ k·e_k + Σ K·e_0), of a cell, from which that of `density.HIT_LENGTH` follows
 
-With the true map they recover the truth. Learned together with the map, p_hit is biased upward, since the map has only
-as many cells as it needs.
+With the true map, they recover the true values. If map and values are learned together, p_hit is biased upward, since
+the map has no more occupied cells than it needs.
 """
 
 from __future__ import annotations
@@ -28,35 +28,35 @@ MOST_UNEXPLAINED = 0.9
 
 
 def learn(forward: ForwardModel, occupied: NDArray[Any]) -> ModelParameters:
-    """Return the model after one update of its probabilities and σ, given a map; values stay in the table's ranges.
+    """Return the model after one update of its probabilities and σ, given a map; values stay in their allowed ranges.
 
-    A value that no reading informs is kept (σ without echoes, p_hit without any obstacle).
+    A value without information is kept (σ without echoes, p_hit without any obstacle).
 
     Parameters
     ----------
     forward : ForwardModel
-        The readings, and the values so far.
+        The readings, and the present values.
     occupied : array of shape `forward.grid.shape`
-        1 where occupied.
+        1 if occupied.
     """
     readings, model = forward.readings, forward.model
     e = forward.expectations(occupied)
     values = {'p_rand': float(e.random.mean())}
     if model.p_lost > 0:
         values['p_lost'] = float(e.lost.mean())
-    # readings that state their own σ say nothing about the model's
+    # readings with a σ of their own have no information about that of the model
     unstated = readings.echo & (readings.sigma == 0)
     hits = float(e.hit[unstated].sum())
     if hits > 0:
         values['sigma'] = math.sqrt(float(e.squared_error[unstated].sum()) / hits)
-    # lost echoes and random measurements say nothing about the obstacles that stood in the way
+    # lost echoes and random measurements have no information about the obstacles in their cones
     chances = float(e.rank.sum() + (e.obstacles * e.no_echo).sum())
     if chances > 0:
         values['p_hit'] = hit_parameter(float(e.hit.sum()) / chances, forward.grid.resolution)
     bounded: dict[str, Any] = {
         name: float(np.clip(value, find(name).low, find(name).high)) for name, value in values.items()
     }
-    # a map that explains nothing must not take the whole model with it
+    # with a map that explains nothing, the model must stay valid
     excess = bounded['p_rand'] + bounded.get('p_lost', 0.0)
     if excess > MOST_UNEXPLAINED:
         for name in ('p_rand', 'p_lost'):

@@ -1,19 +1,19 @@
-"""The health of each sensor: what its readings are worth, and which sensor stands out from the others.
+"""The health of each sensor: statistics of its readings, and which sensors are suspect.
 
-Fractions of a sensor's readings, given the maximum likelihood map:
+Fractions of the readings of a sensor, given the maximum likelihood map:
 
     random    a random measurement is the likeliest cause (e_* above one half)
     no echo   max-range readings
     missed    no echo, though the map has an obstacle within 3/4 of max range in the cone
     short     a random echo, nearer than half the way to the first obstacle of the cone, or to max range if none
-    same      echoes within the commonest 0.2 m of range, whatever the map
+    same      echoes within the most frequent 0.2 m of range, independent of the map
 
-A sensor whose echo is its own robot repeats itself, and the map may even believe it. So where a sensor repeats a range
-of less than half of what is usual among the others, a live map of the others is asked as well: an echo from where they
-see free space is short, too.
+A sensor that detects its own robot repeats one range, and the map may even explain it. So if a sensor repeats a range
+of less than half of the usual one of the others, a live map of the other sensors is used as well: an echo from where
+this is free is short, too.
 
-A fraction is compared with those of the other sensors, since in a hall of smooth walls all are silent, and in a crowd
-all are random. It is suspect if it is large by itself *and* well above the median of the others.
+Fractions are compared with those of the other sensors, since all have no echoes in a hall of smooth walls, and all have
+random ones in a crowd. A fraction is suspect if it is large *and* well above the median of the others.
 """
 
 from __future__ import annotations
@@ -34,37 +34,37 @@ from ..sensor.cone import make_cone, rows_of, runs_of
 from ..sensor.forward_model import ForwardModel
 
 NEAR = 0.5
-"""A random echo is short if it is nearer than this part of the way to the first obstacle."""
+"""A random echo is short if it is nearer than this fraction of the distance to the first obstacle."""
 REACH = 0.75
-"""A max-range reading counts as missed if there is an obstacle within this part of max range."""
+"""A max-range reading is missed if there is an obstacle within this fraction of max range."""
 FEW = 30
-"""Fewer readings are not judged."""
+"""A sensor with fewer readings is not judged."""
 FEW_SHARE = 0.1
-"""Nor are fewer than this part of the median of the others."""
+"""Nor is one with less than this fraction of the median number of the others."""
 SILENT, DEAF = 0.95, 0.2
-"""A sensor without echoes has at least the first fraction of max-range readings, and the second of missed obstacles."""
+"""A sensor that detects nothing has at least these fractions of max-range readings and of missed obstacles."""
 PHANTOMS = 0.5
-"""So large a part of the few echoes it has is random."""
+"""At least this fraction of its few echoes is random."""
 SHORT = 0.5
 RANDOM = 0.5
 SAME, WINDOW = 0.8, 0.2
-"""A sensor that repeats itself has at least this fraction of its readings in a window of so many metres."""
+"""A sensor that repeats one range has at least this fraction of its readings within so many metres."""
 CLOSE = 0.7
-"""If so large a part of the random readings is short, but not always the same, somebody walks there."""
+"""If at least this fraction of the random readings is short, but not at one range, a person moves near the sensor."""
 BIN, BINS = 0.05, 400
-"""Metres and number of the bins of ranges, where readings are counted in parts."""
+"""Size, metres, and number of the bins of ranges, if readings are counted in portions."""
 ABOVE = 0.25
-"""A suspect fraction exceeds the median of the others by at least so much."""
+"""A suspect fraction is at least this much above the median of the others."""
 FREE = 0.35
-"""The live map of the others is free below this probability."""
+"""Cells of the live map of the others are free below this probability."""
 
 
 @dataclass(frozen=True)
 class SensorHealth:
     """One row of the table; fractions lie in [0, 1] and are NaN without readings.
 
-    `common` is the middle of the commonest 0.2 m of range, metres. `verdict` is 'ok', 'few readings', 'something moves
-    near it', 'never hears anything', 'always short' or 'mostly random'.
+    `common` is the mean (the middle, from counts) of the most frequent 0.2 m of range, metres. `verdict` is 'ok', 'few
+    readings', 'something moves near it', 'never hears anything', 'always short' or 'mostly random'.
     """
 
     readings: int
@@ -82,7 +82,7 @@ class SensorHealth:
         return self.verdict in ('never hears anything', 'always short', 'mostly random')
 
     @property
-    def told(self) -> str:
+    def verdict_text(self) -> str:
         """The verdict, with the range that a short sensor repeats."""
         return f'{self.verdict}: {self.common:.2f} m' if self.verdict == 'always short' else self.verdict
 
@@ -97,9 +97,9 @@ class SensorHealth:
 
 @kernel
 def _first_obstacles(cones: Any, occupied: Any, out: Any) -> None:
-    """Fill `out` with the distance of the nearest occupied cell of each cone up to its reach, inf for none; in cells.
+    """Write the distance of the nearest occupied cell of each cone to `out`, cells; inf for none.
 
-    A cone reaches no farther than the farthest corner of the grid, however large the range of the sensor.
+    Cones are cut off at the farthest corner of the grid.
     """
     height, width = occupied.shape
     for t in range(len(cones)):
@@ -133,7 +133,7 @@ def first_obstacles(forward: ForwardModel, ml: NDArray[np.int8]) -> Floats:
 
 
 def commonest_range(z: Floats) -> tuple[int, float]:
-    """Return how many ranges the fullest window of `WINDOW` metres holds, and its middle; (0, NaN) without any."""
+    """Return the largest number of ranges within `WINDOW` metres, and their mean; (0, NaN) without ranges."""
     if not len(z):
         return 0, math.nan
     ordered = np.sort(z)
@@ -160,7 +160,7 @@ def sensor_health(maps: MapSet) -> dict[str, SensorHealth]:
 
 
 def _marks(readings: Readings, obstacle: Floats, unexplained: NDArray[np.bool_]) -> dict[str, NDArray[np.bool_]]:
-    """Return which readings count for each column of the table, shape (N,)."""
+    """Return which readings belong to each column of the table, shape (N,)."""
     echo = readings.echo
     return {
         'random': unexplained,
@@ -176,7 +176,7 @@ def _table(
     counts: Mapping[str, NDArray[Any]],
     common: Sequence[tuple[int, float]],
 ) -> dict[str, SensorHealth]:
-    """Return the table from counts by sensor, shape (S,), and each one's commonest range with how many are of it."""
+    """Return the table from counts by sensor, shape (S,), and the `commonest_range` of each."""
     with np.errstate(invalid='ignore'):
         shares: dict[str, Floats] = {kind: column / numbers for kind, column in counts.items()}
         shares['same'] = np.array([held for held, _ in common], np.float64) / numbers
@@ -190,15 +190,16 @@ def _table(
     return made
 
 
-# ---- of parts of the readings, whose counts are added up
+# ---- the same from portions of the readings, whose counts are added
 
 
 def health_counts(
     readings: Readings, forward: ForwardModel, ml: NDArray[np.int8], unexplained: NDArray[np.bool_]
 ) -> dict[str, NDArray[np.int64]]:
-    """Return counts by sensor of some of the readings, int64, shape (S,): what `health_of_counts` needs of all of them.
+    """Return counts by sensor of a portion of the readings, int64, shape (S,), for `health_of_counts`.
 
-    `ranges`, shape (S, B), has the echoes by range, in bins of `BIN` metres; the last one has all beyond.
+    `ranges`, shape (S, B), is a histogram of the ranges of echoes with bins of `BIN` metres; the last bin has all
+    longer ones.
     """
     size = len(readings.sensor_names)
     marks = _marks(readings, first_obstacles(forward, ml), unexplained)
@@ -211,7 +212,7 @@ def health_counts(
 
 
 def health_of_counts(names: tuple[str, ...], counts: Mapping[str, NDArray[np.int64]]) -> dict[str, SensorHealth]:
-    """Return the table from sums of `health_counts`: as `sensor_health`, without asking a live map of the others."""
+    """Return the table from sums of `health_counts`: like `sensor_health`, but without a live map of the others."""
     width = round(WINDOW / BIN)
     common = []
     for row in counts['ranges']:
@@ -236,13 +237,13 @@ def _from_free_space(maps: MapSet, sensor: int) -> NDArray[np.bool_]:
     probability = live.probability()
     free = np.zeros(len(readings), bool)
     there = np.flatnonzero(mine)[inside]
-    # a comparison with NaN, where the others know nothing, is false
+    # NaN, where the others have no readings, is not free
     free[there] = probability[rows[inside], columns[inside]] < FREE
     return free
 
 
 def _median(values: Floats) -> float:
-    """Return the median of what is known, NaN if nothing is."""
+    """Return the median of the finite values, NaN if there are none."""
     known = values[np.isfinite(values)]
     return float(np.median(known)) if len(known) else math.nan
 
@@ -252,10 +253,10 @@ def _verdict(number: int, usual: float, mine: dict[str, float], others: dict[str
         return 'few readings'
 
     def above(kind: str) -> bool:
-        # a sensor alone is judged by itself
+        # a single sensor has no others to compare with
         return not math.isfinite(others[kind]) or mine[kind] >= others[kind] + ABOVE
 
-    # a robot may stand for hours before what a sensor does not hear; echoes that the map explains were heard
+    # a robot may stand for hours in front of something that returns no echo, but then some echoes are explained
     phantoms = mine['random'] >= PHANTOMS * (1.0 - mine['no_echo'])
     if mine['no_echo'] >= SILENT and mine['missed'] >= DEAF and phantoms and above('no_echo'):
         return 'never hears anything'
@@ -270,7 +271,7 @@ def _verdict(number: int, usual: float, mine: dict[str, float], others: dict[str
 
 def health_warning(table: dict[str, SensorHealth]) -> str:
     """Return one line that names the suspect sensors, or ''."""
-    suspects = [f'{name} ({row.told})' for name, row in table.items() if row.suspect]
+    suspects = [f'{name} ({row.verdict_text})' for name, row in table.items() if row.suspect]
     if not suspects:
         return ''
     return (

@@ -1,18 +1,18 @@
-"""How sure learned parameters are, given the map: estimating functions, standard errors and intervals.
+"""Standard errors and confidence intervals of learned parameters, given the map, from estimating functions.
 
-The updates of `learning` end where, over all readings, the sum of
+The updates of `model_update` converge where the sum over all readings of
 
     ψ_rand  = e_* / p_rand − (e_hit + e_0) / (1 − p_rand − p_lost)
     ψ_lost  = e_lost / p_lost − (e_hit + e_0) / (1 − p_rand − p_lost)
     ψ_hit   = [e_hit / p − (Σ (k − 1)·e_k + K·e_0) / (1 − p)] ∂p/∂p_hit    (p is p_hit of a cell)
     ψ_sigma = Σ e_k (z − d_k)² / σ³ − e_hit / σ          (echoes without a σ of their own)
 
-is zero. The first three are the derivatives of log p(z | m), by Fisher's identity; so is the last, but for the readings
-without echo, which say nothing of σ. With A = −∂Σψ/∂θ, the observed information, and B the variance of Σψ, the
-covariance is A⁻¹ B A⁻ᵀ. B is taken twice: as if readings were independent, and over blocks of time, since a person or
-a smooth wall spoils many readings in a row. The larger standard error counts.
+is zero. The first three are the derivatives of log p(z | m), by Fisher's identity; so is the last, except for readings
+without echo, which are not used for σ. With A = −∂Σψ/∂θ, the observed information, and B the variance of Σψ, the
+covariance is A⁻¹ B A⁻ᵀ (sandwich estimator). B is computed twice: for independent readings, and over blocks of time,
+since a person or a smooth wall affects many successive readings. The larger standard error is used.
 
-All this is conditional on the map: that the map was made from the same readings is not in it.
+The results are conditional on the map: they do not include that it was made from the same readings.
 """
 
 from __future__ import annotations
@@ -33,9 +33,9 @@ from ..sensor.forward_model import Expectations, ForwardModel
 
 LEARNED = ('p_hit', 'p_rand', 'p_lost', 'sigma')
 BLOCKS = 30
-"""Blocks of time, each with as many readings as the others."""
+"""Most blocks of time; they have equal numbers of readings."""
 LEAST_BLOCK = 10
-"""Readings in a block, at least."""
+"""Fewest readings in a block."""
 _STEP = 1e-3
 _NEAR = 1e-3
 _NORMAL = 1.96
@@ -43,18 +43,18 @@ _NORMAL = 1.96
 
 @dataclass(frozen=True)
 class Estimate:
-    """A learned value and how sure it is.
+    """A learned value and its uncertainty.
 
     Attributes
     ----------
     value : float
     error : float
-        Standard error; NaN where the value could not be learned or lies at a bound.
+        Standard error; NaN if the value could not be learned or is at a bound.
     low, high : float
         Bounds of the 95 % interval: normal in the logit of a probability and in the logarithm of σ.
     readings : float
-        Expected number of readings that inform the value: for p_hit those that met an obstacle, by echo or in silence;
-        for σ those that are echoes of one; for p_lost those without echo; for p_rand all.
+        Expected number of readings with information about the value: for p_hit those that met an obstacle, with or
+        without an echo; for σ the echoes of obstacles; for p_lost those without echo; for p_rand all.
     bound : str
         Why it has no standard error, or ''.
     """
@@ -68,7 +68,7 @@ class Estimate:
 
 
 def estimating_functions(forward: ForwardModel, occupied: NDArray[Any]) -> dict[str, Floats]:
-    """Return ψ of every parameter, each of shape (N,); without p_lost if that is zero."""
+    """Return ψ of each parameter, shape (N,); without p_lost if that is zero."""
     readings, model = forward.readings, forward.model
     e = forward.expectations(occupied)
     explained = (e.hit + e.no_echo) / (1.0 - model.p_rand - model.p_lost)
@@ -76,7 +76,7 @@ def estimating_functions(forward: ForwardModel, occupied: NDArray[Any]) -> dict[
     unstated = readings.echo & (readings.sigma == 0)
     resolution = forward.grid.resolution
     p_hit = hit_probability(model, resolution)
-    # of p_hit of a cell by that of the model
+    # derivative of p_hit of a cell with respect to that of the model
     slope = resolution / HIT_LENGTH * (1.0 - p_hit) / (1.0 - model.p_hit)
     made = {
         'p_hit': (e.hit / p_hit - missed / (1.0 - p_hit)) * slope,
@@ -94,9 +94,9 @@ def estimates(forward: ForwardModel, occupied: NDArray[Any]) -> dict[str, Estima
     Parameters
     ----------
     forward : ForwardModel
-        The readings, and the values at which the updates ended.
+        The readings, and the values to which the updates converged.
     occupied : array of shape `forward.grid.shape`
-        The map that they were learned from; 1 is occupied.
+        The map that they were learned from; 1 if occupied.
     """
     model = forward.model
     informed = _informed(forward.readings, forward.expectations(occupied))
@@ -124,7 +124,7 @@ def _informed(readings: Readings, e: Expectations) -> dict[str, float]:
 
 
 def _held(name: str, model: ModelParameters, resolution: float, informed: float) -> str:
-    """Return why a parameter does not move, or ''."""
+    """Return why a parameter cannot be learned, or ''."""
     value, row = getattr(model, name), find(name)
     if name == 'p_lost' and value == 0:
         return '0 is the model without lost echoes, which learning keeps'
@@ -138,7 +138,7 @@ def _held(name: str, model: ModelParameters, resolution: float, informed: float)
 
 
 def _errors(forward: ForwardModel, occupied: NDArray[Any], free: list[str]) -> list[float]:
-    """Return the standard errors of the parameters `free`, in their order; NaN where they are not determined."""
+    """Return the standard errors of the parameters `free`, in their order; NaN if they are not determined."""
     if not free:
         return []
 
@@ -161,7 +161,7 @@ def _errors(forward: ForwardModel, occupied: NDArray[Any], free: list[str]) -> l
         return [math.nan] * len(free)
     functions = psi(model)
     variances = [functions @ functions.T]
-    # in order of time, whatever the order of the readings
+    # sort by time
     ordered = functions[:, np.argsort(readings.stamp, kind='stable')]
     count = min(BLOCKS, len(readings) // LEAST_BLOCK)
     if count > len(free):
@@ -169,7 +169,7 @@ def _errors(forward: ForwardModel, occupied: NDArray[Any], free: list[str]) -> l
         spread = sums - sums.mean(1, keepdims=True)
         variances.append(count / (count - 1) * (spread @ spread.T))
     squares = np.max([np.diag(inverse @ variance @ inverse.T) for variance in variances], axis=0)
-    # where the information has no positive diagonal, the values are not at a maximum
+    # if the covariance has no positive diagonal, the values are not at a maximum
     sound = (np.diag(inverse) > 0) & (squares > 0)
     return [math.sqrt(square) if good else math.nan for square, good in zip(squares, sound, strict=True)]
 

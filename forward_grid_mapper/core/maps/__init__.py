@@ -1,1 +1,1 @@
-"""From the map that the search found, or from the readings alone, to the maps that are handed out."""
+"""From the map that the search found, or from the readings alone, to the final maps."""

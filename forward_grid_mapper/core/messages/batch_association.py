@@ -1,8 +1,8 @@
-"""Pose association for files: what `PoseAssociator` does message by message, for thousands at a time.
+"""Pose association for files: the same as `PoseAssociator`, vectorised for batches of messages.
 
-The readings, their order, the counts and the state after each batch are the same, bit for bit; sines and remainders are
-those of the math library, since numpy's differ in the last bit. Whatever is not as it usually is, such as odometry out
-of order, is taken message by message.
+Readings, their order, counts and the state after each batch are the same, bit for bit. Sines and remainders are those
+of the math module, since those of numpy differ in the last bit. Unusual batches, such as odometry out of order, are
+processed message by message.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ from .rep117 import LONGEST_NAME, Measurement, Measurements, measure_all
 from .stamp_order import JUMP
 
 NEVER = np.iinfo(np.int64).max
-"""The place of a message that does not come."""
+"""Stands for the place of a message that is not in the batch."""
 
 
 class _Waiting(NamedTuple):
-    """Readings that wait for their pose, columns of shape (N,): those of `Measurement`, and the place of arrival."""
+    """Readings that wait for a pose, columns of shape (N,): those of `Measurement`, and the place in the batch."""
 
     place: Ints
     number: Ints
@@ -49,7 +49,7 @@ class _Waiting(NamedTuple):
 class BatchAssociator(PoseAssociator):
     """A patient associator, for files, that takes messages in batches or one at a time.
 
-    In a batch, an answer of `extrinsics` that is a `Later` is final.
+    In a batch, a result `Later` of `extrinsics` is final.
     """
 
     def __init__(self, extrinsics: ExtrinsicsLookup, parameters: Parameters | None = None) -> None:
@@ -67,7 +67,7 @@ class BatchAssociator(PoseAssociator):
                 self.add_odometry(message)
 
     def _is_usual(self, odometry: Odometry) -> bool:
-        """Return whether all odometry is accepted, is of one frame and in order of time."""
+        """Return whether all odometry is valid, in one frame and sorted by time."""
         if not len(odometry.stamp):
             return True
         pairs = {odometry.frames[k] for k in np.unique(odometry.frame).tolist()}
@@ -82,7 +82,7 @@ class BatchAssociator(PoseAssociator):
         return in_order and all(possible(Pose2(*pose)) for pose in odometry.pose.tolist())
 
     def _add_at_once(self, batch: MessageBatch) -> None:
-        """Take messages whose odometry is as usual."""
+        """Process a batch with usual odometry."""
         ranges, odometry = batch
         newest = self._history.newest
         self._take_odometry(odometry)
@@ -103,7 +103,7 @@ class BatchAssociator(PoseAssociator):
         waiting, placed = waiting.select(settled), placed[settled]
         order = np.lexsort((waiting.number, waiting.stamp, placed))
         why = self._keep(waiting.select(order), frames)
-        # rejections in the order in which they come one by one, which is that of reports
+        # count rejections in the same order as message by message; reports list them so
         bad = ~good
         places = np.concatenate([ranges.place[bad], placed[order]])
         reasons = np.concatenate([measured.reason[bad], why])
@@ -122,7 +122,7 @@ class BatchAssociator(PoseAssociator):
         self._history.extend(odometry.stamp.tolist(), poses)
 
     def _with_earlier(self, new: _Waiting, frames: list[str]) -> _Waiting:
-        """Return those that can be settled now of what waits since earlier batches, and what is new."""
+        """Return the new readings, and those of earlier batches that can be settled now."""
         newest, earlier = self._history.newest, []
         while newest is not None and self._waiting and self._waiting[0].stamp <= newest - JUMP:
             earlier.append(heapq.heappop(self._waiting))
@@ -148,12 +148,12 @@ class BatchAssociator(PoseAssociator):
             heapq.heappush(self._waiting, held)
 
     def _keep(self, waiting: _Waiting, frames: list[str]) -> NDArray[np.str_]:
-        """Place readings in their order, and keep those that can be; return why not, '' for those that are kept."""
+        """Place readings in order, and store those that are accepted; return the reasons for rejection, or ''."""
         poses = self._history.at_all(waiting.stamp, self.parameters.max_pose_gap)
         measured = Measurements(poses.reason, *waiting[4:])
         sensors = np.zeros((len(poses.reason), 3))
         known = np.flatnonzero(poses.reason == '')
-        # the first to ask for a sensor's pose decides where the report names it
+        # look up sensors in the order of their first readings, which is that of reports
         numbers, first = np.unique(waiting.frame[known], return_index=True)
         for number in numbers[np.argsort(first)].tolist():
             which = known[waiting.frame[known] == number]
@@ -172,7 +172,7 @@ class BatchAssociator(PoseAssociator):
         return measured.reason
 
     def _mount(self, frame_id: str, stamp: int) -> Pose2 | str:
-        """Return the pose of a sensor on the robot, or the reason why there can be no reading of it."""
+        """Return the pose of a sensor on the robot, or the reason why its readings are rejected."""
         mount = self._extrinsics(self.base_frame, frame_id, stamp)
         if mount is None or isinstance(mount, Later):
             return 'unknown_extrinsics' if mount is None else mount.reason
@@ -180,7 +180,7 @@ class BatchAssociator(PoseAssociator):
         return mount
 
     def _append(self, kept: _Waiting, sensors: Floats, measured: Measurements, frames: list[str]) -> None:
-        """Put readings into the buffer, which is thinned where it would be if they came one by one."""
+        """Append readings to the buffer; it is thinned at the same readings as if they came one by one."""
         numbers, first, of = np.unique(kept.frame, return_index=True, return_inverse=True)
         order = np.argsort(first)
         names = tuple(frames[number] for number in numbers[order].tolist())
@@ -193,7 +193,7 @@ class BatchAssociator(PoseAssociator):
             readings = readings.select(slice(room, None))
 
     def _reject_all(self, places: Ints, reasons: NDArray[np.str_], frames: list[str]) -> None:
-        """Count rejections, kind by kind in the order of the first of each."""
+        """Count rejections by frame and reason, in the order of the first of each."""
         bad = np.flatnonzero(reasons != '')
         kinds = Counter((frames[k], str(reasons[k])) for k in bad[np.argsort(places[bad], kind='stable')].tolist())
         for (frame, reason), count in kinds.items():
@@ -203,7 +203,7 @@ class BatchAssociator(PoseAssociator):
 
 
 def _first_after(stamp: Ints, odometry: Odometry, newest: int | None) -> Ints:
-    """Return at which place odometry is JUMP ahead of stamps, shape (N,): -1 if before the batch, or `NEVER`."""
+    """Return the place at which odometry is JUMP ahead of each stamp, (N,): -1 if before the batch, or `NEVER`."""
     places = np.append(odometry.place, NEVER)[np.searchsorted(odometry.stamp, stamp + JUMP)]
     return places if newest is None else np.where(stamp + JUMP <= newest, -1, places)
 

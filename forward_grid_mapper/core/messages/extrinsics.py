@@ -1,9 +1,8 @@
-"""Where sensors sit on the robot: what is answered when somebody asks, and what an inclined sensor says of the plane.
+"""Extrinsics: poses of sensors on the robot, and the projection of inclined sensors on the plane of the map.
 
-A sensor that looks up or down measures along its axis, and the map is a plane. A wall that stands upright is met at the
-horizontal part of the range, r cos e for an axis at elevation e. The cone's shadow on the plane is wider than the cone:
-its half angle a has sin a = sin h / cos e for a cone of half angle h, from the two upright planes through the sensor
-that touch the cone.
+An inclined sensor measures along its axis, but the map is a plane. The horizontal distance of a vertical wall is
+r cos e for range r and elevation e of the axis. The projection of the cone is wider than the cone: its half angle a has
+sin a = sin h / cos e for a cone of half angle h, by the two vertical planes through the sensor that touch the cone.
 """
 
 from __future__ import annotations
@@ -20,16 +19,16 @@ from .quaternions import STEEPEST, elevation_of
 from .rep117 import Measurement, Measurements
 
 STEEP = 'steep_sensor'
-"""The reason of `rep117.REASONS` for sensors that say nothing of the plane."""
+"""The reason of `rep117.REASONS` for sensors that cannot be projected on the plane."""
 
 
 class Mount(Pose2):
-    """The pose of a sensor on the robot: as a tuple, its projection on the plane, and besides its `elevation`.
+    """The pose of a sensor on the robot: the tuple is its projection on the plane.
 
     Attributes
     ----------
     elevation : float
-        Of the sensor's axis above the plane, radians; REP 103's pitch with the other sign.
+        Of the axis of the sensor above the plane, radians: −pitch of REP 103.
     """
 
     elevation: float
@@ -42,17 +41,17 @@ class Mount(Pose2):
 
 
 class Later:
-    """The answer that the pose may still become known; `reason` is for readings that cannot wait any longer."""
+    """The result of a look-up if the pose may still become known; `reason` is for readings whose time is over."""
 
     def __init__(self, reason: str) -> None:
         self.reason = reason
 
 
 LATER = Later('unknown_extrinsics')
-"""Nobody knows the frame so far."""
+"""The frame is unknown so far."""
 
 LATE = Later('late_transform')
-"""The frame is known, but not at this stamp."""
+"""The frame is known, but there is no transform at this stamp yet."""
 
 ExtrinsicsLookup = Callable[[str, str, int], 'Pose2 | Later | str | None']
 """(base frame, sensor frame, stamp in ns) → pose of the sensor in the base frame, a `Later`, the reason why there can
@@ -66,19 +65,19 @@ def mount_of(x: float, y: float, axis: Sequence[float]) -> Mount | str:
 
 
 def shadow_of(half_angle: float, elevation: float) -> float | None:
-    """Return the half angle of the shadow that a cone casts on the plane; None if it holds the vertical. Radians."""
+    """Return the half angle of the projection of a cone, radians; None if the cone contains the vertical."""
     if half_angle + abs(elevation) >= math.pi / 2:
         return None
     return math.asin(math.sin(half_angle) / math.cos(elevation))
 
 
 def project(measured: Measurement, elevation: float) -> str:
-    """Turn a measurement along an axis of this elevation into what it says of the plane.
+    """Project a measurement along an axis of this elevation on the plane, in place.
 
     Returns
     -------
     str
-        '', or the reason why it says nothing; then it is unchanged.
+        '', or the reason why this is impossible; then it is unchanged.
     """
     factor = math.cos(elevation)
     if factor == 1.0:
@@ -87,13 +86,13 @@ def project(measured: Measurement, elevation: float) -> str:
     if shadow is None:
         return STEEP
     measured.half_angle = shadow
-    # no echo stays no echo: z and z_max are multiplied by the same
+    # a reading without echo remains one, since z and z_max have the same factor
     measured.z, measured.z_max, measured.sigma = measured.z * factor, measured.z_max * factor, measured.sigma * factor
     return ''
 
 
 def project_all(measured: Measurements, elevation: float) -> Measurements:
-    """Return many measurements as what they say of the plane, as `project` does with each; a `reason` stays."""
+    """Return many measurements projected on the plane like `project`; an existing `reason` stays."""
     factor = math.cos(elevation)
     if factor == 1.0:
         return measured

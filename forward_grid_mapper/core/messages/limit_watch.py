@@ -1,7 +1,7 @@
-"""What Range messages say of themselves before they have a pose: ranges against the limits that come with them.
+"""Checks of Range messages before association: ranges in other units than their limits.
 
-A range in centimetres beside a max_range in metres is 'no echo' by REP 117, and one below a min_range in centimetres is
-rejected: neither is an error, and both give a wrong map. So the values are looked at as they come.
+A range in centimetres with a max_range in metres is 'no echo' by REP 117, and one below a min_range in centimetres is
+rejected. Neither is an error, but both give a wrong map. So the values of incoming messages are checked.
 """
 
 from __future__ import annotations
@@ -13,47 +13,47 @@ from .message_batch import Ranges
 from .message_types import RangeMessage
 
 SAMPLES = 1024
-"""Messages that are looked at; of more, ever fewer are taken, so that they are spread over the whole drive."""
+"""Most messages that are sampled; they are spread over the whole drive."""
 
 ENOUGH = 30
-"""Messages below which nothing is said."""
+"""Fewest messages for a check."""
 
 BEYOND = 1.1
-"""Times max_range from which on a range lies beyond it; many drivers send a little more for 'no echo'."""
+"""A range is beyond max_range if it is so many times as large; many drivers send a little more for 'no echo'."""
 
 MANY = 0.15
-"""Part of the finite ranges that lie beyond max_range, or below min_range, where units differ."""
+"""Fraction of the finite ranges that are beyond max_range, or below min_range, if units differ."""
 
 SENTINEL = 0.5
-"""Where one value makes up this part of those beyond, it is what the driver sends for 'no echo'."""
+"""If one value has this fraction of the ranges beyond, the driver sends it for 'no echo'."""
 
 FARTHEST = 100.0
-"""Metres that no sonar measures, and hardly any other Range sensor."""
+"""Metres; no sonar measures so far, and hardly any other Range sensor."""
 
 NEAR = 0.2
-"""Part of such a max_range within which all ranges lie where it alone is wrong."""
+"""If all ranges are within this fraction of such a max_range, only max_range is wrong."""
 
 STATED = 1e6
-"""A max_range from which on none is stated: drivers send the largest number they know."""
+"""From this value on, max_range is taken as not stated: drivers send the largest number."""
 
 UNITS = {'feet': 3.281, 'inches': 39.37, 'centimetres': 100.0, 'millimetres': 1000.0}
-"""How many of them a metre has, in order."""
+"""Units in a metre, in increasing order."""
 
 
 class LimitWatch:
-    """Takes Range messages and says whether ranges and limits seem to be in different units."""
+    """Samples Range messages and warns if ranges and limits seem to be in different units."""
 
     def __init__(self) -> None:
         self.clear()
 
     def clear(self) -> None:
-        """Forget all messages."""
+        """Remove all samples."""
         # range, min_range and max_range of each
         self._samples = np.empty((SAMPLES, 3))
         self._held, self._every, self._count = 0, 1, 0
 
     def add(self, message: RangeMessage) -> None:
-        """Look at a message; costs next to nothing for most of them."""
+        """Count a message, and sample it if it is its turn."""
         self._count += 1
         if self._count % self._every:
             return
@@ -62,11 +62,11 @@ class LimitWatch:
         self._halve()
 
     def add_all(self, messages: Ranges) -> None:
-        """Look at many messages, as `add` does at each."""
+        """Apply `add` to many messages."""
         values = np.stack([messages.range, messages.min_range, messages.max_range], axis=1)
         done = 0
         while done < len(values):
-            # the next one that is looked at, and as many as there is room for
+            # the next sample, and as many as there is space for
             skip = self._every - 1 - self._count % self._every
             taken = values[done + skip :: self._every][: SAMPLES - self._held]
             if not len(taken):
@@ -78,14 +78,14 @@ class LimitWatch:
         self._count += len(values) - done
 
     def _halve(self) -> None:
-        """Look at every other one from here on, where there is no more room."""
+        """If the samples are full, drop every second one, and sample half as often from now on."""
         if self._held == SAMPLES:
             self._held //= 2
             self._samples[: self._held] = self._samples[1::2].copy()
             self._every *= 2
 
     def warnings(self) -> list[str]:
-        """Return what seems to be wrong; empty if nothing is."""
+        """Return warnings; empty if there is no suspicion."""
         ranges, _, limits = samples = self._samples[: self._held].T
         finite = samples[:, np.isfinite(ranges) & (ranges > 0) & (limits > 0) & (limits < np.inf)]
         if finite.shape[1] < ENOUGH:
@@ -155,5 +155,5 @@ def _middle(values: Floats) -> float:
 
 
 def _at(part: float, values: Floats) -> float:
-    """Return the value that this part of the others lies below."""
+    """Return the quantile `part` of values."""
     return float(np.sort(values)[int(part * (len(values) - 1))])

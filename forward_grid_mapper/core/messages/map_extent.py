@@ -1,4 +1,4 @@
-"""How far the map extends, and whether it may grow to hold one more reading."""
+"""The extent of the map, and whether it may grow by one more reading."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ from .message_types import Pose2
 from .rep117 import Measurement, Measurements
 
 FARTHEST = 2e7
-"""Metres from the origin beyond which no pose can be right: half the way round the Earth."""
+"""Largest possible coordinate, metres: half the circumference of the Earth."""
 
 LARGEST_CONE = 2_000_000
-"""Cells that one reading may touch, so that none keeps the node busy for longer than a moment."""
+"""Most cells in the cone of a reading, so that none blocks the node for long."""
 
 
 def possible(pose: Pose2) -> bool:
-    """Return whether a pose is finite and on Earth; `max` and `min` would hide a NaN."""
+    """Return whether a pose is finite and on Earth; comparisons are false for NaN."""
     return abs(pose.x) < FARTHEST and abs(pose.y) < FARTHEST and math.isfinite(pose.yaw)
 
 
 def reach_with_margin(measured: Measurement, parameters: Parameters) -> float:
-    """Return how far from the sensor the maps take note of a reading, and two cells more, in metres."""
+    """Return the reach of a reading in all maps, plus two cells, metres."""
     sigma = measured.sigma or parameters.model.sigma
     return float(_reach(measured.z, measured.z_max, sigma, parameters, max, min))
 
@@ -38,7 +38,7 @@ def reach_with_margin(measured: Measurement, parameters: Parameters) -> float:
 def _reach(
     z: Any, z_max: Any, sigma: Any, parameters: Parameters, highest: Callable[..., Any], lowest: Callable[..., Any]
 ) -> Any:
-    """Return `reach_with_margin` of numbers or of arrays; `highest` and `lowest` take the greater and the smaller."""
+    """Return `reach_with_margin` of numbers or of arrays; `highest` and `lowest` are `max` and `min` for them."""
     cell = parameters.grid.resolution
     evaluated = z + CUT * highest(sigma, cell / 2)
     return highest(lowest(evaluated, z_max), z + arc_depths(cell)[1]) + 2 * cell
@@ -51,7 +51,7 @@ Box = tuple[float, float, float, float]
 
 
 def _fits(box: Box, parameters: Parameters) -> bool:
-    """Return whether the map may be as large as a box."""
+    """Return whether a map of this box has at most `max_cells`."""
     cell = parameters.grid.resolution
     return ((box[1] - box[0]) / cell + 1) * ((box[3] - box[2]) / cell + 1) <= parameters.grid.max_cells
 
@@ -63,16 +63,16 @@ class MapExtent:
         self.clear()
 
     def clear(self) -> None:
-        """Begin with an empty map."""
+        """Make the map empty."""
         self._box = (math.inf, -math.inf, math.inf, -math.inf)
 
     def restore(self, readings: Readings, parameters: Parameters) -> dict[str, NDArray[np.bool_]]:
-        """Grow to hold readings that an earlier run admitted, perhaps with other parameters.
+        """Grow by readings that an earlier run admitted, perhaps with other parameters.
 
         Returns
         -------
         dict of str → bool, shape (N,)
-            The readings that the map cannot hold, by the reason (`rep117.REASONS`).
+            Masks of the readings that are rejected, by reason (`rep117.REASONS`).
         """
         r = readings
         sigma = np.where(r.sigma > 0, r.sigma, parameters.model.sigma)
@@ -92,7 +92,7 @@ class MapExtent:
         return {'large_cone': large, 'too_far_away': far}
 
     def _too_far(self, x: Floats, y: Floats, reach: Floats, parameters: Parameters) -> NDArray[np.bool_]:
-        """Grow by readings one after the other; return the mask of those with which the map would be too large."""
+        """Grow by readings one after the other; return the mask of those that would make the map too large."""
         far = np.zeros(len(x), bool)
         for number, (px, py, around) in enumerate(zip(x.tolist(), y.tolist(), reach.tolist(), strict=True)):
             box = self._grown(px - around, px + around, py - around, py + around)
@@ -103,12 +103,12 @@ class MapExtent:
         return far
 
     def _grown(self, left: float, right: float, bottom: float, top: float) -> Box:
-        """Return the box, and another, in one."""
+        """Return the union of the box and another one."""
         mine = self._box
         return min(mine[0], left), max(mine[1], right), min(mine[2], bottom), max(mine[3], top)
 
     def admit_all(self, poses: Floats, measured: Measurements, parameters: Parameters) -> NDArray[np.str_]:
-        """Return `admit` for many readings one after the other; `poses` are those of the sensors, shape (N, 3)."""
+        """Apply `admit` to many readings, one after the other; `poses` are those of the sensors, shape (N, 3)."""
         sigma = np.where(measured.sigma != 0, measured.sigma, parameters.model.sigma)
         reach = _reach(measured.z, measured.z_max, sigma, parameters, np.maximum, np.minimum)
         reason = np.full(len(poses), '', REASON)
@@ -122,7 +122,7 @@ class MapExtent:
         return reason
 
     def _box_of_all(self, poses: Floats, half_angle: Floats, reach: Floats, parameters: Parameters) -> Box | None:
-        """Return the box around all readings; None if one of them cannot be admitted, or only just."""
+        """Return the box around all readings; None if one of them might not be admitted."""
         x, y, yaw = poses.T
         if not ((np.abs(x) < FARTHEST) & (np.abs(y) < FARTHEST) & np.isfinite(yaw)).all():
             return None
@@ -133,13 +133,13 @@ class MapExtent:
         away = np.maximum(np.maximum(left - x, x - right), np.maximum(bottom - y, y - top))
         far = (away > parameters.association.max_jump) & (left <= right)
         box: Box = tuple(grown[:, -1].tolist())
-        # a power and a product may differ in the last bit
+        # with a tolerance, since a power and a product may differ in the last bit
         large = half_angle * (reach / parameters.grid.resolution) ** 2 > LARGEST_CONE * (1 - 1e-9)
         # the box only grows
         return None if far.any() or large.any() or not _fits(box, parameters) else box
 
     def admit(self, sensor: Pose2, measured: Measurement, parameters: Parameters) -> str:
-        """Grow to hold a reading and return '', or return the reason (`rep117.REASONS`) why the map cannot."""
+        """Grow by a reading and return '', or return the reason for its rejection (`rep117.REASONS`)."""
         return self._admit(sensor, reach_with_margin(measured, parameters), measured.half_angle, parameters)
 
     def _admit(self, sensor: Pose2, reach: float, half_angle: float, parameters: Parameters) -> str:

@@ -1,4 +1,4 @@
-"""Messages of a file, many at once, as columns: what `message_types` has one by one."""
+"""Batches of messages from files, as columns; `message_types` has single messages."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ class Odometry(NamedTuple):
     frame : int64, shape (M,)
         Index into `frames`.
     pose : float64, shape (M, 3)
-        x, y, yaw; a row of NaN where a message has no planar pose.
+        x, y, yaw; NaN if a message has no planar pose.
     frames : tuple of (str, str)
         Each pair of `frame_id` and `child_frame_id` once.
     """
@@ -80,7 +80,7 @@ class Odometry(NamedTuple):
         columns = (column.tolist() for column in self[:4])
         for place, stamp, frame, (x, y, yaw) in zip(*columns, strict=True):
             parent, child = self.frames[frame]
-            # only a message without a pose has a NaN
+            # NaN stands for a message without a pose
             yield place, OdometryMessage(stamp, parent, child, None if math.isnan(x) else Pose2(x, y, yaw))
 
 
@@ -97,7 +97,7 @@ class MessageBatch(NamedTuple):
         return (message for _, message in merge(*kinds, key=lambda placed: placed[0]))
 
     def select(self, ranges: NDArray[np.bool_], odometry: NDArray[np.bool_]) -> MessageBatch:
-        """Return the messages that two masks, shapes (N,) and (M,), pick."""
+        """Return the messages selected by two masks, shapes (N,) and (M,)."""
         return MessageBatch(
             Ranges._make([*(column[ranges] for column in self.ranges[:8]), self.ranges.frames]),
             Odometry._make([*(column[odometry] for column in self.odometry[:4]), self.odometry.frames]),
@@ -124,14 +124,14 @@ def batch_of(messages: list[tuple[int, RangeMessage | OdometryMessage]]) -> Mess
 
 
 def joined(batches: list[MessageBatch]) -> MessageBatch:
-    """Return several batches as one, whose places say how their messages lie among each other."""
+    """Return several batches as one; their places define the order of all messages."""
     ranges = _joined([batch.ranges for batch in batches])
     odometry = _joined([batch.odometry for batch in batches])
     return MessageBatch(Ranges._make(ranges), Odometry._make(odometry))
 
 
 def _joined(parts: Sequence[Ranges] | Sequence[Odometry]) -> list[Any]:
-    """Return the columns of parts in the order of their places, and the names that are in any of them."""
+    """Return the columns of all parts, sorted by place, and the union of their names."""
     names: dict[object, int] = {}
     frames = []
     for part in parts:

@@ -1,4 +1,4 @@
-"""The two messages that mapping needs, free of ROS, and the conversion of any ROS message into them.
+"""The two messages that mapping needs, independent of ROS, and the conversion of ROS messages into them.
 
 `sensor_msgs/Range` and `nav_msgs/Odometry` have the same attributes in rclpy and in rosbags (ROS 1 and ROS 2), so one
 duck-typed conversion serves the node and the offline tool alike.
@@ -22,7 +22,7 @@ class Pose2(NamedTuple):
     yaw: float
 
     def compose(self, other: Pose2) -> Pose2:
-        """Return `other`, given in the frame of this pose, in the frame this pose is given in."""
+        """Return self ⊕ other: `other`, given in the frame of this pose, in the parent frame of this pose."""
         c, s = math.cos(self.yaw), math.sin(self.yaw)
         return Pose2(
             self.x + c * other.x - s * other.y,
@@ -46,7 +46,7 @@ class RangeMessage(NamedTuple):
 class OdometryMessage(NamedTuple):
     """One `nav_msgs/Odometry`: pose of `child_frame_id` in `frame_id`, `stamp` in nanoseconds.
 
-    `pose` is None where `planar_pose` makes none of the message's.
+    `pose` is None if `planar_pose` returns None.
     """
 
     stamp: int
@@ -61,7 +61,7 @@ def stamp_of(header: Any) -> int:
 
 
 def planar_pose(position: Any, orientation: Any) -> Pose2 | None:
-    """Return a pose of any library, projected on the plane.
+    """Return a pose projected on the plane; its type may be that of any library.
 
     Parameters
     ----------
@@ -81,7 +81,7 @@ def planar_pose(position: Any, orientation: Any) -> Pose2 | None:
 
 
 def planar_pose_of(x: float, y: float, qx: float, qy: float, qz: float, qw: float) -> Pose2 | None:
-    """Return a pose projected on the plane, from its position in metres and its quaternion, as `planar_pose` does."""
+    """Return `planar_pose` from the position, metres, and the components of the quaternion."""
     yaw = yaw_of(qx, qy, qz, qw)
     return Pose2(x, y, yaw) if yaw is not None and math.isfinite(x) and math.isfinite(y) else None
 

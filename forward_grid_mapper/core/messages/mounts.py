@@ -1,4 +1,4 @@
-"""Poses of sensors on the robot as people write them: three numbers that may be in other units than is thought."""
+"""Poses of sensors on the robot from users: three numbers, which are checked for wrong units."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from ..common.errors import ParameterError
 from .message_types import Pose2
 
 TURN = 2.0 * math.pi
-"""Radians; no sensor is turned by more. A float32 of it passes, too."""
+"""Largest yaw of a sensor, radians; its float32 value is accepted, too."""
 
 FARTHEST = 10.0
-"""Metres from the middle of the robot's base to a sensor, at the most; 15 cm that are written as 15 are more."""
+"""Largest distance of a sensor from the origin of the base frame, metres; 15 for 15 cm is more."""
 
 
 def mount_from(name: str, values: object) -> Pose2:
@@ -22,14 +22,14 @@ def mount_from(name: str, values: object) -> Pose2:
     Parameters
     ----------
     name : str
-        What it is called in errors.
+        Name of the sensor in error messages.
     values : object
-        What should be a list, a tuple or an array of three numbers.
+        A list, a tuple or an array of three numbers; anything else is an error.
 
     Raises
     ------
     ParameterError
-        If it is not that, or the numbers can only be of other units.
+        If it is something else, or the numbers must be in other units.
     """
     numbers = list(values) if isinstance(values, Iterable) and not isinstance(values, str) else []
     good = [float(v) for v in numbers if isinstance(v, Real) and not isinstance(v, bool) and math.isfinite(v)]
@@ -50,9 +50,9 @@ def mount_from(name: str, values: object) -> Pose2:
 
 
 def far_mounts(poses: Mapping[str, Pose2]) -> list[str]:
-    """Return a warning of sensors that transforms put so far away as a parameter may not; `poses` are by frame.
+    """Return a warning about sensors that are farther away by TF than a parameter allows; `poses` are by frame.
 
-    They are mapped all the same: a crane's transforms may be right.
+    They are mapped nevertheless: the transforms of a crane may be right.
     """
     away = {frame: math.hypot(pose.x, pose.y) for frame, pose in poses.items()}
     far = sorted(frame for frame, distance in away.items() if distance > FARTHEST)

@@ -1,6 +1,6 @@
-"""All poses of a drive as odometry gave them, for whoever places its readings anew.
+"""The record of all poses of odometry in a drive, for refining its trajectory later.
 
-`pose_history` places readings as they come, and forgets; this remembers. Columns of 32 bytes a pose.
+`pose_history` only keeps what it needs to place new readings. Each pose takes 32 bytes.
 """
 
 from __future__ import annotations
@@ -16,34 +16,34 @@ from .message_types import NANOSECONDS, Pose2
 Floats = NDArray[np.float64]
 
 MOST_POSES = 300_000
-"""Poses that are kept at the most, 10 MB: of more, those go that their neighbours tell. At 50 Hz it is 100 minutes of
-driving without a rest."""
+"""Most poses, 10 MB. If there are more, those are dropped that interpolation between their neighbours replaces best. At
+50 Hz it is 100 minutes of driving without pauses."""
 
 TOLERANCE = 1e-4
-"""Metres, and radians, by which the neighbours may miss a pose that goes in any case, as where the robot stands."""
+"""Metres, and radians: poses with a smaller interpolation error are always dropped, as during standstill."""
 
 PART = 16_384
-"""Poses that are looked through at once when some have to go: it takes a few milliseconds."""
+"""Poses that are thinned in one step, which takes a few milliseconds."""
 
 OVERLAP = 60 * NANOSECONDS
-"""Nanoseconds of the drive before that stay when another one begins: readings are late by less."""
+"""Nanoseconds of the drive before that are kept when a new one begins: readings are late by less."""
 
 MOST_LATE = 1024
-"""Poses that came late and wait to be sorted in: it costs the same for many."""
+"""Most poses out of order before they are sorted in; sorting costs the same for many."""
 
 
 class OdometryRecord:
-    """Stamps and poses in order of time, one for each stamp; snapshots never change.
+    """Stamps and poses, sorted by time, one for each stamp; snapshots never change.
 
     Parameters
     ----------
     most : int
-        Poses that are kept at the most; 0 is no bound.
+        Most poses that are kept; 0 is no bound.
 
     Attributes
     ----------
     late : int
-        Poses that came after one of a later stamp, or of the same.
+        Number of poses that came after one with a later stamp, or the same.
     """
 
     def __init__(self, most: int = MOST_POSES) -> None:
@@ -55,19 +55,19 @@ class OdometryRecord:
 
     @property
     def newest(self) -> tuple[int, Pose2] | None:
-        """The last stamp, ns, and its pose; None while there is none."""
+        """The last stamp, ns, and its pose; None if there is none."""
         if not self._size:
             return None
         return int(self._stamp[self._size - 1]), Pose2(*self._pose[self._size - 1].tolist())
 
     @property
     def since_anew(self) -> int:
-        """How many poses came since `begin_anew`, which keeps the last ones before it; all, if it was never called."""
+        """Number of poses since `begin_anew`, without those kept from before; all, if it was never called."""
         before = int(np.searchsorted(self._stamp[: self._size], self._before, side='right'))
         return self._size - before + sum(stamp > self._before for stamp in self._late)
 
     def clear(self) -> None:
-        """Forget every pose."""
+        """Remove all poses."""
         self._size, self._next, self._anew = 0, 0, False
         self.late = 0
         self._before = np.iinfo(np.int64).min
@@ -96,7 +96,7 @@ class OdometryRecord:
             self._thin()
 
     def drop(self, stamp: int) -> None:
-        """Forget the pose of the last stamp; snapshots keep it."""
+        """Remove the pose of the last stamp; snapshots keep it."""
         self._late.pop(stamp, None)
         if self._size and self._stamp[self._size - 1] == stamp:
             self._size -= 1
@@ -105,7 +105,7 @@ class OdometryRecord:
             self._before = int(self._stamp[self._size - 1]) if self._size else np.iinfo(np.int64).min
 
     def extend(self, stamps: Sequence[int], poses: Sequence[Pose2]) -> None:
-        """Add many poses, whose stamps increase; without a bound, and later than all before, in no time."""
+        """Add many poses with increasing stamps; it is fast without a bound and if they are later than all before."""
         size, end = self._size, self._size + len(stamps)
         if self._most or not stamps or (size and stamps[0] <= self._stamp[size - 1]):
             for stamp, pose in zip(stamps, poses, strict=True):
@@ -118,23 +118,23 @@ class OdometryRecord:
         self._size = end
 
     def begin_anew(self) -> None:
-        """Begin a drive where another one ended: the next reading may be of any time, the drive begins with it."""
+        """Begin a new drive with the next reading; the last poses before it are kept (`OVERLAP`)."""
         self._sort_in()
         self._anew = True
         newest = int(self._stamp[self._size - 1]) if self._size else 0
         self._before = newest if self._size else self._before
         begin = int(np.searchsorted(self._stamp[: self._size], newest - OVERLAP))
-        # what stays is not much, and the rest is to be freed
+        # copies, so that the memory of the rest is freed
         self._stamp, self._pose = self._stamp[begin : self._size].copy(), self._pose[begin : self._size].copy()
         self._size = len(self._stamp)
 
     def snapshot(self, first: int | None = None) -> tuple[NDArray[np.int64], Floats]:
-        """Return stamps in ns, shape (M,), and x, y, yaw, shape (M, 3), which nobody must change.
+        """Return stamps, ns, shape (M,), and x, y, yaw, shape (M, 3), which must not be modified.
 
         Parameters
         ----------
         first : int, optional
-            Stamp of the drive's first reading, ns: after `begin_anew`, poses begin with the last one before it.
+            Stamp of the first reading of the drive, ns: after `begin_anew`, poses begin with the last one before it.
         """
         self._sort_in()
         stamp, pose = self._stamp[: self._size], self._pose[: self._size]
@@ -144,19 +144,19 @@ class OdometryRecord:
         return stamp[begin:], pose[begin:]
 
     def since(self, stamp: int) -> tuple[NDArray[np.int64], Floats]:
-        """Return stamps and poses from one stamp on, as `snapshot` does, without late ones not yet sorted in."""
+        """Return stamps and poses from a stamp on, like `snapshot`, without late ones that are not yet sorted in."""
         begin = int(np.searchsorted(self._stamp[: self._size], stamp))
         return self._stamp[begin : self._size], self._pose[begin : self._size]
 
     def _sort_in(self) -> None:
-        """Sort in what came late; into copies, since the columns are those of snapshots."""
+        """Sort in late poses; into copies, since snapshots share the columns."""
         if not self._late:
             return
         stamp = np.concatenate([self._stamp[: self._size], np.array(list(self._late), np.int64)])
         pose = np.concatenate([self._pose[: self._size], np.array(list(self._late.values()))])
         self._late.clear()
         order = np.argsort(stamp, kind='stable')
-        # of one stamp the one that came last
+        # of equal stamps, keep the one that came last
         last = np.append(np.diff(stamp[order]) > 0, True)
         self._stamp, self._pose = stamp[order[last]], pose[order[last]]
         self._size = len(self._stamp)
@@ -164,20 +164,21 @@ class OdometryRecord:
             self._thin()
 
     def _thin(self) -> None:
-        """Let poses of a part of the drive go that lie between their neighbours; the next time, of the next part."""
+        """Drop poses of one part of the drive that are close to interpolation; next time, those of the next part."""
         begin = self._next if self._next < self._size - 2 else 0
         end = min(begin + PART, self._size)
         stay = np.ones(self._size, np.bool_)
-        stay[begin:end] = _telling(self._stamp[begin:end], self._pose[begin:end])
+        stay[begin:end] = _hard_to_interpolate(self._stamp[begin:end], self._pose[begin:end])
         self._next = begin + int(np.count_nonzero(stay[begin:end]))
         self._stamp, self._pose = self._stamp[: self._size][stay], self._pose[: self._size][stay]
         self._size = len(self._stamp)
 
 
-def _telling(stamp: NDArray[np.int64], pose: Floats) -> NDArray[np.bool_]:
-    """Return the poses that stay, shape (M,).
+def _hard_to_interpolate(stamp: NDArray[np.int64], pose: Floats) -> NDArray[np.bool_]:
+    """Return a mask of the poses that are kept, shape (M,).
 
-    Of every other one those go that lie nearest to the line between the poses beside them, half of them at least.
+    Of every second pose, those with the smallest error of interpolation between their neighbours are dropped: at least
+    half of them.
     """
     stay = np.ones(len(stamp), np.bool_)
     before, middle, after = slice(0, -2, 2), slice(1, -1, 2), slice(2, None, 2)

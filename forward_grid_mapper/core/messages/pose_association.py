@@ -1,7 +1,7 @@
-"""Pose association: messages in any interleaving → readings in the map frame, every rejection counted by reason.
+"""Pose association: messages in any interleaving → readings in the map frame; each rejection is counted by reason.
 
-One `PoseAssociator` serves the offline tool and the node. Message stamps alone decide where a reading goes, so the same
-messages give the same readings however fast they arrive. A clock is asked only how long a reading has waited already.
+The offline tool and the node use the same `PoseAssociator`. The pose of a reading depends on message stamps only, so
+the same messages give the same readings however fast they arrive. A clock is used only for time-outs.
 """
 
 from __future__ import annotations
@@ -28,22 +28,22 @@ from .robot_path import RobotPath
 from .stamp_order import JUMP, JUMPED_BACK, WAS_AHEAD, order_of
 
 RETRY = NANOSECONDS // 20
-"""How often, in message time or by the clock, a pose that may still become known is asked for again."""
+"""Interval, in message time or by the clock, at which a pose that may still become known is looked up again."""
 
 MOST_FRAMES = 1000
-"""Sensor frames with counts of their own; whatever comes after them is counted as `OTHERS`."""
+"""Most sensor frames with counts of their own; others are counted as `OTHERS`."""
 
 OTHERS = '(other frames)'
 
 MOST_WAITING = 100_000
-"""Readings that may wait for odometry at once, so that memory stays bounded without any."""
+"""Most readings that may wait for odometry, so that memory is bounded without odometry."""
 
 LONGEST_LAG = 60.0
-"""Seconds that a reading waits at the most for odometry that keeps coming and has not reached its stamp."""
+"""Longest time that a reading waits for odometry that keeps coming but has not reached its stamp, seconds."""
 
 
 class PoseAssociator:
-    """Takes Range and Odometry one at a time, in any interleaving, and keeps the readings it could place.
+    """Takes Range and Odometry messages one by one, in any interleaving, and stores the readings that get a pose.
 
     Attributes
     ----------
@@ -54,17 +54,17 @@ class PoseAssociator:
         Messages by reason (`REASONS`, `ODOMETRY_REASONS`).
     rejected_by_frame : dict of frame_id → Counter
     unknown_frames : set of str
-        Sensor frames whose mounting pose is not known now.
+        Sensor frames whose pose on the robot is unknown at present.
     map_frame, base_frame : str
         The frames of the first odometry message; empty before it.
     time_jumps : int
-        How often odometry's clock jumped back.
+        Number of times that the clock of odometry jumped back.
     behind : bool
-        Whether more than `at_once` readings can be placed now: call `settle` before the next message.
+        Whether more than `at_once` readings can be placed now; then call `settle` before the next message.
     settled : int
-        Readings placed, rejected or looked at again so far: how much work there was.
+        Number of readings placed, rejected or looked up again so far, as a measure of the work.
     record : OdometryRecord
-        Of the poses that odometry gave.
+        Of all poses of odometry.
     limits : LimitWatch
         Warns of ranges and limits in different units.
     """
@@ -82,18 +82,18 @@ class PoseAssociator:
         Parameters
         ----------
         extrinsics : callable
-            Answers where a sensor sits on the robot (`extrinsics`).
+            Returns the pose of a sensor on the robot (`extrinsics`).
         parameters : Parameters, optional
         patient : bool
-            Keep all odometry and let readings wait for it without a bound, as a file allows: then the readings accepted
-            do not depend on how the two streams interleave.
+            For files: keep all odometry, and let readings wait for it without limit. Then the accepted readings do not
+            depend on how the two streams interleave.
         clock : callable
-            Returns seconds. A reading times out when `pose_timeout` has passed both by the stamps that came after it
-            and by this clock: so neither a bag that is replayed fast nor a simulation that stands still loses any.
-            While odometry's stamps go on, no reading times out that only overtook it.
+            Returns seconds. A reading times out when `pose_timeout` has passed both by later stamps and by this clock:
+            so none is lost if a bag is replayed fast or a simulation is paused. While stamps of odometry increase, a
+            reading that only overtook it does not time out.
         at_once : int
-            Readings that one call places or rejects at the most, so that odometry that comes after a long silence
-            holds up nobody; 0 is no bound.
+            Most readings that one call places or rejects, so that odometry after a long pause blocks nothing; 0 is no
+            bound.
         """
         self._clock = clock
         self._extrinsics = extrinsics
@@ -123,7 +123,7 @@ class PoseAssociator:
 
     @property
     def waiting(self) -> int:
-        """Number of readings that wait for odometry or for the pose of their sensor."""
+        """Number of readings that wait for odometry, or for the pose of their sensor on the robot."""
         return len(self._waiting) + len(self._held)
 
     @property
@@ -133,18 +133,18 @@ class PoseAssociator:
 
     @property
     def odometry_ahead(self) -> bool:
-        """Whether the newest stamp of odometry is far after the one before, and may turn out to be wrong."""
+        """Whether the newest stamp of odometry is far after the one before, so that it may be wrong."""
         newest, before = self._history.newest, self._history.before
         return newest is not None and before is not None and newest - before > JUMP
 
     @property
     def path(self) -> list[tuple[float, float]]:
-        """Where the robot drove, (x, y) in metres (`robot_path`)."""
+        """The path of the robot, (x, y) in metres (`robot_path`)."""
         return self._path.points
 
     @property
     def readings(self) -> Readings:
-        """The readings to map from: all that were accepted, or `max_readings` of them."""
+        """The readings for mapping: all accepted ones, thinned to `max_readings`."""
         return self.buffer.bounded()
 
     def change(self, parameters: Parameters) -> None:
@@ -153,7 +153,7 @@ class PoseAssociator:
 
     @property
     def odometry(self) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """The poses of the drive as odometry gave them: stamps in ns, shape (M,), and x, y, yaw, shape (M, 3)."""
+        """The poses of the drive by odometry: stamps, ns, shape (M,), and x, y, yaw, shape (M, 3)."""
         stamps = self.buffer.snapshot().stamp
         return self.record.snapshot(int(stamps.min()) if len(stamps) else None)
 
@@ -175,14 +175,14 @@ class PoseAssociator:
         self._settle()
 
     def reject(self, message: RangeMessage, reason: str, count: int = 1) -> None:
-        """Take one Range message, or several like it, and reject it for a reason that is not its own."""
+        """Count one Range message, or several from its frame, as rejected for an external reason."""
         self.received += count
         self._reject(message.frame_id, reason, count)
 
     def clear(self, parameters: Parameters | None = None) -> None:
-        """Forget readings, counts and path; odometry is kept, so that the next reading gets a pose.
+        """Remove readings, counts and path; odometry is kept, so that the next reading gets a pose.
 
-        `parameters` are those of the maps that begin now.
+        `parameters` are those of the new maps.
         """
         self._all = parameters or self._all
         if self._other_frame:
@@ -238,7 +238,7 @@ class PoseAssociator:
             self._history.trim()
 
     def finish(self) -> None:
-        """Say that no more messages come: what still waits gets a pose if there is one, or is rejected."""
+        """Settle all waiting readings after the last message: each gets a pose if there is one, or is rejected."""
         newest = self._history.newest
         if newest is not None:
             self._settle_up_to(newest)
@@ -250,12 +250,12 @@ class PoseAssociator:
         self._held.clear()
 
     def restore(self, readings: Readings) -> int:
-        """Take readings that an earlier run accepted, as received, and as accepted where the map can hold them.
+        """Add readings that an earlier run accepted; those that the map cannot contain are rejected.
 
         Returns
         -------
         int
-            How many it cannot hold; they are rejected.
+            Number of rejected readings.
         """
         self.received += len(readings)
         rejected = self._extent.restore(readings, self._all)
@@ -270,7 +270,7 @@ class PoseAssociator:
         return len(readings) - count
 
     def extend_path(self, point: tuple[float, float]) -> None:
-        """Add a point to the robot's path, if it lies far enough from the last one."""
+        """Add a point to the path of the robot, if it is far enough from the last one."""
         self._path.extend(point)
 
     def _reject(self, frame_id: str, reason: str, count: int = 1) -> None:
@@ -287,10 +287,10 @@ class PoseAssociator:
         self._reject(measured.frame_id, reason)
 
     def _drop_ahead(self) -> None:
-        """Forget the newest pose, whose stamp was ahead of those before and after it; what it settled stays settled."""
+        """Drop the newest pose, whose stamp was ahead of those before and after it; readings placed by it stay."""
         self._history.drop_newest()
         self.odometry_rejected['ahead_of_others'] += 1
-        # time goes on by the stamps that are left
+        # time is that of the remaining stamps
         self._next_try = self._next_look = 0
 
     def _jump_back(self) -> None:
@@ -309,11 +309,11 @@ class PoseAssociator:
         self._newest_range = None
 
     def settle(self) -> None:
-        """Go on placing readings, where `behind` says that there are more."""
+        """Place more readings, if `behind`."""
         self._settle()
 
     def _settle(self) -> None:
-        """Place or reject the waiting readings whose fate is known, `at_once` at the most."""
+        """Place or reject waiting readings as far as possible, at most `at_once`."""
         newest, left = self._history.newest, self._at_once
         if newest is not None:
             # odometry may be late by up to JUMP, and a file can wait for it
@@ -324,7 +324,7 @@ class PoseAssociator:
             self.settled += self._at_once - left
 
     def _time_out(self, newest: int | None, left: int) -> int:
-        """Reject readings that have waited too long, ask for poses again; return how much of `left` is left."""
+        """Reject readings that waited too long, and look up poses again; at most `left`; return what remains of it."""
         now = max(self._newest_range or 0, newest or 0)
         # a gap that would be bridged must not time out first
         patience = max(self.parameters.pose_timeout, self.parameters.max_pose_gap)
@@ -336,7 +336,7 @@ class PoseAssociator:
             return left
         clock = self._clock()
         oldest = clock - patience
-        # odometry that goes on is merely behind, or else `_drop_the_future` notices
+        # odometry whose stamps increase is only late; otherwise `_drop_the_future` rejects the readings
         waiting = self._waiting if newest is None or self._odometry_arrival < oldest else []
         while left and waiting and waiting[0].stamp < limit and waiting[0].arrival < oldest:
             self._reject(heapq.heappop(waiting).frame_id, 'no_odometry')
@@ -356,9 +356,9 @@ class PoseAssociator:
         return left
 
     def _drop_the_future(self, newest: int, patience: float) -> None:
-        """Reject what odometry should have reached by now, by its own stamps and by the clock.
+        """Reject readings whose stamps odometry should have reached by now, by its own stamps and by the clock.
 
-        Odometry that was published before a reading, and was overtaken by it, says nothing of the reading's clock.
+        Odometry that was published before a reading, and was overtaken by it, does not show that the clock is wrong.
         """
         clock = self._clock()
         oldest, published = clock - patience, self._odometry_sent and self._odometry_sent - patience * NANOSECONDS
@@ -374,11 +374,11 @@ class PoseAssociator:
         if len(stay) < len(self._waiting):
             self._waiting = stay
             heapq.heapify(self._waiting)
-            # time goes on by the stamps that are left
+            # time is that of the remaining stamps
             self._newest_range, self._next_try = max((measured.stamp for measured in stay), default=None), 0
 
     def _settle_up_to(self, stamp: int, left: int = sys.maxsize) -> int:
-        """Place the readings up to a stamp, `left` at the most; return how many more may be."""
+        """Place the readings up to a stamp, at most `left`; return what remains of `left`."""
         while left and self._waiting and self._waiting[0].stamp <= stamp:
             self._place(heapq.heappop(self._waiting))
             left -= 1
@@ -392,7 +392,7 @@ class PoseAssociator:
         self._add_extrinsics(measured, pose)
 
     def _add_extrinsics(self, measured: Measurement, pose: Pose2) -> None:
-        """Add the sensor's pose on the robot to the robot's, and keep the reading."""
+        """Compose the poses of robot and sensor, and store the reading."""
         extrinsic = self._extrinsics(self.base_frame, measured.frame_id, measured.stamp)
         if isinstance(extrinsic, Later):
             if extrinsic.reason != 'unknown_extrinsics':

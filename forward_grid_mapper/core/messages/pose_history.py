@@ -1,4 +1,4 @@
-"""The robot's poses over time, as odometry gives them, and the pose at any stamp in between."""
+"""The latest poses of the robot by odometry, and interpolation at any stamp."""
 
 from __future__ import annotations
 
@@ -17,24 +17,24 @@ from .odometry_record import MOST_POSES as MOST_RECORDED
 from .odometry_record import OdometryRecord
 
 HISTORY = 600 * NANOSECONDS
-"""Nanoseconds before the newest pose from which on poses are forgotten: Range messages are late by less, even where a
-bag is replayed faster than they can be taken."""
+"""Poses older than the newest one by more are dropped, nanoseconds: Range messages are late by less, even if a bag is
+replayed faster than they can be processed."""
 
 MOST_POSES = 100_000
-"""Poses that are kept at the most, beside the record; 15 MB."""
+"""Most poses, besides the record; 15 MB."""
 
 FEWEST = 64
-"""Poses below which none is forgotten, so that trimming costs nothing where there are few."""
+"""If there are fewer poses, none is dropped, so that trimming costs nothing."""
 
 FASTEST = 100.0
-"""Metres a second between two poses, beyond which the pose jumped: no robot drives faster."""
+"""Metres a second: if two poses are farther apart, the pose jumped, since no robot drives faster."""
 
 STRIDE = 1.0
-"""Metres that the pose may jump in no time, as a localisation does that corrects itself."""
+"""Metres that the pose may jump at once, like that of a localisation which corrects itself."""
 
 
 def interpolate(before: Pose2, after: Pose2, fraction: float) -> Pose2:
-    """Return the pose at `fraction` of the way: position linear, yaw by the shortest way."""
+    """Return the pose at `fraction` between two poses: linear in position, and in yaw by the shorter turn."""
     turn = math.remainder(after.yaw - before.yaw, 2 * math.pi)
     return Pose2(
         before.x + fraction * (after.x - before.x),
@@ -49,7 +49,7 @@ class Poses(NamedTuple):
     Attributes
     ----------
     reason : str, shape (N,)
-        Why there is none (`rep117.REASONS`), and '' where there is one; then the columns count.
+        Why there is none (`rep117.REASONS`); '' if there is one. The other columns are valid only then.
     x, y, yaw : float64, shape (N,)
     """
 
@@ -65,11 +65,11 @@ class PoseHistory:
     Attributes
     ----------
     record : OdometryRecord
-        Of all of them, those that were forgotten too.
+        Of all of them, including dropped ones.
     """
 
     def __init__(self, patient: bool = False) -> None:
-        """Begin without poses; the record has no bound where there is no hurry and the drive has an end (`patient`)."""
+        """Begin without poses; for files (`patient`), the record has no bound."""
         self.record = OdometryRecord(0 if patient else MOST_RECORDED)
         self._stamps: list[int] = []
         self._poses: list[Pose2] = []
@@ -79,16 +79,16 @@ class PoseHistory:
 
     @property
     def newest(self) -> int | None:
-        """The latest stamp; None while there is none."""
+        """The latest stamp; None if there is none."""
         return self._stamps[-1] if self._stamps else None
 
     @property
     def before(self) -> int | None:
-        """The stamp before the latest; None while there is none."""
+        """The stamp before the latest; None if there is none."""
         return self._stamps[-2] if len(self._stamps) > 1 else None
 
     def clear(self) -> None:
-        """Forget every pose, those of the record too."""
+        """Remove all poses, also from the record."""
         self.record.clear()
         self._stamps.clear()
         self._poses.clear()
@@ -109,7 +109,7 @@ class PoseHistory:
             poses.insert(at, pose)
 
     def drop_newest(self) -> None:
-        """Forget the pose of the latest stamp, that of the record too."""
+        """Remove the pose of the latest stamp, also from the record."""
         self.record.drop(self._stamps.pop())
         self._poses.pop()
 
@@ -120,9 +120,10 @@ class PoseHistory:
         self._poses += poses
 
     def trim(self) -> None:
-        """Forget poses older than `HISTORY`, and the older half of more than `MOST_POSES`.
+        """Remove poses older than `HISTORY`, and the older half if there are more than `MOST_POSES`.
 
-        They go by halves, so that the cost of a message is constant. The newest stamp may be wrong, and far ahead.
+        At least half of the poses are removed at once, so that the mean cost of a message is constant. The second
+        newest stamp is used, since the newest may be wrong and far ahead.
         """
         stamps = self._stamps
         old = bisect_left(stamps, stamps[-2:][0] - HISTORY) if len(stamps) < MOST_POSES else MOST_POSES // 2
@@ -132,15 +133,15 @@ class PoseHistory:
     def at(self, stamp: int, max_gap: float) -> Pose2 | str:
         """Return the pose at a stamp, or the reason why there is none (`rep117.REASONS`).
 
-        A pose of the very stamp bridges no gap, but it must not have jumped from the two before: the one after it,
-        which would tell a wild pose from a correction, is not known yet while a robot drives.
+        A pose with exactly this stamp bridges no gap, but it must not have jumped from both poses before: the pose
+        after it, which would tell an outlier from a correction, is not known yet while the robot drives.
 
         Parameters
         ----------
         stamp : int
             Nanoseconds, not after `newest`.
         max_gap : float
-            Seconds between two poses that may be bridged.
+            Longest time between two poses for interpolation, seconds.
         """
         stamps, poses = self._stamps, self._poses
         after = bisect_left(stamps, stamp)
@@ -159,10 +160,10 @@ class PoseHistory:
         return interpolate(poses[after - 1], poses[after], (stamp - stamps[after - 1]) / gap)
 
     def at_all(self, stamp: NDArray[np.int64], max_gap: float) -> Poses:
-        """Return the poses at many stamps, shape (N,), as `at` does at each."""
+        """Apply `at` to many stamps, shape (N,)."""
         if not len(stamp):
             return Poses(np.zeros(0, REASON), *np.zeros((3, 0)))
-        # those before the first stamp that is asked for have no part in it, but for the last two
+        # of the poses before the first stamp, only the last two are needed
         begin = max(bisect_left(self._stamps, int(stamp.min())) - 2, 0)
         end = bisect_left(self._stamps, int(stamp.max())) + 1
         stamps, poses = np.array(self._stamps[begin:end], np.int64), np.array(self._poses[begin:end]).reshape(-1, 3)
@@ -189,6 +190,6 @@ class PoseHistory:
         return Poses(reason, *at.T)
 
     def _jumped(self, before: int, after: int) -> bool:
-        """Return whether no robot drives from one pose to another so fast."""
+        """Return whether no robot is fast enough to drive from one pose to another."""
         seconds = (self._stamps[after] - self._stamps[before]) / NANOSECONDS
         return math.dist(self._poses[before][:2], self._poses[after][:2]) > STRIDE + FASTEST * seconds

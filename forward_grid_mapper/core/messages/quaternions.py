@@ -1,11 +1,11 @@
-"""Quaternions in the plane: the one conversion of an orientation into a heading, for the node and for bags alike."""
+"""Conversion of orientations (quaternions) into headings in the plane, for both the node and bags."""
 
 from __future__ import annotations
 
 import math
 
 TOLERANCE = 0.01
-"""Bound on |x² + y² + z² + w² − 1|, no unit. tf2 refuses what is beyond, so the node and a bag take the same ones."""
+"""Bound on |x² + y² + z² + w² − 1|; tf2 has the same one, so node and bags accept the same quaternions."""
 
 STEEPEST = math.radians(60.0)
 """Largest angle between an x axis and the plane, radians. Beyond it the heading is ill-defined, and the range of a
@@ -16,7 +16,7 @@ Rotation = tuple[tuple[float, float, float], tuple[float, float, float], tuple[f
 
 
 def rotation_of(x: float, y: float, z: float, w: float) -> Rotation | None:
-    """Return the rotation of a quaternion, brought to length one; None if it is not finite or not normalised."""
+    """Return the rotation of a quaternion, normalised to length one; None if not finite, or beyond `TOLERANCE`."""
     square = x * x + y * y + z * z + w * w
     # a NaN compares false
     if not abs(square - 1.0) <= TOLERANCE:

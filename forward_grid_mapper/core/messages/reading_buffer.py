@@ -1,4 +1,4 @@
-"""The readings that were accepted so far: a buffer that grows up to a bound, and can be looked at from any thread."""
+"""The buffer of accepted readings: it grows up to a bound, and any thread can take snapshots of it."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from .thinning import kept
 Columns = dict[str, NDArray[Any]]
 
 LARGE = 65_536
-"""Rows from which on columns are moved to larger ones little by little, so that no reading waits for the copy."""
+"""From so many rows on, columns are copied to larger ones in steps, so that no reading waits for a long copy."""
 
 STEP = 1024
-"""Readings between two steps of the move."""
+"""Readings between two steps of the copy."""
 
 
 class _Thinned(NamedTuple):
-    """The columns that stay of the first `size` readings, `stay` of them, in the buffer's state `version`."""
+    """The columns of the `stay` readings that remain of the first `size`, for the buffer's state `version`."""
 
     columns: Columns
     stay: int
@@ -33,19 +33,19 @@ class _Thinned(NamedTuple):
 
 
 class ReadingBuffer:
-    """Columns that grow as readings come, and are thinned (`thinning`) when more than `bound` are held.
+    """Columns that grow with the readings, and are thinned (`thinning`) if there are more than `bound`.
 
-    76 bytes a reading. One thread appends; any may take snapshots.
+    It needs 76 bytes for each reading. One thread appends; any may take snapshots.
 
     Attributes
     ----------
     bound : int
-        Readings that `bounded` returns at the most; up to an eighth more are held. 0 is no bound.
+        Most readings that `bounded` returns; up to an eighth more are stored. 0 is no bound.
     before_thinning : list of callable
-        Called before readings are dropped, by the thread that appends: the last moment to look at those that are new.
+        Called before readings are dropped, by the thread that appends: the last chance to process new ones.
     aside : callable, optional
-        Takes two functions, has another thread call the first, and gives what it returned to the second in the thread
-        that appends, or nothing if it failed. By default thinning keeps the caller of `append` waiting.
+        Takes two functions. It calls the first in another thread, and the second, with the result, in the thread that
+        appends; with None if the first failed. By default, `append` blocks during thinning.
     """
 
     _TYPES = {
@@ -62,12 +62,12 @@ class ReadingBuffer:
         self.aside: Callable[[Callable[[], _Thinned], Callable[[_Thinned | None], None]], None] | None = None
         self._version = 0
         self._larger: Columns | None = None
-        # held while columns are replaced, so that a snapshot never mixes old and new ones
+        # locked while columns are replaced, so that a snapshot never mixes old and new ones
         self._lock = threading.Lock()
         self.clear()
 
     def __len__(self) -> int:
-        """Return how many readings were ever appended; the thinned ones count."""
+        """Return the number of readings that were appended, including thinned ones."""
         return self._count
 
     @property
@@ -77,13 +77,13 @@ class ReadingBuffer:
 
     @property
     def room(self) -> int:
-        """Readings that may be appended before the next thinning begins, and that one; a large number without bound."""
+        """Number of readings up to and including the one that starts the next thinning; large without bound."""
         if not self.bound or self._thinning:
             return sys.maxsize
         return max(max(self.bound, self._failed_at) + self.bound // 8 + 1 - self._size, 1)
 
     def clear(self) -> None:
-        """Forget every reading and every sensor name."""
+        """Remove all readings and sensor names."""
         with self._lock:
             self._size = self._count = 0
             self._names: dict[str, int] = {}
@@ -112,7 +112,7 @@ class ReadingBuffer:
         """Add many readings at once."""
         count = len(readings)
         ahead = self._size + count
-        # the move to larger columns, which appending begins, needs this room to be done in steps
+        # the copy in steps, which `append` starts, needs this much free space
         self._reserve(count + (ahead // 3 if ahead >= LARGE else 0))
         sensors = np.array([self._number_of(name) for name in readings.sensor_names] or [0], np.int32)
         for number, count_of, silent in zip(sensors.tolist(), *readings.counts(), strict=False):
@@ -131,7 +131,7 @@ class ReadingBuffer:
         self._thin()
 
     def counts(self) -> dict[str, tuple[int, int]]:
-        """Return, for each sensor, how many readings were ever appended, and how many of them were without echo."""
+        """Return the number of appended readings of each sensor, and of those without echo."""
         return dict(zip(list(self._names), zip(self._counts, self._silent, strict=False), strict=False))
 
     def _number_of(self, sensor: str) -> int:
@@ -142,9 +142,9 @@ class ReadingBuffer:
         return number
 
     def snapshot(self, start: int = 0) -> Readings:
-        """Return what is held of readings number `start`, counted from 0 as `len` does, and later.
+        """Return the stored readings from number `start` on; all appended readings are numbered from 0.
 
-        They are views: later appends do not change them, and may go on in another thread.
+        They are views: later appends, also in another thread, do not change them.
         """
         with self._lock:
             size, columns, names = self._size, self._columns, tuple(self._names)
@@ -153,7 +153,7 @@ class ReadingBuffer:
         return Readings(**views, sensor_names=names)
 
     def bounded(self) -> Readings:
-        """Return the readings to map from: all that is held, thinned to `bound`."""
+        """Return the readings for mapping: all stored ones, thinned to `bound`."""
         return bounded(self.snapshot(), self.bound)
 
     def _reserve(self, count: int) -> None:
@@ -169,7 +169,7 @@ class ReadingBuffer:
             self._larger = None
 
     def _move_on(self) -> None:
-        """Move some rows to larger columns if these are soon needed; a step for every `STEP` readings is enough."""
+        """Copy some rows to larger columns if these are needed soon; once every `STEP` readings is enough."""
         size = len(self._columns['z'])
         if size < LARGE or self._size <= size - size // 4:
             return
@@ -184,13 +184,13 @@ class ReadingBuffer:
         self._moved = end
 
     def _begin_anew(self) -> None:
-        """Forget what was made of columns that are no longer those of the buffer."""
+        """Discard results for columns that are no longer those of the buffer."""
         self._version += 1
         self._larger, self._moved = None, 0
         self._thinning, self._failed_at = False, 0
 
     def _thin(self) -> None:
-        # not at every reading beyond the bound: thinning costs the same for many
+        # not for each reading beyond the bound: thinning once for many costs the same
         slack = self.bound // 8
         if not self.bound or self._thinning or self._size <= max(self.bound, self._failed_at) + slack:
             return
@@ -204,7 +204,7 @@ class ReadingBuffer:
             # snapshots are views of the old columns, which therefore must not change
             thinned = _empty(columns, len(columns['z']))
             for name, view in views.items():
-                # indexing would keep the GIL
+                # unlike indexing, np.take releases the GIL
                 np.take(view, stay, out=thinned[name][: len(stay)], mode='clip')
             return _Thinned(thinned, len(stay), size, version)
 
@@ -214,7 +214,7 @@ class ReadingBuffer:
             self.aside(thin, self._take_thinned)
 
     def _take_thinned(self, thinned: _Thinned | None) -> None:
-        """Go on with thinned columns, and with what was appended since; without them, try again when there is more."""
+        """Replace the columns by thinned ones and what was appended since; without them, try again later."""
         if thinned is None:
             self._thinning, self._failed_at = False, self._size
             return
@@ -225,7 +225,7 @@ class ReadingBuffer:
         except MemoryError:
             self._thinning, self._failed_at = False, self._size
             raise
-        # so much may have come meanwhile that it is time again
+        # so many readings may have come meanwhile that thinning is due again
         self._thin()
 
     def _go_on_with(self, thinned: _Thinned) -> None:

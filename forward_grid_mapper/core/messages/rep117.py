@@ -1,4 +1,4 @@
-"""REP 117: what one Range message says, or why it is rejected."""
+"""REP 117: from a Range message to a measurement, or the reason for its rejection."""
 
 from __future__ import annotations
 
@@ -61,12 +61,12 @@ REASONS = {
 
 
 MANY = 0.2
-"""Part of the readings whose rejection for one reason is worth a warning."""
+"""Fraction of the readings whose rejection for one reason gives a warning."""
 
 
 NEARLY_ALL, ENOUGH = 0.9, 30
-"""Part of a sensor's readings whose rejection for one reason is worth a warning however few they are of all; and
-readings from which on."""
+"""Fraction of the readings of one sensor whose rejection for one reason gives a warning, however few they are among
+all; and their least number."""
 
 
 OF_POSES = {
@@ -84,11 +84,11 @@ OF_POSES = {
     'too_many_waiting',
     'paused',
 }
-"""Reasons that are none of the message by itself; a node that runs tells of them in other places."""
+"""Reasons that are not in the message itself; a running node reports them elsewhere."""
 
 
 CHOSEN = {'over_range', 'paused'}
-"""Reasons that the user chose, and that say nothing against a sensor: one may look where there is nothing to hear."""
+"""Reasons that the user chose, which are no fault of a sensor: there may be no object in its direction."""
 
 
 ODOMETRY_REASONS = {
@@ -105,15 +105,15 @@ ODOMETRY_REASONS = {
 
 
 NEAREST = 0.001
-"""Least range in metres that is taken for one: the drivers of dead sensors send less."""
+"""Smallest valid range, metres: drivers of dead sensors send less."""
 
 
 LONGEST_NAME = 255
-"""Most characters of a frame's name, so that names cost no memory to speak of; no TF tree has longer ones."""
+"""Most characters of the name of a frame, to limit memory; no TF tree has longer ones."""
 
 
 class Measurement:
-    """A Range that passed REP 117: what it says, before it has a pose. Order is that of stamps, then of arrival."""
+    """A valid Range message by REP 117, before it has a pose; sorted by stamp, then by arrival."""
 
     __slots__ = ('arrival', 'frame_id', 'half_angle', 'newest', 'number', 'sent', 'sigma', 'stamp', 'z', 'z_max')
 
@@ -128,11 +128,11 @@ class Measurement:
 
 
 def measure(message: RangeMessage, parameters: AssociationParameters) -> Measurement | str:
-    """Apply REP 117 and the overrides to one Range message; return what it says, or the reason of its rejection.
+    """Apply REP 117 and the parameters to one Range message; return the measurement, or the reason for its rejection.
 
-    A fixed-distance ranger (min_range = max_range) answers -inf for "something within max_range" and +inf for
-    "nothing". The former says no more than that the range lies in (0, max_range), and is taken as half of it with a
-    σ of one twelfth, which spans most of the interval at ±5 σ.
+    A fixed-distance ranger (min_range = max_range) sends -inf for "an object within max_range" and +inf for "none". The
+    former only means that the range is in (0, max_range). It becomes half of max_range with σ of one twelfth, so that
+    ±5 σ cover most of the interval.
     """
     if wrong := _of_name(message.frame_id):
         return wrong
@@ -179,17 +179,17 @@ def rejection_warnings(
 def sensor_rejections(
     by_frame: Mapping[str, Mapping[str, int]], accepted: Mapping[str, tuple[int, int]], known: Container[str] = ()
 ) -> list[str]:
-    """Return a warning for each reason, other than known ones, that costs some sensors nearly all of their readings.
+    """Return a warning for each reason, other than known ones, for which nearly all readings of a sensor are rejected.
 
-    Nothing is said of reasons that the user chose, nor of those for which many of all readings are rejected, which
-    `rejection_warnings` names, nor where no sensor is well.
+    There is none for reasons that the user chose, for those that are frequent among all readings
+    (`rejection_warnings`), and if no sensor works.
 
     Parameters
     ----------
     by_frame : mapping of str to mapping of str to int
-        How many readings of each frame were rejected, by reason.
+        Number of rejected readings of each frame, by reason.
     accepted : mapping of str to (int, int)
-        As `ReadingBuffer.counts` returns it.
+        From `ReadingBuffer.counts`.
     """
     rejected: Counter[str] = sum(map(Counter, by_frame.values()), Counter())
     many = MANY * (rejected.total() + sum(count for count, _ in accepted.values()))
@@ -197,8 +197,8 @@ def sensor_rejections(
     for frame, counts in by_frame.items():
         received = sum(counts.values()) + accepted.get(frame, (0, 0))[0]
         reason = max(counts, key=lambda each: counts[each])
-        told = not frame or reason in CHOSEN or reason in known or rejected[reason] > many
-        if counts[reason] >= max(NEARLY_ALL * received, ENOUGH) and not told:
+        reported = not frame or reason in CHOSEN or reason in known or rejected[reason] > many
+        if counts[reason] >= max(NEARLY_ALL * received, ENOUGH) and not reported:
             lost.setdefault(reason, []).append(frame)
     if not set(accepted).difference(*lost.values()):
         return []
@@ -210,12 +210,12 @@ def sensor_rejections(
 
 
 class Measurements(NamedTuple):
-    """What N Range messages say; the columns are those of `Measurement`.
+    """Measurements of N Range messages; the columns are those of `Measurement`.
 
     Attributes
     ----------
     reason : str, shape (N,)
-        Why a message is rejected, and '' where it is not; then the columns count.
+        Reason for the rejection of each message; '' if it is valid. The other columns are valid only then.
     z, z_max, half_angle, sigma : float64, shape (N,)
     """
 
@@ -226,12 +226,12 @@ class Measurements(NamedTuple):
     sigma: Floats
 
     def select(self, which: NDArray[np.int64]) -> Measurements:
-        """Return those that indices pick."""
+        """Return the measurements with these indices."""
         return Measurements._make(column[which] for column in self)
 
 
 def measure_all(messages: Ranges, parameters: AssociationParameters) -> Measurements:
-    """Apply REP 117 to many messages, as `measure` does to one."""
+    """Apply `measure` to many messages."""
     size = messages.range.shape
     reason = np.array([_of_name(name) for name in messages.frames] or [''], REASON)[messages.frame]
 

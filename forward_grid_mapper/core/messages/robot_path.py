@@ -1,14 +1,14 @@
-"""Where the robot drove, for pictures: a list of points that stays short however long the drive is."""
+"""The path of the robot, for pictures: a list of points of bounded length."""
 
 from __future__ import annotations
 
 import math
 
 STEP = 0.05
-"""Metres between two points, as long as there are few of them: half the edge of a default cell."""
+"""Smallest distance between two points, metres, while there are few: half a default cell."""
 
 MOST_POINTS = 100_000
-"""Points at the most; when there are more, every other one goes."""
+"""Most points; if there are more, every second one is dropped."""
 
 
 class RobotPath:
@@ -19,12 +19,12 @@ class RobotPath:
         self._step = STEP
 
     def clear(self) -> None:
-        """Forget every point."""
+        """Remove all points."""
         self.points.clear()
         self._step = STEP
 
     def extend(self, point: tuple[float, float]) -> None:
-        """Add a point, if it lies far enough from the last one."""
+        """Add a point, if it is far enough from the last one."""
         if self.points and math.dist(self.points[-1], point) <= self._step:
             return
         self.points.append(point)

@@ -1,31 +1,31 @@
-"""Whether the stamps of odometry go on, the clock jumped back, or a single stamp was ahead of the others."""
+"""Checks of stamps of odometry: whether they continue, the clock jumped back, or a single stamp was ahead."""
 
 from __future__ import annotations
 
 from .message_types import NANOSECONDS
 
 JUMP = NANOSECONDS
-"""A stamp older than the newest by more than this means that the clock jumped back, not that messages overtook."""
+"""A stamp older than the newest by more than this means that the clock jumped back; less is a message out of order."""
 
 GOES_ON, WAS_AHEAD, JUMPED_BACK = 'goes on', 'was ahead', 'jumped back'
 
 
 def order_of(stamp: int, newest: int | None, before: int | None) -> str:
-    """Return what a stamp says of those that came before it, nanoseconds.
+    """Return how a stamp, nanoseconds, relates to those before it.
 
-    A clock that jumps back leaves the poses before it behind as well. Where a stamp is behind the newest one alone, and
-    follows those before that, the newest one was wrong.
+    If the clock jumps back, the stamp is before all of them. If it is only before the newest one, and after the one
+    before that, the newest one was wrong.
 
     Parameters
     ----------
     stamp : int
     newest, before : int or None
-        The latest stamp so far, and the one before it; None while there is none.
+        The latest stamp so far, and the one before it; None if there is none.
 
     Returns
     -------
     str
-        `GOES_ON`, `WAS_AHEAD` if the newest stamp is to be forgotten, or `JUMPED_BACK` if all are.
+        `GOES_ON`, `WAS_AHEAD` if the newest stamp must be dropped, or `JUMPED_BACK` if all must.
     """
     if newest is None or stamp >= newest - JUMP:
         return GOES_ON
@@ -33,13 +33,13 @@ def order_of(stamp: int, newest: int | None, before: int | None) -> str:
 
 
 class StampOrder:
-    """The two latest stamps of a stream, and what the next one says of them."""
+    """The two latest stamps of a stream; compares the next one with them."""
 
     def __init__(self) -> None:
         self._latest: list[int] = []
 
     def take(self, stamp: int) -> str:
-        """Take a stamp, nanoseconds; return what `order_of` says of it."""
+        """Add a stamp, nanoseconds; return its `order_of`."""
         before, newest = [None, None, *self._latest][-2:]
         order = order_of(stamp, newest, before)
         if order != GOES_ON:

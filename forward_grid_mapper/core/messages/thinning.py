@@ -1,15 +1,15 @@
-"""Which readings stay when there are more than may be kept: where a sensor looked often, its newest.
+"""Thinning of readings to a bound: of those from the same place and direction, the newest are kept.
 
-Readings of one sensor, from one place and in one direction, are in one *bin*. Every bin keeps its newest `level`
-readings, with one level for all bins, as high as the bound allows. Where not all bins can have one more, or one at all,
-a hash decides which do. So a robot that stands still, or drives the same way again and again, gives up what repeats
-itself, and what was seen once stays. The range has no part in it: with bins by range as well, every stray echo has a
-bin for itself and stays while those that agree go. 12 000 of the simulated corridor's 96 000 readings then give a map
-of F1 .71; without it, .81, as good as the .80 of all of them.
+Readings of one sensor, from one place and in one direction, are in one *bin*. Each bin keeps its newest `level`
+readings, with the same level for all bins, as high as the bound allows. If only some bins can have one more, or one at
+all, a hash decides which. So if a robot stands still, or drives the same way again and again, repeated readings are
+dropped, and single ones stay. The range does not matter: if bins were by range as well, each random echo would have its
+own bin and stay, while those that agree are dropped. Then 12 000 of the 96 000 readings of the simulated corridor give
+a map of F1 0.71; without it, 0.81, as good as the 0.80 of all readings.
 
-What is kept depends on the readings alone and not on when it is decided: thinning twice, with more readings in
-between, keeps what thinning once at the end would have. (A reading is dropped only if enough others rank before it;
-more readings can only move it back.) So the node, which thins as it goes, and a run over the whole drive keep the same.
+The result depends on the readings only, not on when they are thinned: thinning twice, with more readings in between,
+gives the same as once at the end. (A reading is dropped only if enough others rank before it; more readings can only
+lower its rank.) So the node, which thins during the drive, and a run over the whole drive keep the same readings.
 """
 
 from __future__ import annotations
@@ -23,16 +23,16 @@ from numpy.typing import NDArray
 from ..common.readings import Readings
 
 SQUARE = 0.2
-"""Edge in metres of the squares in which sensors count as being in one place."""
+"""Side of the squares within which positions of sensors are one place, metres."""
 
 SECTOR = math.radians(10.0)
-"""Width in radians of the sectors in which axes count as one direction."""
+"""Width of the sectors within which axes of sensors are one direction, radians."""
 
 Words = NDArray[np.uint64]
 
 
 def kept(readings: Readings, bound: int) -> NDArray[np.int64]:
-    """Return the indices, increasing, of the readings that stay when there may be `bound`."""
+    """Return the increasing indices of the readings that are kept, at most `bound`."""
     if len(readings) <= bound:
         return np.arange(len(readings))
     bins = _bins(readings)
@@ -40,17 +40,17 @@ def kept(readings: Readings, bound: int) -> NDArray[np.int64]:
     bins = np.take(bins, order)
     first = np.ones(len(bins), np.bool_)
     first[1:] = bins[1:] != bins[:-1]
-    # these functions let go of the GIL, where np.repeat and indexing do not
+    # these functions release the GIL, while np.repeat and indexing do not
     number = np.arange(len(bins))
     rank = number - np.maximum.accumulate(np.where(first, number, 0))
-    # readings of rank r are the r-th newest of their bins; whole ranks stay until one does not fit
+    # readings of rank r are the r-th newest of their bins; all of a rank are kept until one does not fit
     remaining = bound - np.cumsum(np.bincount(rank))
     level = int(np.count_nonzero(remaining >= 0))
     stay = rank < level
     last = np.flatnonzero(rank == level)
-    left = bound - int(np.count_nonzero(stay))
-    # bins are hashes, so that the smallest are a fair sample, and the same one at every call
-    stay[last[np.argsort(bins[last], kind='stable')[:left]]] = True
+    free = bound - int(np.count_nonzero(stay))
+    # bins are hashes, so the smallest are a random sample, and the same one in each call
+    stay[last[np.argsort(bins[last], kind='stable')[:free]]] = True
     return np.sort(order[stay])
 
 
@@ -62,7 +62,7 @@ def _bins(readings: Readings) -> Words:
 
 
 def _ties(readings: Readings) -> Words:
-    """Return a hash of each reading's values, so that the order of arrival never decides between equal stamps."""
+    """Return a hash of the values of each reading, so that equal stamps are not sorted by arrival."""
     return mixed(np.zeros(len(readings), np.uint64), readings.x, readings.y, readings.yaw, readings.z, readings.sigma)
 
 
@@ -77,7 +77,7 @@ def mixed(seed: Words, *columns: NDArray[np.float64]) -> Words:
     """Return 64 mixed bits of each row (the finaliser of splitmix64, column after column)."""
     mixed = seed
     for column in columns:
-        # + 0.0 makes one zero of two
+        # + 0.0 maps −0 to 0
         mixed = mixed ^ (column + 0.0).view(np.uint64)
         mixed = (mixed ^ (mixed >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
         mixed = (mixed ^ (mixed >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)

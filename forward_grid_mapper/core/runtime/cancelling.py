@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from ..common.errors import Cancelled
 
 NEVER = np.zeros(1, np.uint8)
-"""A `stop` that nobody sets."""
+"""A `stop` that is never set."""
 
 
 def check(stop: NDArray[np.uint8]) -> None:

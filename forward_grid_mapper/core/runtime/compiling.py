@@ -1,4 +1,4 @@
-"""Whether kernels are compiled just now, rather than found in the cache."""
+"""Tells whether kernels are being compiled, that is, were not found in the cache."""
 
 from __future__ import annotations
 
@@ -11,20 +11,20 @@ events: Any = event
 
 
 class _Compilations(events.Listener):  # type: ignore[misc]
-    """Counts compilations: those begun, and those that run. Kernels may be compiled in several threads."""
+    """Counts compilations that were begun, and those that are running; several threads may compile."""
 
     def __init__(self) -> None:
         self.begun = self.running = 0
         self._lock = threading.Lock()
 
     def on_start(self, event: Any) -> None:
-        """Note the begin of a compilation."""
+        """Count the begin of a compilation."""
         with self._lock:
             self.begun += 1
             self.running += 1
 
     def on_end(self, event: Any) -> None:
-        """Note its end."""
+        """Count its end."""
         with self._lock:
             self.running -= 1
 
@@ -39,5 +39,5 @@ def compiling() -> bool:
 
 
 def count() -> int:
-    """Return how many compilations this process has begun; a kernel that calls another begins two."""
+    """Return the number of compilations that this process has begun; two for a kernel that calls another one."""
     return _compilations.begun

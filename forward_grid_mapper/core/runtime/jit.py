@@ -1,4 +1,4 @@
-"""Compilation of kernels: always without the GIL, cached on disk wherever a cache can be kept."""
+"""Compilation of kernels with numba: they release the GIL, and are cached on disk if there is a writable folder."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ CORE = Path(__file__).parents[1]
 PREFIX = 'kernels_'
 
 UNUSED = 24 * 3600
-"""Seconds after its last start from which on machine code of other sources is removed; a process that runs longer has
-all of its kernels in memory."""
+"""Machine code of other sources is removed so many seconds after its last use at a start; a process that runs longer
+has all its kernels in memory."""
 
 
 def _writable(folder: Path) -> bool:
@@ -37,11 +37,11 @@ def _writable(folder: Path) -> bool:
 
 
 def _cache_folder() -> str:
-    """Return the folder for machine code of these very sources.
+    """Return the folder for the machine code of exactly these sources.
 
-    Numba renews a kernel when its own file changes, but not when a kernel that it calls does; so the folder's name
-    depends on all sources. It lies beside them, in the user's cache where they are read-only, or in a temporary folder
-    where the home is as well, which still spares later starts the compilation.
+    Numba compiles a kernel again if its own file changes, but not if a kernel that it calls does. So the name of the
+    folder depends on all sources. It is beside them, or in the user's cache if they are read-only, or in a temporary
+    folder if that is read-only, too; this still saves the compilation at later starts.
     """
     sources = b''.join(path.read_bytes() for path in sorted(CORE.rglob('*.py')))
     name = f'{PREFIX}{hashlib.sha256(sources).hexdigest()[:16]}'
@@ -52,7 +52,7 @@ def _cache_folder() -> str:
     shared = Path(tempfile.gettempdir()) / f'forward_grid_mapper_{os.getuid()}'
     shared.mkdir(mode=0o700, exist_ok=True)
     owner = shared.lstat()
-    # machine code is run as it is found, so it must not be possible for others to have put it there
+    # machine code is executed without checks, so other users must not be able to write there
     if owner.st_uid != os.getuid() or owner.st_mode & 0o077 or shared.is_symlink():
         shared = Path(tempfile.mkdtemp(prefix='forward_grid_mapper_'))
     return str(shared / name)
@@ -62,7 +62,7 @@ def _remove_unused(cache: Path) -> None:
     """Remove the machine code of other sources beside `cache` that no process has started with for a day."""
     with suppress(OSError):
         cache.mkdir(parents=True, exist_ok=True)
-        # numba reads the folder, and does not touch it
+        # numba only reads, which does not change the time of the folder
         os.utime(cache)
         for other in cache.parent.glob(f'{PREFIX}*'):
             if other != cache and time.time() - other.stat().st_mtime > UNUSED:
@@ -74,7 +74,7 @@ _remove_unused(Path(CACHE))
 
 
 def _compiled(function: F, **options: Any) -> F:
-    # without wrappers for C, from which nothing calls a kernel
+    # without C wrappers, since kernels are not called from C
     options = {'cache': True, 'nogil': True, 'error_model': 'numpy', 'no_cfunc_wrapper': True, **options}
     before, config.CACHE_DIR = config.CACHE_DIR, CACHE
     try:
@@ -85,15 +85,15 @@ def _compiled(function: F, **options: Any) -> F:
 
 
 def kernel(function: F) -> F:
-    """Compile `function` at its first call, free of the GIL; keep the machine code on disk.
+    """Compile `function` at its first call, without the GIL; the machine code is cached on disk.
 
-    A kernel borrows the arrays of its caller: it neither makes any nor counts references, which would take longer than
-    the work where a tuple of many arrays is handed to a function for each reading. If it returns arrays, then only to
-    other kernels of this kind.
+    A kernel borrows the arrays of its caller: it allocates none and counts no references. Counting would take longer
+    than the work if a tuple of many arrays is passed to a function for each reading. It may return arrays only to other
+    kernels of this kind.
     """
     return _compiled(function, _nrt=False)
 
 
 def allocating_kernel(function: F) -> F:
-    """Do as `kernel` does, for a function that makes arrays."""
+    """Do the same as `kernel`, for a function that allocates arrays."""
     return _compiled(function)

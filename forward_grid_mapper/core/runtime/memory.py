@@ -1,7 +1,7 @@
-"""How much memory a run of EM takes without its pairs, and how much there is.
+"""The memory that a run of EM needs without pairs, and the memory that is free.
 
-Linux grants more memory than it has and ends the process that uses it. A run that cannot fit must therefore not begin,
-or it takes the readings and the live map with it.
+Linux grants more memory than there is, and kills the process that uses it (overcommit). So a run that does not fit must
+not begin, or readings and live map would be lost as well.
 """
 
 from __future__ import annotations
@@ -13,51 +13,51 @@ from pathlib import Path
 from ..common.parameters import Parameters
 
 BYTES_A_READING = 400
-"""What the search keeps for a reading without its pairs, twice over where arrays are sorted or grow."""
+"""Bytes of the search for each reading, without pairs; twice as much as stored, because arrays are sorted and grow."""
 
 BYTES_A_CELL = 104
-"""What a run on one thread takes for a cell at its peak, when the maps are collected: three maps, the evidence, the
-prior, and the sums that surface normals or passed readings are counted in."""
+"""Bytes of a single-threaded run for each cell at its peak, when the final maps are made: three maps, evidence, prior,
+and the sums for surface normals or passed readings."""
 
 BYTES_A_CELL_AND_THREAD = 32
-"""What another thread takes for a cell at its peak: the four sums of readings that passed."""
+"""Bytes of each further thread for each cell at its peak: the four sums of passed readings."""
 
 THREAD_MEMORY = 64_000_000
-"""Bytes that all threads but the first may take together. Where an array for each of them would be more, on maps of
-some hundred thousand cells and more, fewer threads work; the maps are the same."""
+"""Most bytes of all threads but the first. On maps of some hundred thousand cells and more, arrays for all threads
+would be more, so fewer threads are used; the maps are the same."""
 
 CGROUP, OWN_CGROUPS = Path('/sys/fs/cgroup'), Path('/proc/self/cgroup')
-"""Where control groups are, and the file that names those of this process."""
+"""Folder of control groups, and the file with those of this process."""
 
 NO_LIMIT = 1 << 60
-"""A limit of so many bytes or more is none: v1 writes a large number."""
+"""A limit of so many bytes or more means no limit: v1 has a large number."""
 
 
 def least_memory(cells: int, readings: int, threads: int) -> int:
-    """Return the bytes that EM of so many readings on so many cells takes at its peak, without memory for pairs."""
+    """Return the bytes that EM needs at its peak, without pairs."""
     of_threads = min((threads - 1) * cells * BYTES_A_CELL_AND_THREAD, THREAD_MEMORY)
     return cells * BYTES_A_CELL + readings * BYTES_A_READING + of_threads
 
 
 def memory_for_pairs(parameters: Parameters) -> float:
-    """Return the bytes that pairs may take: what the parameters admit, or what is free if that is less."""
+    """Return the bytes that pairs may take: the limit of the parameters, or half of the free memory if that is less."""
     free = free_memory()
     asked = parameters.search.max_memory * 1e6
-    # half of it, since others live here as well
+    # half of it, since other processes need memory as well
     return asked if free is None else min(asked, free / 2)
 
 
 def free_memory() -> int | None:
-    """Return the bytes that this process can still take: of the machine, its control group, and its own limit.
+    """Return the bytes that this process can still allocate, by the machine, its control group, and its own limit.
 
-    None where none of them is known.
+    None if none of them is known.
     """
     known = [value for value in (_of_the_machine(), _of_the_group(), _of_the_process()) if value is not None]
     return max(min(known), 0) if known else None
 
 
 def shortage(cells: int, readings: int, threads: int) -> str:
-    """Return why EM of so many readings on so many cells cannot fit the memory; empty if it may."""
+    """Return why EM of so many readings on so many cells does not fit into the memory; empty if it may."""
     free, needed = free_memory(), least_memory(cells, readings, threads)
     if free is None or needed <= free:
         return ''
@@ -78,13 +78,13 @@ def _of_the_process() -> int | None:
 
 
 def _of_the_group() -> int | None:
-    """Return how many bytes the control groups (v1 or v2) of this process leave, None if unlimited."""
+    """Return the free bytes in the control groups (v1 or v2) of this process; None if unlimited."""
     left = [_left_in(folder, *names) for folder, names in _groups()]
     return min((value for value in left if value is not None), default=None)
 
 
 def _groups() -> Iterator[tuple[Path, tuple[str, str, str]]]:
-    """Yield the folders of the control groups, and the names there of limit, use and reclaimable memory."""
+    """Yield the folders of the control groups, and the names of limit, usage and reclaimable memory in them."""
     second = 'memory.max', 'memory.current', 'inactive_file'
     first = 'memory.limit_in_bytes', 'memory.usage_in_bytes', 'total_inactive_file'
     yield CGROUP, second
@@ -109,7 +109,7 @@ def _left_in(folder: Path, limit: str, use: str, reclaimable: str) -> int | None
             return None
     except (OSError, ValueError):
         return None
-    # the use includes the page cache, which the kernel can reclaim
+    # the usage includes the page cache, which the kernel can reclaim
     return int(most) - max(used - (_number(folder / 'memory.stat', reclaimable) or 0), 0)
 
 
@@ -119,7 +119,7 @@ def _kilobytes(path: Path, key: str) -> int | None:
 
 
 def _number(path: Path, key: str) -> int | None:
-    """Return the number behind a key in a file that has one a line."""
+    """Return the number after a key in a file with one key on each line."""
     try:
         words = [line.split() for line in path.read_text().splitlines()]
         return next(int(line[1]) for line in words if len(line) > 1 and line[0] == key)
@@ -128,5 +128,5 @@ def _number(path: Path, key: str) -> int | None:
 
 
 def _words(size: float) -> str:
-    """Return bytes in words."""
+    """Return a number of bytes as text."""
     return f'{size / 1e9:.1f} GB' if size >= 1e9 else f'{size / 1e6:.0f} MB'

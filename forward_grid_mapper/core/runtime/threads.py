@@ -1,4 +1,4 @@
-"""Work shared out to the cores: kernels let go of the GIL, so plain threads do."""
+"""Parallel work on all cores: kernels release the GIL, so plain threads are enough."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
 LEAST_PART = 5000
-"""Readings below which a thread is not worth its while."""
+"""Fewest readings for which another thread saves time."""
 
 
 def cores() -> int:
@@ -17,14 +17,14 @@ def cores() -> int:
 
 
 def parts(begin: int, end: int, threads: int) -> list[tuple[int, int]]:
-    """Cut a range of readings into at most `threads` parts of equal length, of LEAST_PART at least."""
+    """Divide a range of readings into at most `threads` parts of equal length, each of at least LEAST_PART."""
     n = max(min(threads, (end - begin) // LEAST_PART), 1)
     edges = [begin + (end - begin) * k // n for k in range(n + 1)]
     return list(itertools.pairwise(edges))
 
 
 def run_each(work: list[Callable[[], None]]) -> None:
-    """Run all of `work`, each in a thread of its own, and wait for it; raise what the first one raised."""
+    """Run each of `work` in its own thread, and wait for all; raise the exception of the first one that failed."""
     if len(work) == 1:
         work[0]()
         return

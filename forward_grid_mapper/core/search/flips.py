@@ -1,4 +1,4 @@
-"""Flips of single cells: which of them gain, and many of them at once or one after the other."""
+"""Flips of single cells: finding those that gain, and flipping many at once or one after the other."""
 
 from __future__ import annotations
 
@@ -17,27 +17,27 @@ from .prior import Prior, prior_gain
 
 @kernel
 def gain_of(s: State, prior: Prior, c: int) -> float:
-    """Return what flipping cell c gains, prior included, in nats."""
+    """Return the gain of flipping cell c, including the prior, nats."""
     data = s.maps.evidence[c] * s.model.nats
     return float(data + prior_gain(prior, s.maps.occupied, s.maps.pattern, c, s.lattice.width))
 
 
 WORTH_WAITING = 0.5
-"""Fraction of the gain it had when the update began that a cell must still have to be flipped in the same update."""
+"""A cell is flipped if it still gains at least this fraction of its gain at the begin of the update."""
 
 
 Least = tuple[float, float]
-"""Nats that a flip must gain, and what it must gain more for every reading that sees the cell."""
+"""Nats that a flip must gain, and nats that it must gain in addition for each reading that observes the cell."""
 
 
 @kernel
 def least_gain(s: State, least: Least, c: int) -> float:
-    """Return what flipping cell c must gain, nats."""
+    """Return the least gain of a flip of cell c, nats."""
     return float(least[0] + least[1] * s.maps.seen[c])
 
 
 BLOCK = 64
-"""Cells of a row that are looked at together."""
+"""Cells of a row that are tested together."""
 
 
 @kernel
@@ -45,21 +45,21 @@ def any_above(evidence: Any, occupied: Any, pattern: Any, floor: Any, begin: int
     """Return whether any of some cells has evidence above `floor`, or is occupied, or has an occupied neighbour."""
     found = 0
     for c in range(np.uint64(begin), np.uint64(end)):
-        # without a branch, so that the compiler makes vector instructions of it
+        # without a branch, so that the compiler vectorises it
         found |= (evidence[c] > floor) | (occupied[c] != 0) | (pattern[c] != 0)
     return found != 0
 
 
 @kernel
 def promising(s: State, prior: Prior, least: Least, window: tuple[int, int, int, int], cells: Any, gains: Any) -> int:
-    """List the cells whose flip gains more than `least`, and what they gain; return their number.
+    """List the cells whose flip gains more than `least`, and the gains; return their number.
 
-    `window` is where to look: first row, last one plus one, and columns likewise.
+    `window` has begin and end of the rows, and of the columns.
     """
     maps, width = s.maps, s.lattice.width
     occupied, evidence, seen, pattern = maps.occupied, maps.evidence, maps.seen, maps.pattern
-    # what the readings must say at least of a free cell without neighbours, since the prior of none is above 0; of
-    # nearly all they say less, and these need no second look
+    # least evidence for a flip of a free cell without neighbours, since its prior is at most 0; nearly all have less,
+    # and are skipped
     floor = np.int64((least[0] - prior.shape[0]) / s.model.nats) - 1
     n = 0
     for row in range(window[0], window[1]):
@@ -86,9 +86,9 @@ def promising(s: State, prior: Prior, least: Least, window: tuple[int, int, int,
 
 @allocating_kernel
 def highest(s: State, cells: NDArray[np.int64], gains: Floats, workspace: Floats) -> NDArray[np.bool_]:
-    """Return which of `cells` gain more than those of their eight neighbours that gain as well; of equals, the first.
+    """Return which of `cells` have the largest gain among their eight neighbours; of equal ones, the first.
 
-    `workspace` (float64, shape (cells of the map,)) must be 0, and is left so.
+    `workspace` (float64, shape (cells of the map,)) must be 0, and is 0 afterwards.
     """
     height, width = s.lattice.height, s.lattice.width
     for i in range(len(cells)):
@@ -106,7 +106,7 @@ def highest(s: State, cells: NDArray[np.int64], gains: Floats, workspace: Floats
 
 @kernel
 def _flip_above(s: State, prior: Prior, cells: NDArray[np.int64], needed: Floats) -> tuple[int, float]:
-    """Flip those of `cells`, in order, that gain more than `needed` when it is their turn."""
+    """Flip those of `cells`, in order, that gain more than `needed` after the flips before."""
     flips, total = 0, 0.0
     for i in range(len(cells)):
         if s.stop[0]:
@@ -122,13 +122,13 @@ def _flip_above(s: State, prior: Prior, cells: NDArray[np.int64], needed: Floats
 def flip_in_order(s: State, prior: Prior, least: Least, cells: NDArray[np.int64], gains: Floats) -> tuple[int, float]:
     """Flip those of `cells`, in order, that still gain enough; return their number and total gain.
 
-    `gains` is what they gained when the update began. A cell that lost much of that since, to the flip of another one,
-    waits for the next update, where it may find itself behind a better one.
+    `gains` are those at the begin of the update. A cell that lost much of its gain by the flip of another one is left
+    to the next update, in which a better cell may come first.
     """
     return _flip_above(s, prior, cells, np.maximum(least[0] + least[1] * s.maps.seen[cells], WORTH_WAITING * gains))
 
 
 def free_unneeded(s: State, prior: Prior, least: Least, cells: NDArray[np.int64]) -> tuple[int, float]:
-    """Free those of `cells`, occupied ones, that cost nothing but rounding to free; return their number and gain."""
+    """Free those of some occupied `cells` that can be freed without loss, within rounding; return number and gain."""
     cells = cells[s.maps.seen[cells] > 0]
     return _flip_above(s, prior, cells, np.nextafter(-least[1] * s.maps.seen[cells], -np.inf))

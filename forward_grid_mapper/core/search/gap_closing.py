@@ -1,15 +1,15 @@
-"""Moves of whole walls: gaps between two ends are closed at once, and short walls are removed at once.
+"""Moves of whole walls: closing gaps between two ends, and removing short walls, each in one step.
 
-Each cell of a gap costs more than it gains, as long as the next one is missing, so single flips never close it. A gap
-is a straight run of free cells between two ends of walls. The run leads away from the neighbours of both ends. The
-readings may speak against it, but only so much: `MOST_AGAINST_METRE` for each metre, and `MOST_AGAINST_GAP` in all.
-Where a gap is so wide that a robot might go through, `MOST_AGAINST_PASSAGE` is the bound: the readings that went
-through a door speak against a wall there.
+Each single cell of a gap costs more than it gains while the next one is free, so single flips never close it. A gap is
+a straight run of free cells between two ends of walls, and leads away from the neighbours of both ends. The evidence of
+readings against it may be at most `MOST_AGAINST_METRE` for each metre, and `MOST_AGAINST_GAP` in total. If the gap is
+so wide that a robot could drive through, the total is `MOST_AGAINST_PASSAGE`, since readings that passed a door are
+evidence against a wall there.
 
-Likewise, to free one cell of a short wall saves next to nothing, as long as the rest of it stands, since the rest has
-two ends as well. A short wall is a set of up to `SHORT_WALL` of occupied cells that touch each other and no others.
+Likewise, freeing one cell of a short wall gains almost nothing, since the rest has two ends as well. A short wall is a
+connected set of occupied cells of at most `SHORT_WALL`.
 
-Either move must raise the objective. All lengths are in metres, so that a finer lattice has the same gaps.
+Both moves must increase the objective. All lengths are in metres, so that gaps do not depend on the cell size.
 """
 
 from __future__ import annotations
@@ -68,9 +68,9 @@ def _may_close(s: State, prior: Prior, c: int, dx: int, dy: int) -> bool:
 
 @kernel
 def _path(s: State, c: int, dx: int, dy: int, up: bool, path: Any) -> bool:
-    """Write the cells between c and the cell at (dx, dy) from it; return whether a wall may stand on them.
+    """Write the cells between c and the cell at (dx, dy) from it; return whether a wall is possible there.
 
-    Where the line passes midway between two cells, `up` takes the one of the larger row and column.
+    If the line passes midway between two cells, `up` takes the one of the larger row and column.
     """
     width = s.lattice.width
     n = max(abs(dx), abs(dy))
@@ -111,14 +111,14 @@ def _is_gap(s: State, prior: Prior, gap: Any, path: Any) -> bool:
 
 @kernel
 def _list_gaps(s: State, prior: Prior, cells: NDArray[np.int64], n: int, gaps: Any, paths: Any) -> int:
-    """List the gaps of length n that may be closed; return their number, of which `gaps` and `paths` hold the first.
+    """List the gaps of length n that may be closed; return their number, also if it is more than fits into `gaps`.
 
     Parameters
     ----------
     gaps : int64, shape (most, 4)
-        The cell at one end, the way to the other one, and 1 where cells midway are taken `up`.
+        The cell at one end, the offset (dx, dy) of the other one, and 1 for `up` of `_path`.
     paths : int64, shape (most + 1, n - 1)
-        The cells between. The last row is to work in.
+        The cells between. The last row is a workspace.
     """
     m, most = 0, len(gaps)
     for c in cells:
@@ -148,11 +148,11 @@ def _flip_sets(s: State, prior: Prior, least: Least, cells: Any, starts: Any, ke
     cells : int64
         The cells of all sets.
     starts : int64, shape (sets + 1,)
-        Where those of each set begin, and where the last one ends.
+        Index at which each set begins, and at which the last one ends.
     keep : bool
         Whether sets that gain enough stay flipped; others are flipped back.
     gains : float64, shape (sets,)
-        Filled with what each set gains, 0 where that is not enough.
+        Output: the gain of each set, 0 if that is not enough.
     """
     for k in range(len(starts) - 1):
         begin, end = starts[k], starts[k + 1]
@@ -172,16 +172,16 @@ def _flip_sets(s: State, prior: Prior, least: Least, cells: Any, starts: Any, ke
 
 @kernel
 def _close(s: State, prior: Prior, least: Least, gaps: Any, paths: Any, starts: Any, gains: Any) -> None:
-    """Close gaps of one length in turn, those that still are some and still gain.
+    """Close gaps of one length one after the other, if they are still gaps and still gain.
 
     Parameters
     ----------
     gaps, paths
-        Those of `_list_gaps`, in the order in which they are closed.
+        From `_list_gaps`, in the order in which they are closed.
     starts : int64, shape (2,)
-        0 and the cells of a gap.
+        0, and the number of cells of a gap.
     gains : float64, shape (gaps,)
-        Filled as by `_flip_sets`.
+        Output, as in `_flip_sets`.
     """
     for k in range(len(gaps)):
         gains[k] = 0.0
@@ -198,7 +198,7 @@ def _gain_of_sets(
 
 
 def _gaps(s: State, prior: Prior, cells: NDArray[np.int64], n: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return what `_list_gaps` lists of gaps and their cells, all of them."""
+    """Return all gaps of length n and their cells, as in `_list_gaps`."""
     most = 1024
     while True:
         gaps, paths = np.empty((most, 4), np.int64), np.empty((most + 1, n - 1), np.int64)
@@ -209,10 +209,10 @@ def _gaps(s: State, prior: Prior, cells: NDArray[np.int64], n: int) -> tuple[NDA
 
 
 def close_gaps(s: State, prior: Prior, least: Least, cells: NDArray[np.int64], longest: int) -> tuple[int, float]:
-    """Close the gaps that gain, the shortest first, and of one length the one first that gains most.
+    """Close the gaps that gain, the shortest first, and among those of one length the largest gain first.
 
-    So what is closed does not depend on the order of cells, which differs in a mirrored map. Returns the number of
-    flips and the total gain.
+    So the result does not depend on the order of cells, which differs in a mirrored map. Returns the number of flips
+    and the total gain.
 
     Parameters
     ----------
@@ -225,7 +225,7 @@ def close_gaps(s: State, prior: Prior, least: Least, cells: NDArray[np.int64], l
     for n in range(2, longest + 1):
         gaps, paths = _gaps(s, prior, cells, n)
         if not len(gaps) and n > 2:
-            # the first length goes on without gaps as well, so that one run of the search has called every kernel
+            # the first length continues even without gaps, so that each search calls, and compiles, all kernels
             continue
         gains = _gain_of_sets(s, prior, least, paths.ravel(), np.arange(len(gaps) + 1) * (n - 1), False)
         order = np.argsort(-gains, kind='stable')[: int((gains > 0.0).sum())]
@@ -238,9 +238,9 @@ def close_gaps(s: State, prior: Prior, least: Least, cells: NDArray[np.int64], l
 
 @kernel
 def _connected(s: State, reached: Any, wall: Any) -> int:
-    """List all occupied cells that are connected to the first one of `wall`, by any neighbours; return their number.
+    """List all occupied cells that are 8-connected to the first one of `wall`; return their number.
 
-    Sets them in `reached` (uint8, shape (cells,)).
+    They are set in `reached` (uint8, shape (cells,)).
     """
     height, width = s.lattice.height, s.lattice.width
     reached[wall[0]] = 1
@@ -260,16 +260,16 @@ def _connected(s: State, reached: Any, wall: Any) -> int:
 
 @kernel
 def _list_short_walls(s: State, cells: NDArray[np.int64], longest: int, reached: Any, walls: Any, starts: Any) -> int:
-    """List the cells of all walls of 2 to `longest` cells, and where those of each wall begin; return their number.
+    """List the cells of all walls of 2 to `longest` cells; return the number of walls.
 
     Parameters
     ----------
     reached : uint8, shape (cells of the map,)
-        To work in; all 0.
+        Workspace; all 0.
     walls : int64
-        As long as there are occupied cells.
+        Output: the cells; as long as the number of occupied cells.
     starts : int64
-        One longer; the entry after the last wall is where that one ends.
+        Output, one longer: index at which each wall begins, and at which the last one ends.
     """
     n, end = 0, 0
     starts[0] = 0

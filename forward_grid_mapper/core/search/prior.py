@@ -1,14 +1,14 @@
-"""The prior of a map: how likely cells are occupied, given what was traversed and given their neighbours.
+"""The prior of a map: a Markov random field of occupied cells, given their neighbours and the traversed cells.
 
-    log p(m) = Σ over occupied cells c of [ local(c) + shape(the occupied ones of its eight neighbours) ]
+    log p(m) = Σ over occupied cells c of [ local(c) + shape(pattern of the occupied ones of its eight neighbours) ]
 
 The search uses two priors, one after the other. In the first, cells are independent, as in the paper: an occupied cell
-has the log odds of `prior`, and its neighbours do not matter. In the second, walls are curves: a curve costs
-`wall_cost` for each metre and `end_cost` for each of its two ends. A cell with two occupied neighbours on opposite
-sides is inside a curve; any other cell is an end; a cell without neighbours is a curve with both ends in one cell. A
-corner of less than 135° costs as much as an end. Both costs are the same in cells of any size.
+has the log odds of `prior`. In the second, walls are curves: a curve costs `wall_cost` for each metre and `end_cost`
+for each of its two ends. A cell with two occupied neighbours on opposite sides is inside a curve; any other cell is an
+end; a cell without neighbours is a curve with both ends in one cell. A corner of less than 135° costs as much as an
+end. Both costs do not depend on the cell size.
 
-No sensor moves through a wall. So traversed cells are never occupied.
+No sensor moves through a wall, so traversed cells are never occupied.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ from ..runtime.jit import allocating_kernel, kernel
 from ..sensor.cone_table import Floats
 
 OPPOSITE_ENOUGH = 3
-"""Eighths of a turn between two neighbours that a curve can pass through: 135°, so that a curve on the lattice may run
-in any direction, but may not turn a corner."""
+"""Least angle between two neighbours of a cell inside a curve, eighths of a turn: 135°, so that a curve on the lattice
+may have any direction, but no corner."""
 
 
 class Prior(NamedTuple):
@@ -36,9 +36,9 @@ class Prior(NamedTuple):
     Attributes
     ----------
     local : float64, shape (cells,)
-        Of each cell by itself; not above 0, but for occupied cells that must stay.
+        Of each cell alone; at most 0, except for occupied cells that must not change.
     shape : float64, shape (256,)
-        What the pattern of occupied neighbours adds; bit k stands for the neighbour k eighths of a turn from east.
+        Of each pattern of occupied neighbours; bit k stands for the neighbour k eighths of a turn from the x axis.
     """
 
     local: Floats
@@ -46,7 +46,7 @@ class Prior(NamedTuple):
 
 
 def has_walls(parameters: SearchParameters) -> bool:
-    """Return whether there is a prior of walls; without one, cells are independent, as in the paper."""
+    """Return whether there is a prior for walls; without one, cells are independent, as in the paper."""
     return parameters.end_cost > 0
 
 
@@ -56,25 +56,25 @@ def independent_prior(parameters: SearchParameters, traversed: NDArray[np.bool_]
     Parameters
     ----------
     parameters : SearchParameters
-        Of which `prior` counts.
+        `prior` is used.
     traversed : bool, shape (cells,)
-        Cells over which a sensor was moved.
+        Cells that the robot traversed.
     """
     odds = math.log(parameters.prior / (1 - parameters.prior))
     return Prior(_local(odds, traversed), np.zeros(256))
 
 
 def wall_prior(parameters: SearchParameters, traversed: NDArray[np.bool_], resolution: float) -> Prior:
-    """Return the prior of walls; that of independent cells where `has_walls` denies it.
+    """Return the prior for walls, or that of independent cells if `has_walls` is false.
 
     Parameters
     ----------
     parameters : SearchParameters
-        Of which `wall_cost` and `end_cost` count.
+        `wall_cost` and `end_cost` are used.
     traversed : bool, shape (cells,)
-        Cells over which a sensor was moved.
+        Cells that the robot traversed.
     resolution : float
-        Edge length of a cell, metres.
+        Cell size, metres.
     """
     if not has_walls(parameters):
         return independent_prior(parameters, traversed)
@@ -82,7 +82,7 @@ def wall_prior(parameters: SearchParameters, traversed: NDArray[np.bool_], resol
 
 
 def _ends() -> Floats:
-    """Return how many ends of a wall each of the 256 patterns leaves."""
+    """Return the number of ends of a wall in a cell with each of the 256 patterns of neighbours."""
     out = np.ones(256)
     out[0] = 2.0
     for pattern in range(1, 256):
@@ -96,8 +96,8 @@ _ENDS = _ends()
 
 
 def shapes(end_cost: float) -> Floats:
-    """Return what each of the 256 patterns adds to the log prior odds of an occupied cell, nats."""
-    # 0, rather than −0, where there is no end
+    """Return `Prior.shape`, the log prior odds by each of the 256 patterns, nats."""
+    # 0, not −0, if there is no end
     return 0.0 - end_cost * _ENDS
 
 
@@ -108,7 +108,7 @@ def _local(odds: float, traversed: NDArray[np.bool_]) -> Floats:
 
 @kernel
 def prior_gain(prior: Prior, occupied: NDArray[np.uint8], pattern: NDArray[np.uint8], c: int, width: int) -> float:
-    """Return what flipping cell c adds to the log prior."""
+    """Return the change of the log prior by flipping cell c."""
     own = pattern[c]
     gain = prior.local[c] + prior.shape[own]
     if own:
@@ -130,7 +130,7 @@ def prior_gains(prior: Prior, occupied: NDArray[np.uint8], pattern: NDArray[np.u
 
 
 def odds_given_neighbours(prior: Prior, occupied: NDArray[np.bool_]) -> Floats:
-    """Return the log prior odds of each cell given the rest of a map, in nats, shape (cells,).
+    """Return the log prior odds of each cell given the rest of a map, nats, shape (cells,).
 
     Parameters
     ----------

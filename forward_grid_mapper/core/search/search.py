@@ -1,24 +1,24 @@
-"""The search for the maximum likelihood map: EM with flips in both directions, and moves.
+"""The search for the maximum likelihood map: EM with flips in both directions, and block moves.
 
-What is called EM here is iterated conditional modes (ICM) with block moves. The causes of the readings are summed out,
-so every step climbs the exact marginal likelihood.
+In other terms, this is iterated conditional modes (ICM) with block moves. The causes of the readings are marginalised,
+so each step increases the exact marginal likelihood.
 
-*Parallel updates* come first: all cells flip at once that gain, and gain more than their neighbours. They begin with
-far too many occupied cells and thin them out. This leads to better maps than adding one cell at a time, and takes a few
-passes over the readings. When they no longer help, *sequential updates* go over the cells that gain, the most promising
-first, until no single flip gains. *Block moves* follow: occupied cells move to neighbours in one step. Sequential
-updates and block moves alternate until neither gains. Ties keep the state, except at the end: occupied cells that
-nothing needs are freed.
+*Parallel updates* come first: all cells whose flip gains, and gains more than those of their neighbours, are flipped at
+once. At first far too many cells become occupied, and then they are thinned out. This gives better maps than adding one
+cell at a time, and takes a few passes over the readings. When they no longer help, *sequential updates* flip single
+cells, those with the largest gain first, until no flip gains. *Block moves* follow: occupied cells move to neighbours
+in one step. Sequential updates and block moves alternate until neither gains. Cells without gain or loss keep their
+state, except at the end: then unneeded occupied cells are freed.
 
-All this happens twice: at first as if the cells of a map were independent, then, from the map found so, with the prior
-of walls (`prior`). The second part also closes gaps in walls, and removes short walls, when nothing else gains
-(`gap_closing`). In either part the objective
+This is done twice: at first with independent cells, then, from the resulting map, with the prior for walls (`prior`).
+The second part also closes gaps in walls, and removes short walls, when nothing else gains (`gap_closing`). In each
+part the objective
 
     J(m) = γ log p(Z | m) + log p(m)
 
-never falls. γ is the likelihood exponent: readings are not independent of each other, so together they say less than
-their sum (a tempered likelihood). At no time are traversed cells occupied. At the end no single flip raises J by more
-than `LEAST_GAIN` and `ROUNDING` for each of the cell's readings.
+never decreases. γ is the likelihood exponent: readings are correlated, so their likelihood is tempered. Traversed cells
+are never occupied. At the end, no single flip increases J by more than `LEAST_GAIN` plus `ROUNDING` for each reading of
+the cell.
 """
 
 from __future__ import annotations
@@ -41,28 +41,28 @@ from ..sensor.cone_table import Floats
 from .flips import flip_in_order, free_unneeded, highest, promising
 from .gap_closing import close_gaps, remove_short_walls
 from .prior import Prior, has_walls, independent_prior, log_prior, wall_prior
-from .shifts import best_shifts, see_any, shift_in_order, try_shifts, unsettle
+from .shifts import best_shifts, mark_observing, shift_in_order, try_shifts, unsettle
 
 LEAST_GAIN = 1e-4
 """Nats that a flip must gain."""
 
 ROUNDING = 2e-7
-"""Nats that it must gain in addition for each of the cell's readings: what float32 ratios may be off, so that the
-search cannot go round, not even where ten thousand readings are off to the same side."""
+"""Nats that it must gain in addition for each reading of the cell: the error of float32 ratios, so that the search
+cannot cycle, not even if ten thousand readings have the same error."""
 
 LEAST = (LEAST_GAIN, ROUNDING)
 
 FEW = 32
-"""Flips of a parallel update below which sequential ones are faster."""
+"""Fewest flips of a parallel update; with fewer, sequential ones are faster."""
 
 
 LITTLE = 0.005
-"""Fraction of all gain so far that a parallel update must add for another one to follow."""
+"""Another parallel update follows if the last one added more than this fraction of the total gain."""
 
 
 @dataclass(frozen=True)
 class Progress:
-    """Where a search stands: iterations done, flips and moves made so far, gain in nats since the start."""
+    """The state of a search: iterations, flips and moves so far, and gain since the start, nats."""
 
     iterations: int
     flips: int
@@ -72,22 +72,21 @@ class Progress:
 
 @dataclass(frozen=True)
 class SearchResult:
-    """The map found, and how.
+    """The map that was found, and data about the search.
 
     Attributes
     ----------
     occupied : uint8, shape (cells,)
-        1 occupied, 0 free; cells that no reading touches are 0.
+        1 occupied, 0 free or in no cone.
     evidence : float64, shape (cells,)
-        γ [log p(Z | cell occupied, rest of the map) − log p(Z | cell free, rest of the map)] in nats, 0 where
-        untouched.
+        γ [log p(Z | cell occupied, rest of the map) − log p(Z | cell free, rest of the map)], nats; 0 if in no cone.
     prior : Prior
-        That which the map was found with.
+        The one that the map was found with.
     log_prior : float
-        That of the map, up to a constant.
+        Of the map, up to a constant.
     progress : Progress
     converged : bool
-        False when `max_iterations` ended the search.
+        False if `max_iterations` ended the search.
     """
 
     occupied: NDArray[np.uint8]
@@ -102,7 +101,7 @@ Watch = Callable[[Progress], None]
 
 
 class Search:
-    """One search; its map so far is `evidence.state.maps.occupied`, which another thread may read at any time."""
+    """One search. Its present map is `evidence.state.maps.occupied`, which another thread may read at any time."""
 
     def __init__(
         self,
@@ -113,18 +112,18 @@ class Search:
         hold: bool = False,
         shifts: bool = True,
     ) -> None:
-        """Start from the map that `evidence` has.
+        """Start from the map in `evidence`.
 
         Parameters
         ----------
         evidence : Evidence
         parameters : SearchParameters
         traversed : bool, shape (cells,), optional
-            Cells over which sensors were moved.
+            Cells that the robot traversed.
         window : optional
-            First row, last one plus one, and columns likewise, of the cells where moves begin; by default all.
+            Begin and end of the rows, and of the columns, in which moves begin; by default all.
         hold : bool
-            Whether all cells outside of the window stay as they are; otherwise moves may reach out of it.
+            Whether all cells outside of the window keep their state; otherwise moves may end outside of it.
         shifts : bool
             Whether occupied cells may move to neighbours. Without these moves the search takes about half of the time.
         """
@@ -136,7 +135,7 @@ class Search:
         self._of_walls = wall_prior(parameters, traversed, evidence.grid.resolution)
         self._settled = np.zeros(evidence.grid.size, np.uint8)
         self._tried_at = -1
-        # to work in; in a small map it takes longer to get the memory than to do most steps
+        # workspaces, since in a small map allocating them takes longer than most steps
         bottom, top, left, right = self._window
         cells = (top - bottom) * (right - left)
         self._gaining, self._gains = np.empty(cells, np.int64), np.empty(cells)
@@ -151,7 +150,7 @@ class Search:
             self._hold()
 
     def _hold(self) -> None:
-        """Make every change outside of the window cost more than any can gain."""
+        """Set the prior so that changes outside of the window cost more than they can gain."""
         bottom, top, left, right = self._window
         inside = np.zeros(self.evidence.grid.shape, np.bool_)
         inside[bottom:top, left:right] = True
@@ -173,9 +172,9 @@ class Search:
         return self.evidence.tempered_log_likelihood + log_prior(self._prior, maps.occupied, maps.pattern)
 
     def run(self, watch: Watch = lambda progress: None) -> SearchResult:
-        """Search until no flip and no move gains; `watch` is called after every iteration.
+        """Search until no flip and no move gains; `watch` is called after each iteration.
 
-        A start map that no flip and no move improves is the result: parallel updates would lead to another maximum.
+        If the initial map is a local maximum, it is the result: parallel updates would lead to another maximum.
 
         Raises
         ------
@@ -194,7 +193,7 @@ class Search:
         return self.refine(watch)
 
     def refine(self, watch: Watch = lambda progress: None) -> SearchResult:
-        """Do as `run` does, but without the parallel updates at the beginning."""
+        """Search like `run`, but without the parallel updates at the beginning."""
         converged = self._climb(watch)
         if has_walls(self._parameters):
             self._prior = self._of_walls
@@ -203,7 +202,7 @@ class Search:
         return self._result(converged)
 
     def improve(self, watch: Watch = lambda progress: None) -> SearchResult:
-        """Go on from a map that `run` found, with the prior of walls alone, until nothing gains."""
+        """Continue from a map found by `run`, with the prior for walls only, until nothing gains."""
         self._prior = self._of_walls
         return self._result(self._climb(watch))
 
@@ -219,7 +218,7 @@ class Search:
         )
 
     def _climb(self, watch: Watch) -> bool:
-        """Make moves of all kinds until nothing gains; return whether that was reached."""
+        """Make moves of all kinds until nothing gains; return whether this converged."""
         walls = self._prior is self._of_walls and has_walls(self._parameters)
         while self._more():
             if self._update_in_sequence(watch) or (self._shifts and self._shift(watch)):
@@ -234,21 +233,21 @@ class Search:
         """Return the occupied cells in the window."""
         bottom, top, left, right = self._window
         width = self.evidence.grid.width
-        # among numbers of type bool, numpy finds those that are set several times faster
+        # numpy.flatnonzero is several times faster for bool
         cells = np.flatnonzero(self.evidence.state.maps.occupied[bottom * width : top * width].view(np.bool_))
         cells += bottom * width
         column = cells % width
         return cells[(left <= column) & (column < right)]
 
     def _promising(self) -> tuple[NDArray[np.int64], Floats]:
-        """Return the cells whose flip gains, the best first, and what they gain."""
+        """Return the cells whose flip gains, the largest gain first, and the gains."""
         n = promising(self.evidence.state, self._prior, LEAST, self._window, self._gaining, self._gains)
         cells, gains = self._gaining[:n], self._gains[:n]
         order = np.argsort(-gains, kind='stable')
         return cells[order], gains[order]
 
     def _update_in_parallel(self, watch: Watch) -> bool:
-        """Flip all that gain more than their neighbours at once; return whether that helped."""
+        """Flip all cells that gain more than their neighbours; return whether another such update is worth while."""
         cells, gains = self._promising()
         cells = cells[highest(self.evidence.state, cells, gains, self._all_zero)]
         if len(cells) < FEW:
@@ -271,7 +270,7 @@ class Search:
         return flips
 
     def _none(self) -> NDArray[np.int32]:
-        """Return an array of -1 for all cells, which goes back to `_all_none` once it is all -1 again; any thread."""
+        """Return an array of -1 for all cells; callers reset it and return it to `_all_none`. For any thread."""
         with suppress(IndexError):
             return self._all_none.pop()
         return np.full(self.evidence.grid.size, -1, np.int32)
@@ -286,11 +285,11 @@ class Search:
         self._settled[cells] = 1
         slot = self._none()
         slot[cells] = np.arange(len(cells), dtype=np.int32)
-        sees = np.ones(len(evidence), np.uint8)
+        observing = np.ones(len(evidence), np.uint8)
         if s.maps.seen[cells].sum() < len(evidence):
-            sees[:] = 0
-            see_any(s, cells, sees)
-        readings = np.flatnonzero(sees)
+            observing[:] = 0
+            mark_observing(s, cells, observing)
+        readings = np.flatnonzero(observing)
         joint = np.zeros((len(cells), NEIGHBOURS), np.int64)
 
         def work(s: State, begin: int, end: int, own: NDArray[np.int64]) -> None:
@@ -308,7 +307,7 @@ class Search:
         return shifts
 
     def _free(self, watch: Watch) -> int:
-        """Free cells that nothing needs, as parallel updates leave them where the prior does not speak against them."""
+        """Free unneeded cells, which parallel updates leave if the prior of an occupied cell is not negative."""
         cells = self._occupied()
         flips, gain = free_unneeded(self.evidence.state, self._prior, LEAST, cells)
         if flips:
@@ -316,7 +315,7 @@ class Search:
         return flips
 
     def _cells(self, length: float) -> int:
-        """Return how many cells a length in metres is."""
+        """Return a length, metres, in cells."""
         return max(round(length / self.evidence.grid.resolution), 1)
 
     def _close_gaps(self, watch: Watch) -> int:

@@ -1,14 +1,14 @@
 """Shifts: an occupied cell moves to a neighbour in one step, a block move of two cells.
 
-A shift frees cell c and occupies its neighbour o. What it gains follows from the single flips, since T is linear in
-each cell's term. For a reading that sees both, with likelihood ratios r_c and r_o of the single flips and
-q = 1 − p_hit, both together have the ratio
+A shift frees cell c and occupies its neighbour o. Its gain follows from the single flips, since T is linear in the term
+of each cell. For a reading that observes both, with likelihood ratios r_c and r_o of the single flips and
+q = 1 − p_hit, the ratio of both together is
 
     o behind c              r_c + (r_o − 1) / q
     o in front of c         r_o + q (r_c − 1)
     both in the free zone   1
 
-So one pass over the readings tries all shifts, and only those that gain are made.
+So one pass over the readings gives the gains of all shifts, and only those with a gain are made.
 """
 
 from __future__ import annotations
@@ -30,12 +30,12 @@ from .flips import Least, gain_of, least_gain
 from .prior import Prior
 
 LEAST_JOINT = 1e-9
-"""Ratios of shifts are differences, and rounding may leave nothing of the smallest."""
+"""Smallest ratio of a shift: ratios are differences, and rounding may make them 0."""
 
 
 @kernel
 def unsettle(s: State, since: int, settled: Any) -> None:
-    """Mark the cells of all readings that changed after the clock was `since` as not settled."""
+    """Mark the cells of all readings that changed after the time `since` of the clock as not settled."""
     for t in range(len(s.reading_states)):
         reading_state = s.reading_states[t]
         if reading_state.changed > since:
@@ -48,11 +48,11 @@ def unsettle(s: State, since: int, settled: Any) -> None:
 
 
 @kernel
-def see_any(s: State, cells: NDArray[np.int64], sees: Any) -> None:
-    """Mark in `sees` (uint8, shape (N,)) the readings that see any of `cells`."""
+def mark_observing(s: State, cells: NDArray[np.int64], observing: Any) -> None:
+    """Mark in `observing` (uint8, shape (N,)) the readings that observe any of `cells`."""
     for c in cells:
         for i in range(find_observing(s, c)):
-            sees[s.observing[i, 0]] = 1
+            observing[s.observing[i, 0]] = 1
 
 
 @kernel
@@ -67,14 +67,14 @@ def _in_runs(pairs: Pairs, at: int, runs: int, c: int) -> bool:
 def _add_joint(
     s: State, reading_state: Any, pairs: Pairs, at: int, cell: tuple[int, int], place: Any, joint: Any
 ) -> None:
-    """Add to `joint` (8,) what a reading says of shifting a cell to each of its neighbours, beyond the two flips.
+    """Add the log ratio of shifting a cell to each of its neighbours, minus those of the two flips, to `joint` (8,).
 
     Parameters
     ----------
     cell
-        The cell, and its place in the band, or -1 if it is in the free zone.
+        The cell, and its index in the band, or -1 if it is in the free zone.
     place : int32, shape (cells,)
-        Places in the band, -1 elsewhere.
+        Index of each cell in the band, -1 outside of it.
     """
     c, here = cell
     height, width = s.lattice.height, s.lattice.width
@@ -102,18 +102,18 @@ def _add_joint(
 
 @kernel
 def try_shifts(s: State, readings: Any, slot: Any, place: Any, joint: Any) -> None:
-    """Compute what some readings say of shifts, beyond the two flips, in units of `fixed_point.QUANTUM`.
+    """Add the log ratios of shifts by some readings, minus those of the two flips, in units of `fixed_point.QUANTUM`.
 
     Parameters
     ----------
     readings : int64
-        Which readings.
+        Indices of the readings.
     slot : int32, shape (cells,)
-        Row of `joint` of each cell that is to be tried, -1 elsewhere.
+        Row of `joint` of each cell whose shifts are tried, -1 for others.
     place : int32, shape (cells,)
-        To work in; all -1, and left so.
+        Workspace; all -1 before and after the call.
     joint : int64, shape (rows, 8)
-        By neighbour, row by row; added to. What it says of occupied neighbours means nothing.
+        Sums by cell and neighbour; they are meaningless for occupied neighbours.
     """
     workspace = s.workspace
     for t in readings:
@@ -150,7 +150,7 @@ def try_shifts(s: State, readings: Any, slot: Any, place: Any, joint: Any) -> No
 def best_shifts(
     s: State, prior: Prior, least: Least, cells: NDArray[np.int64], joint: Any
 ) -> tuple[NDArray[np.int64], Floats]:
-    """Return for each of `cells` the free neighbour to which a shift gains most, -1 if none does, and what it gains."""
+    """Return for each of `cells` the free neighbour to which a shift gains most, -1 if none gains, and the gain."""
     height, width = s.lattice.height, s.lattice.width
     targets, gains = np.full(len(cells), -1, np.int64), np.zeros(len(cells))
     for i in range(len(cells)):

@@ -1,9 +1,9 @@
-"""What a single reading can say at most for or against an obstacle: bounds of its part of the objective.
+"""Bounds of the evidence of a single reading for or against an obstacle.
 
-A reading multiplies the odds of an obstacle by [(c + T') / (c + T)]^γ, where c gathers the causes that no map changes,
-T and T' those that the map explains without and with the obstacle, and γ is the likelihood exponent. Since c is never
-zero, the ratio is bounded: the random measurement bounds what an echo says, the lost echo what a reading without echo
-says. So no wall stands or falls by one reading.
+A reading multiplies the odds of an obstacle by [(c + T') / (c + T)]^γ, where c is the density of the causes independent
+of the map, T and T' that of the others without and with the obstacle, and γ the likelihood exponent. Since c is never
+zero, the ratio is bounded: for an echo by the random measurement, for a reading without echo by the lost echo. So no
+wall depends on a single reading.
 """
 
 from __future__ import annotations
@@ -16,16 +16,16 @@ from .density import density, hit_probability
 
 
 class ReadingBounds(NamedTuple):
-    """Bounds in nats of the objective: positive for an obstacle, negative against it.
+    """Bounds of the log-likelihood ratio, tempered, nats: positive for an obstacle, negative against it.
 
     Attributes
     ----------
     echo_for : float
-        An echo for the cell at its range, where the map explains it by nothing else.
+        Of an echo for the cell at its range, if nothing else on the map explains it.
     echo_against_cell, echo_against_wall : float
-        An echo from far beyond against one cell on its way, and against any number of cells.
+        Of an echo from far beyond against one cell on its way, and against any number of cells.
     silence_against_cell, silence_against_wall : float
-        A reading without echo, likewise. It speaks for no cell.
+        The same of a reading without echo, which is never evidence for a cell.
     """
 
     echo_for: float
@@ -36,7 +36,7 @@ class ReadingBounds(NamedTuple):
 
 
 def reading_bounds(model: ModelParameters, resolution: float, z_max: float) -> ReadingBounds:
-    """Return what a reading can say at most.
+    """Return the bounds for a reading.
 
     Parameters
     ----------

@@ -1,10 +1,10 @@
-"""The geometry of one cone on the lattice: which cells belong to a reading, and how far away they are.
+"""The geometry of a cone on the lattice: the cells of a reading, and their distances.
 
-A cell belongs to a cone if its centre lies within the half angle of the axis and within reach. Near the sensor a thin
-cone has no centre in it at all, so the cells that the axis crosses belong too. In every row of the
-lattice each of the two kinds forms one run, which is found without testing cells one by one.
+A cell belongs to a cone if its centre is within the half angle of the axis and within reach. Near the sensor, a narrow
+cone contains no centre, so the cells that the axis crosses belong to it as well. In each row of the lattice, the cells
+of each kind form one run, which is computed without testing single cells.
 
-All lengths here are in cells, relative to the grid's lower left corner.
+All lengths are in cells, relative to the lower left corner of the grid.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import NamedTuple
 from ..runtime.jit import kernel
 
 HALF_WIDTH = 0.75
-"""Least half width in cells that a cone is taken to have when its strength is asked for."""
+"""Smallest half width of a cone for its strength, cells."""
 
 
 class Cone(NamedTuple):
@@ -30,7 +30,7 @@ class Cone(NamedTuple):
     axis_x, axis_y, right_x, right_y, left_x, left_y : float
         Unit vectors of the axis and of the two edges.
     bottom, top : int
-        First and last row, on the grid or off it.
+        First and last row; they may be outside of the grid.
     """
 
     x: float
@@ -48,10 +48,10 @@ class Cone(NamedTuple):
 
 
 class Runs(NamedTuple):
-    """The cells of a cone in one row: columns `first` to `last`, and `first2` to `last2` right of them.
+    """The cells of a cone in one row: columns `first` to `last`, and `first2` to `last2` to the right of them.
 
-    A run is empty where its last column is before its first; one run is the rule. `inner` to `outer` are the columns of
-    the row that are in the free zone, whether they are in the cone or not.
+    A run is empty if its last column is before its first; usually the second is. `inner` to `outer` are the columns
+    of the row within the radius of the free zone, in the cone or not.
     """
 
     first: int
@@ -77,7 +77,7 @@ def make_cone(
     half
         Sine and cosine of the half angle in (0, π/2).
     lengths
-        Radius of the sector, and of the free zone, which is empty where negative.
+        Radius of the sector, and of the free zone, which is empty if negative.
     """
     reach, free = lengths
     axis_x, axis_y = axis
@@ -104,7 +104,7 @@ def make_cone(
 
 @kernel
 def _clip(a: float, b: float, low: float, high: float) -> tuple[float, float]:
-    """Clip [low, high] to the u with a * u + b >= 0."""
+    """Clip the interval [low, high] to those u with a * u + b >= 0."""
     if a > 0.0:
         return max(low, -b / a), high
     if a < 0.0:
@@ -116,7 +116,7 @@ def _clip(a: float, b: float, low: float, high: float) -> tuple[float, float]:
 
 @kernel
 def wedge_run(cone: Cone, row: int) -> tuple[int, int]:
-    """Return the first and last column of a row whose cell centres lie in the sector; last < first if none does."""
+    """Return the first and last column of a row whose cell centres are in the sector; last < first if there is none."""
     v = row + 0.5 - cone.y
     chord = cone.reach * cone.reach - v * v
     if chord < 0.0:
@@ -165,7 +165,7 @@ def rows_of(cone: Cone, height: int) -> tuple[int, int]:
 
 @kernel
 def runs_of(cone: Cone, row: int, width: int) -> Runs:
-    """Return the cells of the cone in a row of the grid. Every walk over a cone is one over `rows_of` and these."""
+    """Return the cells of the cone in a row of the grid; all loops over a cone use `rows_of` and this."""
     v = row + 0.5 - cone.y
     inner, outer = within(cone.x, v, cone.free)
     first, last = within(cone.x, v, cone.reach)
@@ -186,11 +186,11 @@ def runs_of(cone: Cone, row: int, width: int) -> Runs:
 
 @kernel
 def strength(axis_x: float, axis_y: float, sine2: float, du: float, dv: float) -> float:
-    """Return how much of a beam there is (du, dv) from its apex: 1 on the axis, 0 at the edge and beyond.
+    """Return the strength of a beam at (du, dv) from its apex: 1 on the axis, 0 at the edge and outside.
 
-    With φ the angle off the axis and β the half angle it is 1 − (sin φ / sin β)² (after Moravec and Elfes 1985, who
-    have the angles themselves). β is taken as large enough for the cone to be one and a half cells wide there, since a
-    thin beam fills the cells it crosses. `sine2` is the square of sin β.
+    With φ the angle to the axis and β the half angle, it is 1 − (sin φ / sin β)² (after Moravec and Elfes 1985, who use
+    the angles themselves). The cone is taken to be at least one and a half cells wide, since a narrow beam fills the
+    cells that it crosses. `sine2` is sin² β.
     """
     across = axis_x * dv - axis_y * du
     width2 = max(sine2 * (du * du + dv * dv), HALF_WIDTH * HALF_WIDTH)

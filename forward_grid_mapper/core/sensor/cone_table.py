@@ -1,13 +1,12 @@
-"""The cones of readings on a grid: how far they reach, which grid holds them, and a walk over the cells of one.
+"""The cones of readings on a grid: their reach, the grid that contains them, and a loop over the cells of one.
 
-A reading of range z splits its cone. In the *free zone*, up to z − `CUT` σ, the noise density is nil: an occupied cell
-there acts only by standing in the way, so its distance does not matter. In the *band* around z lie the cells that can
-evaluate the reading. Cells beyond the band cannot matter, unless z is near z_max: then all cells up to z_max stand in
-the way of the max-range cause.
+The range z of a reading divides its cone. In the *free zone*, up to z − `CUT` σ, the noise density is 0: an occupied
+cell there only blocks the sound, so its distance does not matter. The *band* around z has the cells that can explain
+the reading. Cells beyond the band do not matter, unless z is near z_max: then all cells up to z_max block the max-range
+cause.
 
-Distances are to the centres of cells, but it is a surface that echoes, and that lies before the centre: anywhere
-between it and the near side, as far as the map knows. So lengths along a cone are longer by `surface_offset` cells
-here than what the sensor reports.
+Distances are those of cell centres. But the echo comes from the surface, which is in front of the centre, by an unknown
+part of a cell. So lengths along a cone are longer here by `surface_offset` cells than the ranges of the sensor.
 """
 
 from __future__ import annotations
@@ -32,28 +31,28 @@ Floats = NDArray[np.float64]
 _FIELDS = ('x', 'y', 'axis_x', 'axis_y', 'sine', 'cosine', 'z', 'z_max', 'sigma', 'free', 'reach')
 
 CONE = np.dtype([(name, np.float64) for name in _FIELDS], align=True)
-"""The cone of a reading on a grid, in cells; what the kernels need to walk it.
+"""The cone of a reading on a grid, in cells, for the kernels.
 
 Apex; unit vector of the axis; sine and cosine of the half angle; range, largest range and σ; `free`, the end of the
-free zone; `reach`, beyond which no cell matters: all four lengths to the centres of cells. One record a reading, since
-kernels come upon readings at random.
+free zone; `reach`, beyond which no cell matters. Lengths are to the centres of cells. It is an array of records because
+kernels access readings in random order.
 """
 
 Cones = NDArray[np.void]
 
 UNIT = 2.0**-32
-"""Cells; coordinates are rounded to it, which leaves 20 bits of float64 for the number of a cell."""
+"""Coordinates are rounded to this, cells; 20 bits of float64 remain for the index of a cell."""
 
 
 def effective_sigma(readings: Readings, model: ModelParameters, resolution: float) -> Floats:
-    """Return each reading's σ in metres: its own or the model's, but not less than half a cell."""
+    """Return σ of each reading, metres: its own or that of the model, but at least half a cell."""
     return np.maximum(np.where(readings.sigma > 0, readings.sigma, model.sigma), resolution / 2)
 
 
 def reach_of(readings: Readings, sigma: Floats) -> Floats:
-    """Return the distance in metres beyond which no surface in each cone matters, shape (N,).
+    """Return the distance beyond which no surface in each cone matters, metres, shape (N,).
 
-    Short of z_max − `CUT` σ the max-range cause has no density, and only cells up to z + `CUT` σ count.
+    Below z_max − `CUT` σ, the max-range cause has density 0, and only cells up to z + `CUT` σ matter.
     """
     ends = readings.z + CUT * sigma
     return np.where(ends < readings.z_max, ends, readings.z_max)
@@ -62,9 +61,9 @@ def reach_of(readings: Readings, sigma: Floats) -> Floats:
 def grid_of(
     readings: Readings, model: ModelParameters, grid: GridParameters, within: Grid | None = None, beyond: float = 0.0
 ) -> Grid:
-    """Return a grid that holds every cell that a reading touches, and all of `within`.
+    """Return the grid that contains the cells of all cones, and `within`.
 
-    It follows the bounding boxes of the cones, out to where no cell matters and to `beyond` metres past the range.
+    It covers the bounding boxes of the cones up to their reach, and at least `beyond` metres more than the range.
 
     Raises
     ------
@@ -99,7 +98,7 @@ def check_size(made: Grid, grid: GridParameters) -> None:
 
 
 def _box(readings: Readings, reach: Floats) -> tuple[float, float, float, float]:
-    """Return left, right, bottom and top of all cones, metres."""
+    """Return left, right, bottom and top of the bounding box of all cones, metres."""
     r = readings
     box: tuple[float, float, float, float] = _widest(
         *(np.ascontiguousarray(v) for v in (r.x, r.y, r.yaw, r.half_angle, reach))
@@ -109,12 +108,12 @@ def _box(readings: Readings, reach: Floats) -> tuple[float, float, float, float]
 
 @kernel
 def _widest(x: Floats, y: Floats, yaw: Floats, half_angle: Floats, reach: Floats) -> tuple[float, float, float, float]:
-    """Return the box of all sectors, as `cone_boxes` gives one for each."""
+    """Return the bounding box of all sectors; `cone_boxes` returns that of each."""
     quarter = math.pi / 2
     left, right, bottom, top = math.inf, -math.inf, math.inf, -math.inf
     for i in range(len(x)):
         u, v, r = x[i], y[i], reach[i]
-        # a whole disc in there cannot make it larger: all but a few
+        # most readings are skipped here: not even their full disc would enlarge the box
         if u - r >= left and u + r <= right and v - r >= bottom and v + r <= top:
             continue
         low, high = yaw[i] - half_angle[i], yaw[i] + half_angle[i]
@@ -137,7 +136,7 @@ def _widest(x: Floats, y: Floats, yaw: Floats, half_angle: Floats, reach: Floats
 
 
 def cone_table(readings: Readings, grid: Grid, model: ModelParameters) -> Cones:
-    """Return the readings' cones in cells of `grid`, records of `CONE`, shape (N,)."""
+    """Return the cones of readings in cells of `grid`, records of `CONE`, shape (N,)."""
     sigma = effective_sigma(readings, model, grid.resolution)
     scale, offset = 1.0 / grid.resolution, model.surface_offset
     table = np.empty(len(readings), CONE)
@@ -152,7 +151,7 @@ def cone_table(readings: Readings, grid: Grid, model: ModelParameters) -> Cones:
 
 
 def _exact(cells: Floats) -> Floats:
-    """Return coordinates in whole units, so that where a sensor is in a cell does not depend on the grid's corner."""
+    """Return coordinates rounded to `UNIT`, so that the offset in a cell does not depend on the corner of the grid."""
     out: Floats = np.round(cells / UNIT) * UNIT
     return out
 
@@ -166,7 +165,7 @@ def cone_of(reading: Any) -> Cone:
 
 @kernel
 def walk(table: Any, t: int, shape: Any, cells: Any, distances: Any) -> int:
-    """Write the cells of reading t and their distances; return their number, even where the arrays are too short."""
+    """Write the cells of reading t and their distances; return their number, even if the arrays are too short."""
     height, width = shape
     cone = cone_of(table[t])
     n = 0
@@ -185,7 +184,7 @@ def walk(table: Any, t: int, shape: Any, cells: Any, distances: Any) -> int:
 
 @allocating_kernel
 def walk_resized(table: Any, t: int, shape: Any, cells: Any, distances: Any) -> tuple[int, NDArray[np.int32], Floats]:
-    """Do as `walk` does; where the arrays are too short, go on with longer ones. Return them after the number."""
+    """Do the same as `walk`, with longer arrays if they are too short; return the number and the arrays."""
     n = walk(table, t, shape, cells, distances)
     if n > len(cells):
         cells, distances = np.empty(2 * n, np.int32), np.empty(2 * n, np.float64)

@@ -1,13 +1,13 @@
-"""The density of a range: the noise about an obstacle, and the causes that no map changes.
+"""The density of a range: the noise of obstacles, and the causes that are independent of the map.
 
     p(z | m) =  p_rand / z_max                                                        random measurement (*)
              +  p_lost · N(z; z_max, σ) if there is no echo, z ≥ z_max                lost echo
              +  (1 − p_rand − p_lost) · Σ_k (1 − p_hit)^(k−1) p_hit N(z; d_k, σ)      k-th obstacle, k = 1 … K
              +  (1 − p_rand − p_lost) · (1 − p_hit)^K N(z; z_max, σ)                  nothing hit, max range (0)
 
-p_hit is that of a cell (`hit_probability`), d_k the distance of the k-th nearest occupied cell of the cone. This is eq
-22, 24 and 25 of the paper with the prior of the correspondences, eq 28, summed over them. With p_lost = 0 and cells of
-0.1 m it is the paper's model.
+p_hit is that of a cell (`hit_probability`), d_k the distance of the k-th nearest occupied cell of the cone. These are
+(22), (24) and (25) of the paper with the prior of the correspondences, (28), summed over them. With p_lost = 0 and
+cells of 0.1 m it is the model of the paper.
 """
 
 from __future__ import annotations
@@ -24,23 +24,23 @@ from ..common.readings import Floats, Readings
 from ..runtime.jit import allocating_kernel, kernel
 
 CUT = 4.0
-"""σ beyond which the noise density is taken as nil, so that few cells of a cone need a distance of their own: there it
-is 3e-4 of its peak, less than random measurements account for."""
+"""σ beyond which the noise density is set to 0, so that distances of few cells are needed: there it is 3e-4 of its
+peak, less than the density of random measurements."""
 
 _ROOT = math.sqrt(2.0 * math.pi)
 
 
 class Causes(NamedTuple):
-    """The model's terms that do not depend on the map.
+    """The terms of the model that do not depend on the map.
 
     Attributes
     ----------
     p_hit, mixture_weight : float
-        That of a cell, and 1 − p_rand − p_lost, the weight of the causes that the map explains.
+        p_hit of a cell, and 1 − p_rand − p_lost, the weight of the causes that depend on the map.
     random, lost : float64, shape (N,)
-        The densities p_rand / z_max and, where there is no echo, p_lost · N(z; z_max, σ) in 1/m.
+        The densities p_rand / z_max and, without echo, p_lost · N(z; z_max, σ), 1/m.
     max_range : float64, shape (N,)
-        N(z; z_max, σ) in 1/m.
+        N(z; z_max, σ), 1/m.
     """
 
     p_hit: float
@@ -52,7 +52,7 @@ class Causes(NamedTuple):
 
 @kernel
 def density(error: float, sigma: float) -> float:
-    """Return N(z; d, σ) in 1/m, cut off at `CUT` σ: eq 22.
+    """Return N(z; d, σ), 1/m, cut off at `CUT` σ: (22) of the paper.
 
     Parameters
     ----------
@@ -73,10 +73,10 @@ def _densities(error: NDArray[np.float64], sigma: NDArray[np.float64]) -> Any:
 
 
 def hit_probability(model: ModelParameters, resolution: float) -> float:
-    """Return the probability that an occupied cell in the cone returns the echo, if none before it did.
+    """Return the probability that an occupied cell in the cone returns the echo, if no nearer one did.
 
-    A surface that misses the pulse with probability 1 − p_hit over `HIT_LENGTH` misses it with the product of the
-    probabilities of its parts. So the same wall is heard alike in cells of any size.
+    A surface of `HIT_LENGTH` returns no echo with probability 1 − p_hit, which is the product of those of its parts. So
+    the probability of an echo of a wall does not depend on the cell size.
 
     Parameters
     ----------
@@ -88,12 +88,12 @@ def hit_probability(model: ModelParameters, resolution: float) -> float:
 
 
 def hit_parameter(probability: float, resolution: float) -> float:
-    """Return the `p_hit` with which `hit_probability` is `probability` in cells of edge `resolution`, metres."""
+    """Return the `p_hit` with which `hit_probability` is `probability`; `resolution` is the cell size, metres."""
     return float(1.0 - (1.0 - min(probability, MOST_HIT)) ** (HIT_LENGTH / resolution))
 
 
 def causes_of(readings: Readings, sigma: Floats, model: ModelParameters, resolution: float) -> Causes:
-    """Return the map-independent terms of each reading.
+    """Return the terms of each reading that do not depend on the map.
 
     Parameters
     ----------

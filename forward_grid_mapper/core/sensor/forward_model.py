@@ -1,11 +1,11 @@
-"""The forward sensor model: how likely readings are, given a whole map, and which causes explain them.
+"""The forward sensor model: the likelihood of readings, given a whole map, and the probabilities of their causes.
 
 The density p(z | m) and its causes are those of `density`. d_k is the distance to the k-th nearest occupied cell of the
 cone, without the surfaces at which the reading exceeds the incidence angle (`surface_normals`).
 
-This is the one likelihood of the package. It is evaluated exactly here, in float64 and straight from the cones: for the
-map that is handed out, for learning, for sensor health and for lost walls. The search (`evidence.updates`) has it in a
-form in which a flip costs O(1) a reading, and is tested against this one.
+The whole package uses this likelihood. Here it is evaluated exactly, in float64 and directly from the cones: for the
+final map, for learning, for sensor health and for lost walls. The search (`evidence.updates`) uses a form in which a
+flip costs O(1) for each reading; it is tested against this one.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ class Expectations:
 
 
 class _Given(NamedTuple):
-    """What the kernel needs beside the map; `pairing` and `normals` decide which surfaces a reading passes."""
+    """What the kernel needs besides the map; `pairing` and `normals` decide which surfaces a reading passes."""
 
     cones: Cones
     pairing: Cones
@@ -56,7 +56,7 @@ class _Given(NamedTuple):
 
 @kernel
 def _sort(values: Any, n: int) -> None:
-    """Sort the first n values in place, by insertion into strides that shrink: they are few, and partly in order."""
+    """Sort the first n values in place by Shell sort: they are few, and partly sorted."""
     stride = 1
     while stride < n // 3:
         stride = 3 * stride + 1
@@ -113,7 +113,7 @@ def _expect(given: _Given, occupied: Any, out: Any) -> None:
 
 
 class ForwardModel:
-    """Readings on a grid, and how likely each of them is given any map of that grid.
+    """Readings on a grid, and their likelihood given any map of this grid.
 
     Attributes
     ----------
@@ -123,7 +123,7 @@ class ForwardModel:
     normals : SurfaceNormals
         Of the cells of `grid`.
     cones : records of `CONE`, shape (N,)
-        Those of `cone_table`.
+        From `cone_table`.
     """
 
     def __init__(
@@ -134,16 +134,16 @@ class ForwardModel:
         normals: SurfaceNormals | None = None,
         cones: Cones | None = None,
     ) -> None:
-        """Take over `cones` if they are known; without `normals` no reading exceeds the incidence angle."""
+        """Use `cones` if already computed; without `normals`, no reading exceeds the incidence angle."""
         self.readings, self.grid, self.model = readings, grid, model
         self.normals = no_normals() if normals is None else normals
         self.cones = cone_table(readings, grid, model) if cones is None else cones
         self._pairing = self.cones
 
     def at(self, model: ModelParameters) -> ForwardModel:
-        """Return the same with other values of the model.
+        """Return the forward model with other values of the model.
 
-        The normals stay, and so does the choice of the surfaces that each reading passes, which depends on σ: so the
+        Normals stay the same, and so do the surfaces that each reading passes, although they depend on σ: so the
         likelihood is a smooth function of the values.
         """
         other = ForwardModel(self.readings, self.grid, model, self.normals)
@@ -151,12 +151,12 @@ class ForwardModel:
         return other
 
     def expectations(self, occupied: NDArray[Any]) -> Expectations:
-        """Return the E-step and the log-likelihood of every reading, given a map.
+        """Return the E-step and the log-likelihood of each reading, given a map.
 
         Parameters
         ----------
         occupied : array of shape `grid.shape`
-            Occupied cells are 1; anything else counts as free.
+            1 if occupied; anything else counts as free.
         """
         resolution, model = self.grid.resolution, self.model
         causes = causes_of(self.readings, self.cones['sigma'] * resolution, model, resolution)

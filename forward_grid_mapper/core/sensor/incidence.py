@@ -1,18 +1,18 @@
-"""Up to which incidence each surface returns echoes: rough walls do from nearly anywhere, smooth ones and glass hardly.
+"""The limit of the incidence angle of each surface: large for rough walls, small for smooth ones and glass.
 
-A surface that is heard from near its normal and missed beyond 20° is no gap: it is smooth. With one incidence angle for
-all surfaces, what went past it at 30° would speak against it. So it may be one of three: the smallest and the largest
-of the model, and midway. For each cell whose normal is known, the readings in the three zones up to these are counted
-apart: echoes by how well their range agrees, with the weight w of `surface_normals`, and passes, readings that end
-beyond it, by the strength of their beam there. They are summed over the square of `NEIGHBOURHOOD` around the cell.
+A surface that is detected near its normal and missed beyond 20° is no gap, but smooth. With one limit for all surfaces,
+readings that passed it at 30° would be evidence against it. So the limit is one of three: the smallest and the largest
+of the model, and the middle. For each cell whose normal is known, readings are counted in the three zones of incidence
+up to these: echoes, weighted by how well their range agrees (w of `surface_normals`), and passes, readings that end
+beyond it, weighted by the strength of their beam. Counts are summed over the square of `NEIGHBOURHOOD` around the cell.
 
-Let a surface return the part r of the readings within a limit, and r' of those beyond. With e echoes and p passes
+Let the fraction r of the readings within a limit be echoes, and r' of those beyond. With e echoes and p passes
 
     log L(r) = e log r + p log (1 − r)        r = e / (e + p)
 
-and the limit is the one whose two rates are likelier by `GAIN` than one rate for all, and by the most. It counts only
-where at least `LEAST_RATE` of the readings within are echoes, and `CONTRAST` times as large a part as of those beyond:
-of readings through an open door, few within are echoes, so all that passed it counts against a wall there.
+The limit is the one whose two rates are most likely, if they are likelier by `GAIN` than one rate for all. At least
+`LEAST_RATE` of the readings within must be echoes, and `CONTRAST` times the rate beyond: of readings through an open
+door few are echoes, so all its passes are evidence against a wall.
 """
 
 from __future__ import annotations
@@ -42,11 +42,11 @@ from .cone_table import Cones, cone_of
 from .surface_normals import QUANTUM, Square, SurfaceNormals, square_of, sum_across, touched, unit_of_sums
 
 ZONES = 3
-"""Zones of incidence that readings are counted in: two that are a few degrees wider, or five, are about as good."""
+"""Number of zones of incidence; two that are a few degrees wider, or five, are about as good."""
 
 
 def slots_of(normals: SurfaceNormals, window: Window) -> NDArray[np.int32]:
-    """Return numbers for the cells of a window whose normals are known, -1 for all other cells, shape (cells,)."""
+    """Return consecutive numbers for the cells of a window with known normals, -1 for all others, shape (cells,)."""
     bottom, top, left, right = window
     height, width = len(normals.before), normals.before.shape[1] - 1
     out = np.full((height, width), -1, np.int32)
@@ -56,12 +56,12 @@ def slots_of(normals: SurfaceNormals, window: Window) -> NDArray[np.int32]:
 
 
 def no_counts(slots: NDArray[np.int32]) -> NDArray[np.int64]:
-    """Return counts for these cells before any reading: echoes and passes of each zone, shape (2 · ZONES, known)."""
+    """Return zero counts for these cells: echoes and passes in each zone, shape (2 · ZONES, known)."""
     return np.zeros((2 * ZONES, int(slots.max(initial=-1)) + 1), np.int64)
 
 
 def edges_of(model: ModelParameters) -> NDArray[np.float64] | None:
-    """Return the squared cosines at which the zones end, shape (ZONES,); None where all surfaces are alike."""
+    """Return the squared cosines at which the zones end, shape (ZONES,); None if all surfaces have the same limit."""
     if model.min_incidence_angle >= model.max_incidence_angle:
         return None
     out: NDArray[np.float64] = np.cos(np.linspace(model.min_incidence_angle, model.max_incidence_angle, ZONES)) ** 2
@@ -86,7 +86,7 @@ def count(
     ----------
     cones : records of `CONE`, shape (N,)
     weights : int32, shape (N,)
-        How many readings each stands for.
+        Number of readings that each represents.
     normals : SurfaceNormals
         Of length one in the window.
     slots : int32, shape (cells,)
@@ -136,20 +136,20 @@ def count(
 
 @kernel
 def _rate(echoes: float, passes: float) -> float:
-    """Return the part of the readings that are echoes, a half where there are none."""
+    """Return the fraction of the readings that are echoes, one half without readings."""
     return (echoes + FEW_ECHOES) / (echoes + passes + FEW_READINGS)
 
 
 @kernel
 def _log_likelihood(echoes: float, passes: float) -> float:
-    """Return log L of the rate that is likeliest."""
+    """Return log L of the maximum likelihood rate."""
     rate = _rate(echoes, passes)
     return echoes * math.log(rate) + passes * math.log(1.0 - rate)
 
 
 @kernel
 def limit(counts: Any) -> int:
-    """Return the zone with which a surface ends, given its echoes and passes in each: float64, shape (2 · ZONES,)."""
+    """Return the last zone in which a surface returns echoes, from its counts: float64, shape (2 · ZONES,)."""
     echoes, passes = 0.0, 0.0
     for k in range(ZONES):
         echoes += counts[k]
@@ -182,7 +182,7 @@ def _narrow(
     columns: Any,
     pooled: Any,
 ) -> None:
-    """Give the normals in a window the lengths of the zones with which their surfaces end.
+    """Scale the normals in a window so that their lengths state the limits of their surfaces.
 
     Parameters
     ----------
@@ -190,10 +190,11 @@ def _narrow(
         As for `narrowed`.
     lengths : float64, shape (ZONES,)
     square, unit
-        Of the square around a cell, and what 1 counts in a sum over it.
-    columns : float64, shape (columns of the window and what `square` is beyond, 2 · ZONES)
+        Of the square around a cell, and the factor of sums over it.
+    columns : float64, shape (columns of the window and margins of `square`, 2 · ZONES)
+        Workspace.
     pooled : float64, shape (2 · ZONES,)
-        To work in.
+        Workspace.
     """
     bottom, top, left, right = window
     height, width = len(normals.before), normals.before.shape[1] - 1
@@ -228,7 +229,7 @@ def narrowed(
     grid: Grid,
     window: Window,
 ) -> SurfaceNormals:
-    """Return the normals with lengths that state each surface's own incidence angle, in a window.
+    """Return the normals, whose lengths in a window state the limit of the incidence angle of each surface.
 
     Parameters
     ----------
@@ -255,16 +256,16 @@ def with_own_angles(
     window: Window,
     edges: NDArray[np.float64],
 ) -> SurfaceNormals:
-    """Return the normals with lengths that state each surface's own incidence angle, counted on one thread.
+    """Return the normals, whose lengths state the limit of the incidence angle of each surface; single-threaded.
 
     Parameters
     ----------
     normals : SurfaceNormals
         Of length one in all that is `touched` by the window; they are changed in the window.
     cones : records of `CONE`, shape (N,)
-        All that come into what is `touched`.
+        All that reach into the `touched` window.
     weights : int32, shape (N,)
-        How many readings each stands for.
+        Number of readings that each represents.
     grid : Grid
     window : first row, last one plus one, and columns likewise
     edges : float64, shape (ZONES,)

@@ -1,17 +1,17 @@
-"""Normals of surfaces, and which readings exceed the incidence angle at which a surface returns an echo.
+"""Normals of surfaces, and readings that exceed the incidence angle up to which a surface returns echoes.
 
-Sound that meets a smooth surface at a slant does not come back. So a reading that reaches past a surface contradicts it
-only if it met the surface nearly along its normal. Most of what speaks against walls that are there, in recordings
-of real sonars, comes from readings that exceed the incidence angle.
+Sound that meets a smooth surface at a slant is reflected away from the sensor. So a reading longer than the distance of
+a surface is evidence against it only if it met the surface nearly along its normal. In recordings of real sonars, most
+of the evidence against true walls comes from readings that exceed the incidence angle.
 
-The normal is estimated before any search, from the echoes alone. Near a surface the bearings of those readings whose
-range agrees gather around its normal; φ and φ + π are one, so 2φ is averaged, over the square of `NEIGHBOURHOOD`
-around the cell:
+Normals are estimated before the search, from the echoes alone. Near a surface, the bearings φ of the readings whose
+range agrees are distributed around its normal. φ and φ + π are equivalent, so 2φ is averaged over the square of
+`NEIGHBOURHOOD` around the cell:
 
     C = Σ w cos 2φ      S = Σ w sin 2φ      M = Σ w      w = exp(−(d − z)² / 2σ²)      normal = atan2(S, C) / 2
 
-It counts as known where M and √(C² + S²) / M are large enough. How far off it the surface returns echoes is another
-question (`incidence`).
+It is known if M and √(C² + S²) / M are large enough. Up to which angle the surface returns echoes is estimated in
+`incidence`.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from .cone import rows_of, runs_of
 from .cone_table import Cones, cone_of
 
 QUANTUM = 2.0**-20
-"""Unit of the sums, which as whole numbers do not depend on their order."""
+"""Unit of the integer sums, which do not depend on their order."""
 
 
 class SurfaceNormals(NamedTuple):
@@ -39,13 +39,13 @@ class SurfaceNormals(NamedTuple):
     ----------
     known : uint8, shape (cells,)
     x, y : float32, shape (cells,)
-        Along the normal, either way; 0 where it is not known. Of length one where the surface returns echoes up to the
-        incidence angle of the model, shorter where it does so up to less: (x, y) times a unit vector is the cosine off
-        the normal times cos(angle of the model) / cos(own angle), and is held against `cos2_limit` (`incidence`).
+        Along the normal, with either sign; 0 if unknown. The length is one if the surface returns echoes up to the
+        largest angle of the model, and cos(angle of the model) / cos(own limit) if its own limit is smaller
+        (`incidence`): so the squared product with a unit vector is compared with `cos2_limit` for all surfaces.
     before : int32, shape (height, width + 1)
         Number of known cells in each row before a column.
     cos2_limit : float
-        Squared cosine of the angle off the normal above which a reading exceeds the incidence angle; 0 if none does.
+        Squared cosine of the largest angle to the normal; 0 if there is no limit.
     """
 
     known: NDArray[np.uint8]
@@ -56,7 +56,7 @@ class SurfaceNormals(NamedTuple):
 
 
 def on_larger_grid(normals: SurfaceNormals, inner: Grid, outer: Grid) -> SurfaceNormals:
-    """Return the normals of `inner` as those of `outer`, which holds it; none is known outside of `inner`."""
+    """Return the normals of `inner` on the larger grid `outer`; those outside of `inner` are unknown."""
     if not len(normals.known):
         return normals
     window = outer.window(inner)
@@ -73,7 +73,7 @@ def on_larger_grid(normals: SurfaceNormals, inner: Grid, outer: Grid) -> Surface
 
 
 def known_normals(known: NDArray[np.uint8], x: NDArray[Any], y: NDArray[Any], angle: float) -> SurfaceNormals:
-    """Return normals that were kept.
+    """Return normals from stored arrays.
 
     Parameters
     ----------
@@ -87,7 +87,7 @@ def known_normals(known: NDArray[np.uint8], x: NDArray[Any], y: NDArray[Any], an
 
 
 def no_normals() -> SurfaceNormals:
-    """Return normals at which no reading exceeds the incidence angle."""
+    """Return normals without any limit of the incidence angle."""
     none = np.zeros(0, np.float32)
     return SurfaceNormals(np.zeros(0, np.uint8), none, none, np.zeros((1, 1), np.int32), 0.0)
 
@@ -129,26 +129,26 @@ def _before(known: NDArray[Any]) -> NDArray[np.int32]:
 
 
 Square = tuple[int, float]
-"""How many cells `NEIGHBOURHOOD` reaches beyond the middle one, and which part of the outermost counts."""
+"""Number of cells by which `NEIGHBOURHOOD` extends beyond the middle one, and weight of the outermost ones."""
 
 
 def square_of(resolution: float) -> Square:
-    """Return it for cells of so many metres."""
+    """Return the square of `NEIGHBOURHOOD` for a cell size, metres."""
     half = (max(round(NEIGHBOURHOOD / resolution, 6), 1.0) - 1.0) / 2.0
     whole = math.ceil(half - 1e-9)
     return whole, half - whole + 1.0
 
 
 def unit_of_sums(resolution: float) -> float:
-    """Return what 1 in a sum over `NEIGHBOURHOOD` counts, in cells of `WEIGHT_CELL`."""
+    """Return the factor from sums over `NEIGHBOURHOOD` to weights in cells of `WEIGHT_CELL`."""
     return float(QUANTUM * (resolution / WEIGHT_CELL) ** 2)
 
 
 @kernel
 def sum_columns(values: Any, row: int, first: int, square: Square, out: Any) -> None:
-    """Write to `out` the sums of columns over the height of `NEIGHBOURHOOD` around a row, those from `first` on.
+    """Write the sums of columns, from `first` on, over the height of `NEIGHBOURHOOD` around a row to `out`.
 
-    Nothing is added from beyond the edges of `values`, int64, shape (height, width).
+    Outside of `values`, int64, shape (height, width), everything is 0.
     """
     height, width = values.shape
     out[:] = 0.0
@@ -161,7 +161,7 @@ def sum_columns(values: Any, row: int, first: int, square: Square, out: Any) -> 
 
 @kernel
 def sum_across(columns: Any, begin: int, square: Square) -> float:
-    """Return the sum of what `sum_columns` wrote, over the width of `NEIGHBOURHOOD`."""
+    """Return the sum of the results of `sum_columns` over the width of `NEIGHBOURHOOD`."""
     total = 0.0
     for k in range(-square[0], square[0] + 1):
         total += (square[1] if abs(k) == square[0] else 1.0) * columns[begin + square[0] + k]
@@ -179,8 +179,8 @@ def _estimate(normals: SurfaceNormals, sums: Any, window: Window, square: Square
     window, square
     unit : float
         `unit_of_sums`.
-    columns : float64, shape (3, columns of the window and what `square` is beyond)
-        To work in.
+    columns : float64, shape (3, columns of the window and margins of `square`)
+        Workspace.
     """
     bottom, top, left, right = window
     width = sums.shape[2]
@@ -209,14 +209,14 @@ def _write(normals: SurfaceNormals, sums: NDArray[np.int64], grid: Grid, window:
 
 
 def normals_of(sums: NDArray[np.int64], grid: Grid, angle: float) -> SurfaceNormals:
-    """Return the normals that the sums of `gather` give.
+    """Return the normals from the sums of `gather`.
 
     Parameters
     ----------
     sums : int64, shape (3, cells)
     grid : Grid
     angle : float
-        Radians off the normal beyond which a surface returns no echo.
+        Largest angle to the normal at which surfaces return echoes, radians.
     """
     normals = _unknown(grid.shape, math.cos(angle) ** 2)
     _write(normals, sums, grid, (0, grid.height, 0, grid.width))
@@ -230,7 +230,7 @@ def _unknown(shape: tuple[int, int], cos2_limit: float) -> SurfaceNormals:
 
 
 def renewed(normals: SurfaceNormals, sums: NDArray[np.int64], grid: Grid, window: Window) -> SurfaceNormals:
-    """Return the normals after the sums changed in a window; those given stay as they are.
+    """Return new normals after the sums changed in a window; the given ones are not modified.
 
     Parameters
     ----------
@@ -256,7 +256,7 @@ def touched(window: Window, grid: Grid) -> Window:
 
 @kernel
 def exceeds_incidence_angle(normals: SurfaceNormals, reading: Any, c: int, u: float, v: float) -> bool:
-    """Return whether a reading meets cell c, at (u, v) from its apex, beyond the incidence angle, and goes on."""
+    """Return whether a reading passed cell c, at (u, v) from its apex, beyond the limit of the incidence angle."""
     if not normals.known[c]:
         return False
     square = u * u + v * v

@@ -1,4 +1,4 @@
-"""The whole map that tiles are cut from and put back into."""
+"""The whole map in tiles: provides the input of each tile, and stores its results."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ from .windows import Finished, Given, Judged, Searched, normals_from
 T = TypeVar('T')
 
 Each = Callable[[Callable[[Given], T], Iterable[Given]], Iterable[T]]
-"""Calls a function with each item, in any order or at once, and returns the results in the order of the items: `map`,
-or that of an executor."""
+"""Calls a function with each item, in any order or in parallel, and returns the results in the order of the items:
+`map`, or that of an executor."""
 
 
 FIRST_AROUND = 2.0
-"""Metres around a core whose readings make its first map."""
+"""Metres around a core from which readings make its first map."""
 
 
 class Mosaic:
-    """The map of all tiles as far as it is known, and the tiles that have to be searched again.
+    """The present map of all tiles, and the tiles that must be searched again.
 
     Attributes
     ----------
@@ -38,7 +38,7 @@ class Mosaic:
     grid : Grid
     tiling : Tiling
     schedule : Schedule
-        Of the tiles that have to be searched.
+        Of the tiles that must be searched.
     traversed : bool, shape `grid.shape`
     occupied : uint8, shape `grid.shape`
     normals : float32, shape (2, *grid.shape)
@@ -68,7 +68,7 @@ class Mosaic:
 
     @property
     def halo(self) -> float:
-        """Readings of all tiles together, by those that there are: how often each is evaluated."""
+        """Mean number of tiles that evaluate a reading."""
         return sum(map(len, self._readings_of)) / len(self.readings)
 
     @property
@@ -80,11 +80,11 @@ class Mosaic:
         return self.tiling.box(number, self.readings.select(indices), self._parameters)
 
     def given(self, number: int) -> Given:
-        """Return what is known around a tile."""
+        """Return the input of a tile."""
         return self._given(number, self._readings_of[number], self._boxes[number])
 
     def given_first(self, number: int) -> Given:
-        """Return what is known around a tile for its first map, which is made without its neighbours."""
+        """Return the input of a tile for its first map, which is made without its neighbours."""
         indices = self._first_readings[number]
         return self._given(number, indices, self._box(number, indices))
 
@@ -109,26 +109,26 @@ class Mosaic:
         return normals_from(self.normals, self._parameters)
 
     def take_normals(self, number: int, normals: NDArray[np.float32]) -> None:
-        """Keep the normals of a core."""
+        """Store the normals of a core."""
         self.normals[(slice(None), *self._core(number))] = normals
 
     def take_first(self, number: int, found: Searched) -> None:
-        """Keep the core of a map that was found without its neighbours."""
+        """Store the core of a first map."""
         tile = self.tiling.tiles[number]
         self.occupied[self._core(number)] = found.occupied[tile.window.window(tile.core)]
 
     def take(self, number: int, found: Searched) -> None:
-        """Keep the map of a window; tiles that see what changed are stale."""
+        """Store the map of a window; tiles whose boxes contain changes become stale."""
         self.occupied[self.grid.window(self.tiling.tiles[number].window)] = found.occupied
         self.schedule.searched(number, found.changed)
 
     def take_finished(self, number: int, found: Finished) -> None:
-        """Keep the maps of a core."""
+        """Store the final maps of a core."""
         core = self._core(number)
         self.ml[core], self.uncertainty[core], self.searched[core] = found.ml, found.uncertainty, found.searched
 
     def take_judged(self, number: int, found: Judged) -> None:
-        """Keep what was found of the readings of a tile."""
+        """Store the results for the own readings of a tile."""
         indices = self._readings_of[number]
         own = indices[self._owner[indices] == number]
         self.log_likelihood[own], self.unexplained[own] = found.log_likelihood, found.unexplained

@@ -1,4 +1,4 @@
-"""Which tiles have to be searched: all of them once, and again those that see what has changed in another one."""
+"""The schedule of tiles: each is searched once, and again after changes of another tile within its box."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from .tiling import common_part
 
 
 class Schedule:
-    """The tiles that are stale: they were not searched yet, or their surroundings have changed since.
+    """The stale tiles, which were not searched yet, or whose box has changed since.
 
     Attributes
     ----------
@@ -26,7 +26,7 @@ class Schedule:
         return [number for number in colour if number in self.stale]
 
     def searched(self, number: int, changed: Grid | None) -> None:
-        """Note that a tile was searched, and the part of the lattice in which its search changed anything."""
+        """Record that a tile was searched; `changed` is the part of the lattice that its search changed, or None."""
         self.stale.discard(number)
         if changed is None:
             return

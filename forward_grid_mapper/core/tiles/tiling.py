@@ -1,11 +1,11 @@
-"""Tiles of a grid, the readings that each of them takes, and which tiles may be searched at once.
+"""Tiles of a grid, their readings, and which tiles may be searched in parallel.
 
-A tile has three nested windows. Its *core* is its own part of the map; the cores cover the grid. Its *window* is the
-core and `MARGIN` around it: whatever move the search makes, a gap closed or a wall shifted, lies in some window. Its
-*box* holds the cones of all readings that touch the window, its halo.
+A tile has three nested areas. Its *core* is its own part of the map; the cores cover the grid. Its *window* is the core
+and a `margin` around it, so that each move of the search, such as closing a gap or shifting a wall, lies in some
+window. Its *box* contains the cones of all readings that reach into the window.
 
-All that the readings say of a cell of the window is in the box: so what a flip there gains is exact, as long as the
-rest of the box is held. Tiles of one *colour* have no reading in common, so they do not see each other change.
+All readings of the cells of the window are in the box, so gains of flips there are exact while the rest of the box is
+fixed. Tiles of one *colour* have no reading in common, so they do not affect each other.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ from ..common.readings import Readings
 from ..sensor.cone_table import effective_sigma, grid_of, reach_of
 
 ROUND = max(LONGEST_GAP, SHORT_WALL)
-"""Metres around a window that its moves look at, whatever the readings reach: the other end of a gap, the rest of a
-short wall. The prior looks `NEIGHBOURS_AWAY` cells farther."""
+"""Metres around a window that its moves depend on, besides the readings: the other end of a gap, or the rest of a short
+wall. The prior depends on `NEIGHBOURS_AWAY` more cells."""
 
 NEIGHBOURS_AWAY = 3
 
 
 class Tile(NamedTuple):
-    """One tile: its place among the tiles, its core and its window."""
+    """One tile: its row and column among the tiles, its core and its window."""
 
     row: int
     column: int
@@ -52,16 +52,16 @@ class Tiling:
     """
 
     def __init__(self, grid: Grid, size: float, widest: float) -> None:
-        """Cut a grid into tiles.
+        """Divide a grid into tiles.
 
         Parameters
         ----------
         grid : Grid
-            Of the whole map; holds the cones of all readings.
+            Of the whole map; it contains the cones of all readings.
         size : float
-            Edge of a tile, metres; a cell at the least. Edges lie on the lattice, wherever the grid begins.
+            Side of a tile, metres; at least a cell. Edges lie on the lattice, independent of the grid.
         widest : float
-            That of `widest_of`, of the boxes of all readings, metres.
+            `widest_of` the boxes of all readings, metres.
         """
         self.grid = grid
         self._edge = edge_of(size, grid.resolution)
@@ -89,7 +89,7 @@ class Tiling:
         return tuple(tuple(colours[key]) for key in sorted(colours))
 
     def around(self, tile: Tile) -> Grid:
-        """Return the window and the cells around it that its search looks at, whatever the readings reach."""
+        """Return the window and the cells around it that its moves depend on, besides the readings."""
         n, w = self._around, tile.window
         wide = Grid(w.resolution, w.column - n, w.row - n, w.width + 2 * n, w.height + 2 * n)
         return common_part(wide, self.grid)
@@ -99,7 +99,7 @@ class Tiling:
         around = self.around(self.tiles[number])
         if not len(readings):
             return around
-        # no box is larger than the whole
+        # no limit is needed, since no box is larger than the grid
         unlimited = dataclasses.replace(parameters.grid, max_cells=self.grid.size)
         return grid_of(readings, parameters.model, unlimited, within=around)
 
@@ -109,22 +109,22 @@ class Tiling:
         Parameters
         ----------
         boxes : float64, shape (4, N)
-            Those of `boxes_of`.
+            From `boxes_of`.
         around : float
-            Metres: also those that touch what is so near to the core, where that is more.
+            Metres around the core that are used in place of the window, if this is more.
         """
         found = by_tile(boxes, self.grid.resolution, self._edge, around)
         none = np.zeros(0, np.int64)
         return [found.get((tile.row, tile.column), none) for tile in self.tiles]
 
     def touching(self, number: int, boxes: NDArray[np.float64], around: float = 0.0) -> NDArray[np.bool_]:
-        """Return which readings are among those that `readings_of` gives a tile, shape (N,)."""
+        """Return a mask of the `readings_of` a tile, shape (N,)."""
         first, last = _touched(boxes, self.grid.resolution, self._edge, around)
         place = np.array(self.tiles[number][:2])[:, None]
         return np.asarray(((first <= place) & (place <= last)).all(axis=0))
 
     def meeting(self, part: Grid, window: bool = False) -> list[int]:
-        """Return the tiles whose cores, or windows, have cells in a part of the grid."""
+        """Return the tiles whose cores, or windows, overlap a part of the grid."""
         m = self._margin if window else 0
         rows = range((part.row - m) // self._edge, (part.row + part.height - 1 + m) // self._edge + 1)
         columns = range((part.column - m) // self._edge, (part.column + part.width - 1 + m) // self._edge + 1)
@@ -132,7 +132,7 @@ class Tiling:
         return [r * self._across + c for r, c in places if 0 <= r < self._up and 0 <= c < self._across]
 
     def owners(self, readings: Readings) -> NDArray[np.int64]:
-        """Return the tile in whose core each sensor was, shape (N,): so each reading is of one tile."""
+        """Return the tile that each reading belongs to, by the core that its sensor was in, shape (N,)."""
         rows, columns = self.grid.cells_of(readings.x, readings.y)
         row = (np.clip(rows, 0, self.grid.height - 1) + self.grid.row) // self._edge - self._corner[0]
         column = (np.clip(columns, 0, self.grid.width - 1) + self.grid.column) // self._edge - self._corner[1]
@@ -141,14 +141,14 @@ class Tiling:
 
 
 def edge_of(size: float, resolution: float) -> int:
-    """Return the edge of tiles of `size` metres, in cells."""
+    """Return the side of tiles of `size` metres, cells."""
     return max(round(size / resolution), 1)
 
 
 def _touched(
     boxes: NDArray[np.float64], resolution: float, edge: int, around: float
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the first and the last row and column of tiles that cones touch, metres around; shape (2, N)."""
+    """Return first and last row and column of the tiles whose windows cones may touch, each of shape (2, N)."""
     left, right, bottom, top = np.floor(boxes / resolution).astype(np.int64)
     cells = max(margin(resolution), round(around / resolution))
     return (np.stack([bottom, left]) - cells) // edge, (np.stack([top, right]) + cells) // edge
@@ -157,9 +157,9 @@ def _touched(
 def by_tile(
     boxes: NDArray[np.float64], resolution: float, edge: int, around: float = 0.0
 ) -> dict[tuple[int, int], NDArray[np.int64]]:
-    """Return the indices of the readings that touch each tile, as `Tiling.readings_of`, by its row and column.
+    """Return `Tiling.readings_of` by row and column of the tiles.
 
-    For this no grid need be known: the edges of tiles lie on the lattice.
+    It needs no grid, since the edges of tiles lie on the lattice.
     """
     first, last = _touched(boxes, resolution, edge, around)
     spans = last - first + 1
@@ -182,7 +182,7 @@ def widest_of(boxes: NDArray[np.float64]) -> float:
 
 
 def margin(resolution: float) -> int:
-    """Return how many cells a window reaches beyond its core: half the longest gap, so that one window holds each."""
+    """Return the cells of a window beyond its core: half the longest gap, so that each gap lies in some window."""
     return math.ceil(LONGEST_GAP / 2 / resolution) + 1
 
 
@@ -194,7 +194,7 @@ def boxes_of(readings: Readings, parameters: Parameters) -> NDArray[np.float64]:
 
 
 def common_part(grid: Grid, whole: Grid) -> Grid:
-    """Return the part of a grid that lies in another one; it may have no cells."""
+    """Return the intersection of two grids; it may have no cells."""
     left, bottom = max(grid.column, whole.column), max(grid.row, whole.row)
     right = min(grid.column + grid.width, whole.column + whole.width)
     top = min(grid.row + grid.height, whole.row + whole.height)

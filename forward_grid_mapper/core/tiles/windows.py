@@ -1,6 +1,6 @@
-"""What is done with one tile: functions of its readings and of the map around it, which any process may call.
+"""Work on a single tile: functions of its readings and of the map around it, which any process may run.
 
-Each takes a `Given` and returns arrays of the tile's core alone (of its window, where the search may change it).
+Each takes a `Given` and returns arrays of the core of the tile, or of its window if the search may change that.
 """
 
 from __future__ import annotations
@@ -28,24 +28,24 @@ from .tiling import Tile
 
 
 class Given(NamedTuple):
-    """What is known around a tile.
+    """The input for the work on a tile.
 
     Attributes
     ----------
     tile : Tile
     box : Grid
-        Holds the cones of all its readings, and its window.
+        Contains the cones of all its readings, and its window.
     readings : Readings
-        Whose cones may touch the window, in canonical order.
+        Those whose cones may reach into the window, in canonical order.
     own : bool, shape (N,)
-        Those whose sensors were in the core.
+        Mask of those whose sensors were in the core.
     traversed : bool, shape `box.shape`
     occupied : uint8, shape `box.shape`
         The map.
     normals : float32, shape (2, *box.shape)
-        Along the surface normals, as of `SurfaceNormals`, 0 where none is known.
+        x and y of the surface normals (`SurfaceNormals`), 0 if unknown.
     ml : int8, shape `box.shape`
-        The map that is handed out; only for `judged`.
+        The final map; only for `judged`.
     """
 
     tile: Tile
@@ -58,12 +58,12 @@ class Given(NamedTuple):
     ml: NDArray[np.int8]
 
     def core(self, values: NDArray[Any]) -> NDArray[Any]:
-        """Return a copy of the part of an array of the box that is the core's."""
+        """Return a copy of the core's part of an array of the box."""
         return np.array(values.reshape(self.box.shape)[self.box.window(self.tile.core)])
 
 
 def normals_from(xy: NDArray[np.float32], parameters: Parameters) -> SurfaceNormals:
-    """Return normals from x and y as of `SurfaceNormals`, float32, shape (2, height, width), 0 where none is known."""
+    """Return normals from x and y (`SurfaceNormals`), float32, shape (2, height, width), 0 if unknown."""
     if not has_limit(parameters.model):
         return no_normals()
     x, y = xy
@@ -71,7 +71,7 @@ def normals_from(xy: NDArray[np.float32], parameters: Parameters) -> SurfaceNorm
 
 
 class Searched(NamedTuple):
-    """The map of a window after a search, and the part of the lattice in which it changed, None if it did not."""
+    """The map of a window after a search, and the part of the lattice that changed, or None."""
 
     occupied: NDArray[np.uint8]
     changed: Grid | None
@@ -80,7 +80,7 @@ class Searched(NamedTuple):
 
 
 class Finished(NamedTuple):
-    """The maps of a core that the search gives, and sums over the tile's own readings."""
+    """The final maps of a core, and sums over the own readings of the tile."""
 
     ml: NDArray[np.int8]
     uncertainty: NDArray[np.float32]
@@ -92,7 +92,7 @@ class Finished(NamedTuple):
 
 
 class Judged(NamedTuple):
-    """What the map says of the tile's own readings."""
+    """The evaluation of the own readings of a tile on the final map."""
 
     log_likelihood: NDArray[np.float64]
     unexplained: NDArray[np.bool_]
@@ -101,7 +101,7 @@ class Judged(NamedTuple):
 
 
 def found_normals(given: Given, parameters: Parameters) -> NDArray[np.float32]:
-    """Return x and y of the surface normals of the core, as of `SurfaceNormals`, float32, shape (2, *core.shape)."""
+    """Return x and y of the surface normals of the core (`SurfaceNormals`), float32, shape (2, *core.shape)."""
     box = given.box
     if not has_limit(parameters.model):
         return np.zeros((2, *given.tile.core.shape), np.float32)
@@ -126,7 +126,7 @@ def _evidence(given: Given, parameters: Parameters) -> Evidence:
 
 
 def _filled_part(mask: NDArray[np.bool_], window: Grid) -> Grid | None:
-    """Return the smallest part of a window that holds all cells of a mask; None if there are none."""
+    """Return the smallest part of a window that contains all cells of a mask; None if there are none."""
     rows, columns = np.flatnonzero(mask.any(axis=1)).tolist(), np.flatnonzero(mask.any(axis=0)).tolist()
     if not rows:
         return None
@@ -135,9 +135,9 @@ def _filled_part(mask: NDArray[np.bool_], window: Grid) -> Grid | None:
 
 
 def first_map(given: Given, parameters: Parameters) -> Searched:
-    """Search all of the box from the empty map, and return the window's part of it.
+    """Search the whole box from the empty map, and return the part of the window.
 
-    What lies outside of the window is not seen by all its readings, and serves to explain those of the window.
+    Cells outside of the window lack some of their readings; they only help to explain the readings of the window.
     """
     given = given._replace(occupied=np.zeros_like(given.occupied))
     evidence = _evidence(given, parameters)
@@ -148,7 +148,7 @@ def first_map(given: Given, parameters: Parameters) -> Searched:
 
 
 def improved(given: Given, parameters: Parameters) -> Searched:
-    """Search the window, and hold the rest of the box, until nothing gains."""
+    """Search the window, with the rest of the box fixed, until nothing gains."""
     evidence = _evidence(given, parameters)
     rows, columns = given.box.window(given.tile.window)
     window = rows.start, rows.stop, columns.start, columns.stop
@@ -162,7 +162,7 @@ def improved(given: Given, parameters: Parameters) -> Searched:
 
 
 def finished(given: Given, parameters: Parameters) -> Finished:
-    """Return the maps of the core that go with the map that the search found."""
+    """Return the final maps of the core from the map that the search found."""
     p = parameters
     evidence = _evidence(given, p)
     searched = evidence.observed()
@@ -179,7 +179,7 @@ def finished(given: Given, parameters: Parameters) -> Finished:
 
 
 def judged(given: Given, parameters: Parameters) -> Judged:
-    """Return what the map that is handed out says of the tile's own readings."""
+    """Evaluate the own readings of the tile on the final map."""
     own = given.readings.select(given.own)
     forward = ForwardModel(own, given.box, parameters.model, normals_from(given.normals, parameters))
     e = forward.expectations(given.ml)

@@ -1,1 +1,1 @@
-"""Trajectory and map together: the drift of odometry is taken out by matching sonar with local maps."""
+"""SLAM: the trajectory is estimated together with the map, which removes the drift of odometry."""

@@ -103,15 +103,15 @@ def determined_calibration(
     return {name: stated[name] for name in CALIBRATION if name in stated and stated[name].sigma <= LARGEST_SIGMA[name]}
 
 
-def combined_calibration(first: Mapping[str, float], told: Mapping[str, Estimate]) -> dict[str, Estimate]:
-    """Return the calibration of raw odometry, if `told` is the one of odometry to which `first` was applied."""
+def combined_calibration(first: Mapping[str, float], estimates: Mapping[str, Estimate]) -> dict[str, Estimate]:
+    """Return the calibration of raw odometry, if `estimates` are for odometry to which `first` was applied."""
     one = {name: first.get(name, 0.0) for name in CALIBRATION}
     found = {}
-    for name, (value, sigma) in told.items():
+    for name, (value, sigma) in estimates.items():
         if name == 'heading':
             both = one[name] + value
         elif name == 'bias':
-            turns = told['turn_scale'].value if 'turn_scale' in told else 0.0
+            turns = estimates['turn_scale'].value if 'turn_scale' in estimates else 0.0
             both = (1 + turns) * one[name] + value * (1 + one['scale'])
         else:
             both = (1 + one[name]) * (1 + value) - 1

@@ -44,8 +44,8 @@ from .walls import wall_votes
 from .windows import TRAVEL, TURN, Odometry, Windows, cut
 
 SETTLED, LONGEST, SHIFT = 12, 44, 8
-"""Windows at the begin of the tail whose nodes are fixed (5 m, on which walls begin); most windows of the tail (18 m);
-windows that leave it in one step (3 m)."""
+"""Windows at the begin of the tail whose nodes are fixed (5 m, from which walls continue); most windows of the tail
+(18 m); windows that leave it in one step (3 m)."""
 
 LATE = NANOSECONDS // 5
 """Nanoseconds that a window waits for readings that arrive out of order."""

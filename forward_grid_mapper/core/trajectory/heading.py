@@ -77,10 +77,10 @@ DOUBTFUL, PAUSE = 0.02, 5
 NEGLIGIBLE = 1e-4
 """Places with a smaller probability are ignored."""
 
-PARTS_ASKEW = 2
+MOST_FURTHER_PARTS = 2
 """Most parts of a building that stand at an angle to the first one."""
 
-ASKEW, FINER = np.radians(np.arange(6.0, 85.0, 3.0)), np.radians([-2.0, -1.0, 1.0, 2.0])
+TRIED_DIRECTIONS, FINER = np.radians(np.arange(6.0, 85.0, 3.0)), np.radians([-2.0, -1.0, 1.0, 2.0])
 """Directions of walls that are tried, radians relative to the first part, and offsets around the best of these."""
 
 LEAST_APART = math.radians(6.0)
@@ -89,7 +89,7 @@ LEAST_APART = math.radians(6.0)
 ENTERED = 0.02
 """Rate at which the direction of walls is drawn again, 1/m."""
 
-LEAST_ASKEW = 8.0
+LEAST_PART_GAIN = 8.0
 """Nats by which votes must be likelier with another direction of walls. It was at most 5.1 in 64 drives through
 buildings with right angles, 10 to 21 in 5 of 12 drives through buildings with a kink, less than 7 in the other 7."""
 
@@ -123,7 +123,7 @@ class Heading:
         Probability that no right angle was lost, the smallest of the drive.
     over_odometry : float
         Log-likelihood ratio of all votes to odometry without errors of the yaw, nats.
-    askew : float64, shape (B,)
+    wall_direction : float64, shape (B,)
         Direction of the walls at each place, radians, modulo a right angle: 0 in the first part of the building.
     doubts : tuple of (int, float)
         Doubtful nodes, and the probability that a right angle was lost there.
@@ -139,7 +139,7 @@ class Heading:
     gain: float
     certainty: float
     over_odometry: float
-    askew: Floats
+    wall_direction: Floats
     doubts: tuple[tuple[int, float], ...] = ()
     slight: tuple[tuple[int, float], ...] = ()
 
@@ -154,7 +154,7 @@ class _Chain:
 
     Parameters
     ----------
-    askew : sequence of float
+    directions : sequence of float
         Directions of walls, radians; the first is 0.
     around : int
         Number of right angles that the states of δ cover: 1 or 4.
@@ -172,7 +172,7 @@ class _Chain:
         windows: Windows,
         at: NDArray[np.int64],
         votes: Floats,
-        askew: Sequence[float] = (0.0,),
+        directions: Sequence[float] = (0.0,),
         around: int = 1,
         temper: float = 1.0,
         wider: float = 1.0,
@@ -183,13 +183,13 @@ class _Chain:
         self.states, self._wider = around * STATES, wider
         self.grid = np.arange(self.states) * STEP
         # a wall along an axis has the direction −(yaw + δ) in the frame of the node
-        seen = np.degrees(np.array(askew)[:, None] - (yaw[:, None, None] + self.grid)) % DIRECTIONS
+        seen = np.degrees(np.array(directions)[:, None] - (yaw[:, None, None] + self.grid)) % DIRECTIONS
         ends = np.column_stack([votes, votes[:, :1]])
         places = np.arange(DIRECTIONS + 1)
         rows = np.stack([np.interp(place, places, row) for place, row in zip(seen, ends, strict=True)])
         self.likelihood: Floats = (UNIFORM_PART + (1.0 - UNIFORM_PART) * rows) ** temper
         self._anywhere = np.full(self.states, 1 / self.states)
-        self._other = -np.expm1(-ENTERED * self.length) if len(askew) > 1 else np.zeros(len(self.length))
+        self._other = -np.expm1(-ENTERED * self.length) if len(directions) > 1 else np.zeros(len(self.length))
 
     def drift(self, drifts: Drifts) -> Floats:
         """Return the change of δ from each place to the next, without noise, radians, shape (B − 1,)."""
@@ -312,28 +312,28 @@ def heading(windows: Windows, at: NDArray[np.int64], votes: Floats, noises: Sequ
     """
     if len(at) < FEWEST_VOTES:
         return None
-    askew = [0.0]
+    directions = [0.0]
     chain = _Chain(windows, at, votes)
     best, value = _fitted(chain, Drifts(0.0, 0.0, noises[len(noises) // 2]), noises)
-    while len(askew) <= PARTS_ASKEW:
-        angle, noise, likelier = _further_direction(windows, at, votes, askew, best, noises)
+    while len(directions) <= MOST_FURTHER_PARTS:
+        angle, noise, likelier = _further_direction(windows, at, votes, directions, best, noises)
         if likelier <= value:
             break
-        other = _Chain(windows, at, votes, [*askew, angle])
+        other = _Chain(windows, at, votes, [*directions, angle])
         found, now = _fitted(other, best._replace(noise=noise), noises)
-        if now - value < LEAST_ASKEW:
+        if now - value < LEAST_PART_GAIN:
             break
-        askew, chain, best, value = [*askew, angle], other, found, now
+        directions, chain, best, value = [*directions, angle], other, found, now
     total = chain.log_likelihood(best)
     if total < LEAST_GAIN * len(at):
         return None
-    circle = _Chain(windows, at, votes, askew, 4, TEMPER, WIDER)
+    circle = _Chain(windows, at, votes, directions, 4, TEMPER, WIDER)
     # at the begin of the drive any of the four right angles may be chosen
     first = chain.grid[int(chain.smooth(best)[0].sum(0).argmax())]
     start = (np.abs(circle.off(first)) < math.pi / 4).astype(np.float64)
     belief = circle.smooth(best, start)
     correction, certain = _most_probable(circle, belief.sum(1))
-    direction = np.array(askew)[belief.sum(2).argmax(1)]
+    direction = np.array(directions)[belief.sum(2).argmax(1)]
     measured, information = yaws_of_votes(votes, windows.node[at, 2] - direction, correction)
     return Heading(
         at,
@@ -368,7 +368,7 @@ def _further_direction(
     windows: Windows,
     at: NDArray[np.int64],
     votes: Floats,
-    askew: Sequence[float],
+    directions: Sequence[float],
     drifts: Drifts,
     noises: Sequence[float],
 ) -> tuple[float, float, float]:
@@ -379,11 +379,13 @@ def _further_direction(
     def best(angles: list[float], noises: Sequence[float]) -> tuple[float, float, float]:
         tried = []
         for angle in angles:
-            chain = _Chain(windows, at, votes, [*askew, angle])
+            chain = _Chain(windows, at, votes, [*directions, angle])
             tried += [(angle, noise, _log_posterior(chain, drifts._replace(noise=noise))) for noise in noises]
         return max(tried, key=lambda each: each[2])
 
     quarter = math.pi / 2
-    apart = [min(abs(math.remainder(angle - known, quarter)) for known in askew) for angle in ASKEW]
-    angle, noise, _ = best([float(a) for a, least in zip(ASKEW, apart, strict=True) if least >= LEAST_APART], some)
+    apart = [min(abs(math.remainder(angle - known, quarter)) for known in directions) for angle in TRIED_DIRECTIONS]
+    angle, noise, _ = best(
+        [float(a) for a, least in zip(TRIED_DIRECTIONS, apart, strict=True) if least >= LEAST_APART], some
+    )
     return best([angle, *(angle + FINER).tolist()], [noise])

@@ -35,7 +35,7 @@ ROBUST_ODOMETRY = 3.0
 ROBUST_YAW = 3.0
 """k of Geman and McClure's loss for measured yaws and distances of walls, σ."""
 
-ASKEW = math.radians(0.5)
+WALL_ANGLE_SIGMA = math.radians(0.5)
 """σ of the angle between a wall and its axis, radians."""
 
 ITERATIONS = 30
@@ -325,11 +325,11 @@ class _Normal:
         prior = np.zeros(self.size)
         prior[:2], prior[2] = 1e8, 1e-3 if len(self.graph.yaws.node) else 1e8
         prior[end : end + len(calibration)] = 1.0 / self.graph.calibration_sigma**2
-        prior[end + len(calibration) :: 2], prior[end + len(calibration) + 1 :: 2] = 1e-6, 1.0 / ASKEW**2
+        prior[end + len(calibration) :: 2], prior[end + len(calibration) + 1 :: 2] = 1e-6, 1.0 / WALL_ANGLE_SIGMA**2
         self.cost += float(((calibration / self.graph.calibration_sigma) ** 2).sum())
-        self.cost += float(((walls[:, 1] / ASKEW) ** 2).sum())
+        self.cost += float(((walls[:, 1] / WALL_ANGLE_SIGMA) ** 2).sum())
         self.gradient[end : end + len(calibration)] += calibration / self.graph.calibration_sigma**2
-        self.gradient[end + len(calibration) + 1 :: 2] += walls[:, 1] / ASKEW**2
+        self.gradient[end + len(calibration) + 1 :: 2] += walls[:, 1] / WALL_ANGLE_SIGMA**2
         self.h = (self.h + sparse.diags(prior)).tocsc()
         self.prior = prior
         self.prior[:3] = 0.0

@@ -214,7 +214,7 @@ class Solver(MatchSolver):
         yaw = windows.node[heading.at, 2] + heading.measured
         self._yaws = Yaws(heading.at, yaw, heading.information, YAW_WEIGHT)
         middles = (heading.at[1:] + heading.at[:-1]) / 2
-        self._askew = heading.askew[np.searchsorted(middles, count)]
+        self._wall_angle = heading.wall_direction[np.searchsorted(middles, count)]
 
     def calibration_of(self, solution: Solution) -> Floats:
         """Return the whole calibration of the odometry, shape (4,)."""
@@ -237,7 +237,7 @@ class Solver(MatchSolver):
         return solution
 
     def _walls(self, nodes: Floats, strict: bool) -> Walls:
-        return Distances(self._windows, self._scans.held_out, nodes, self._askew).walls(strict)
+        return Distances(self._windows, self._scans.held_out, nodes, self._wall_angle).walls(strict)
 
 
 def _edges_of(found: Matches) -> Edges:

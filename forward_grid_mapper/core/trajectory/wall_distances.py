@@ -69,13 +69,13 @@ class Distances:
         Windows whose echoes are not used.
     nodes : float64, shape (K, 3)
         In a map whose axes are parallel to the walls.
-    askew : float64, shape (K,), optional
+    wall_angle : float64, shape (K,), optional
         Angle of the walls around each node to the axes, radians.
 
     Attributes
     ----------
     node, direction : int64, shape (D,)
-        Node, and direction of the normal: number of right angles from the x axis turned by `askew`.
+        Node, and direction of the normal: number of right angles from the x axis turned by `wall_angle`.
     normal : float64, shape (D, 2)
         The direction as a unit vector.
     distance, lever, yaw : float64, shape (D,)
@@ -83,10 +83,10 @@ class Distances:
     """
 
     def __init__(
-        self, windows: Windows, held_out: NDArray[np.bool_], nodes: Floats, askew: Floats | None = None
+        self, windows: Windows, held_out: NDArray[np.bool_], nodes: Floats, wall_angle: Floats | None = None
     ) -> None:
         self._windows, self._nodes = windows, nodes
-        self._askew = np.zeros(len(windows)) if askew is None else askew
+        self._wall_angle = np.zeros(len(windows)) if wall_angle is None else wall_angle
         readings, first = windows.readings, windows.first
         self._usable = readings.echo & (readings.z < FARTHEST) & ~np.repeat(held_out, np.diff(first))
         self._looks_past = not (np.abs(wrapped(windows.mount[:, 2])) <= readings.half_angle).any()
@@ -95,7 +95,7 @@ class Distances:
         table = np.array(rows, np.float64).reshape(-1, 5)
         self.node, self.direction = table[:, 0].astype(np.int64), table[:, 1].astype(np.int64)
         self.distance, self.lever, self.yaw = table[:, 2], table[:, 3], table[:, 4]
-        self.normal = normals_of(self.direction, self._askew[self.node])
+        self.normal = normals_of(self.direction, self._wall_angle[self.node])
 
     def _measured(self, k: int) -> list[tuple[float, ...]]:
         """Return the distances of the block that begins at window k: node, direction, distance, lever, yaw."""
@@ -112,7 +112,7 @@ class Distances:
         half, z = w.readings.half_angle[of_block], w.readings.z[of_block]
         right, left = self._beside[of_block].T
         for direction in range(4):
-            angle = direction * math.pi / 2 + self._askew[middle]
+            angle = direction * math.pi / 2 + self._wall_angle[middle]
             off = wrapped(sensor[:, 2] - angle)
             in_cone, slant, sides = np.abs(off) <= half + MARGIN, np.zeros(len(off)), 0
             if (in_cone & usable).sum() < FEWEST:
@@ -141,7 +141,7 @@ class Distances:
         place = robot + self.distance
         out, count = np.zeros(len(place), np.int64), 0
         last: dict[tuple[int, float], dict[int, int]] = {}
-        for i, direction in enumerate(zip(self.direction.tolist(), self._askew[self.node].tolist(), strict=True)):
+        for i, direction in enumerate(zip(self.direction.tolist(), self._wall_angle[self.node].tolist(), strict=True)):
             open_walls = last.setdefault(direction, {})
             for wall in [wall for wall, j in open_walls.items() if progress[i] - progress[j] > LONGEST_GAP]:
                 del open_walls[wall]
@@ -176,10 +176,10 @@ def _sides(slant: Floats) -> int:
     return int((slant > 0.0).any()) + int((slant < 0.0).any())
 
 
-def normals_of(direction: NDArray[np.int64], askew: Floats) -> Floats:
-    """Return the unit vectors of directions, in right angles, each turned by `askew` radians, shape (D, 2)."""
+def normals_of(direction: NDArray[np.int64], wall_angle: Floats) -> Floats:
+    """Return the unit vectors of directions, in right angles, each turned by `wall_angle` radians, shape (D, 2)."""
     x, y = np.array([(1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0)])[direction].T
-    c, s = np.cos(askew), np.sin(askew)
+    c, s = np.cos(wall_angle), np.sin(wall_angle)
     return np.stack([c * x - s * y, s * x + c * y], axis=1)
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import naive
-from forward_grid_mapper.core.common.constants import FREE_MARGIN, LED_ON, LONGEST_GAP, MOST_AGAINST_EXTENSION
+from forward_grid_mapper.core.common.constants import FREE_GROWTH, FREE_MARGIN, LONGEST_GAP, MOST_AGAINST_EXTENSION
 from forward_grid_mapper.core.common.grid import Grid
 from forward_grid_mapper.core.common.parameters import ModelParameters
 from forward_grid_mapper.core.common.readings import Readings
@@ -116,7 +116,9 @@ def test_readings_of_one_direction_do_not_say_that_a_cell_is_free() -> None:
     told = post_process(made(around, model, free), 0.0, 0.9, 1.5, NOWHERE)
     assert told[5, 10] == 0
     far = np.flatnonzero(told[5] == 0)
-    assert far[0] == 10 - round(LED_ON / 0.1) - round(FREE_MARGIN / 0.1), 'as far as it leads on, and a cell beside'
+    assert far[0] == 10 - round(FREE_GROWTH / 0.1) - round(FREE_MARGIN / 0.1), (
+        'as far as it leads on, and a cell beside'
+    )
 
 
 def test_free_space_leads_on_through_what_readings_passed_alone() -> None:
@@ -128,7 +130,7 @@ def test_free_space_leads_on_through_what_readings_passed_alone() -> None:
 
 
 def test_tiles_hold_all_that_decides_about_a_cell() -> None:
-    assert LED_ON + FREE_MARGIN <= LONGEST_GAP / 2
+    assert FREE_GROWTH + FREE_MARGIN <= LONGEST_GAP / 2
 
 
 def test_the_map_asked_about_may_be_another_and_weights_count() -> None:

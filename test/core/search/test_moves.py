@@ -27,7 +27,7 @@ from forward_grid_mapper.core.search.flips import (
 )
 from forward_grid_mapper.core.search.prior import Prior
 from forward_grid_mapper.core.search.search import LEAST
-from forward_grid_mapper.core.search.shifts import best_shifts, see_any, shift_in_order, try_shifts, unsettle
+from forward_grid_mapper.core.search.shifts import best_shifts, mark_observing, shift_in_order, try_shifts, unsettle
 from forward_grid_mapper.core.sensor.forward_model import expectations, log_likelihood
 from samples import plain_model, random_readings
 
@@ -365,7 +365,7 @@ def test_readings_that_see_a_flip_are_found_and_unsettle_all_their_cells(
         flip(evidence.state, c)
     seen_by = [set().union(*naive.pairs_of(stored.state, t)[:2]) for t in range(len(readings))]
     sees = np.zeros(len(readings), np.uint8)
-    see_any(evidence.state, np.array(cells), sees)
+    mark_observing(evidence.state, np.array(cells), sees)
     assert sees.tolist() == [int(bool(seen & set(cells))) for seen in seen_by]
     settled = np.ones(GRID.size, np.uint8)
     unsettle(evidence.state, since, settled)

@@ -83,9 +83,13 @@ def found(bent: tuple[Recording, Odometry, Windows]) -> Heading:
 def test_the_second_part_is_found_with_its_direction(exact, bent, found) -> None:
     windows = bent[2]
     x = odometry_of(exact).at(windows.node_stamp)[found.at, 0] - PIVOT[0]
-    second = found.askew != 0.0 if (found.askew[x < -4.0] == 0.0).mean() > 0.5 else found.askew == 0.0
+    second = (
+        found.wall_direction != 0.0
+        if (found.wall_direction[x < -4.0] == 0.0).mean() > 0.5
+        else found.wall_direction == 0.0
+    )
     assert (second[x > 4.0]).mean() > 0.9 and (second[x < -4.0]).mean() < 0.1
-    directions = set(found.askew.tolist())
+    directions = set(found.wall_direction.tolist())
     assert len(directions) == 2
     angle = max(directions)
     assert abs(abs(math.remainder(angle, math.pi / 2)) - KINK) < math.radians(3.0)
@@ -101,14 +105,14 @@ def test_the_heading_is_right_in_both_parts(exact, bent, found, monkeypatch) -> 
         return float(np.degrees(np.sqrt((wrapped(wrong - middle) ** 2).mean())))
 
     assert off(found) < 2.0
-    monkeypatch.setattr(module, 'PARTS_ASKEW', 0)
+    monkeypatch.setattr(module, 'MOST_FURTHER_PARTS', 0)
     alike = heading(windows, *wall_votes(windows, np.zeros(len(windows), bool)))
-    assert alike is not None and (alike.askew == 0.0).all()
+    assert alike is not None and (alike.wall_direction == 0.0).all()
     assert off(alike) > 8.0
 
 
 def test_places_of_both_parts_measure_the_yaw(found) -> None:
-    for part in (found.askew == 0.0, found.askew != 0.0):
+    for part in (found.wall_direction == 0.0, found.wall_direction != 0.0):
         told = part & (found.information > 0.0)
         assert told.sum() > 0.6 * part.sum()
         off = np.degrees(wrapped(found.measured - found.correction))[told]
@@ -119,9 +123,9 @@ def test_a_node_has_the_direction_of_the_nearest_votes(bent, found) -> None:
     _, odometry, windows = bent
     scans = Scans(windows, Parameters(), np.zeros(1, np.uint8), held_out(len(windows)))
     solver = Solver(odometry, windows, scans, found, lambda stage: lambda part: None)
-    for node, angle in enumerate(solver._askew.tolist()):
+    for node, angle in enumerate(solver._wall_angle.tolist()):
         off = np.abs(found.at - node)
-        assert angle in found.askew[off == off.min()]
+        assert angle in found.wall_direction[off == off.min()]
 
 
 @pytest.mark.slow
@@ -201,7 +205,7 @@ def test_drift_is_not_taken_for_another_part() -> None:
     drifting = with_drift(recording, LEVELS['wheels'], 2)
     windows = cut(drifting.readings, odometry_of(drifting))
     heard = heading(windows, *wall_votes(windows, np.zeros(len(windows), bool)))
-    assert heard is not None and (heard.askew == 0.0).all()
+    assert heard is not None and (heard.wall_direction == 0.0).all()
 
 
 def test_a_wall_ends_where_another_part_begins(bent) -> None:

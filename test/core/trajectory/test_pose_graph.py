@@ -9,10 +9,10 @@ import pytest
 from scipy.optimize import minimize
 
 from forward_grid_mapper.core.trajectory.pose_graph import (
-    ASKEW,
     ROBUST,
     ROBUST_ODOMETRY,
     ROBUST_YAW,
+    WALL_ANGLE_SIGMA,
     Edges,
     Graph,
     Walls,
@@ -103,7 +103,7 @@ def test_the_solution_is_that_of_a_general_optimiser(part) -> None:
             s = np.einsum('ei,eij,ej->e', r, edges.information, r)
             total += (k**2 * np.log1p(s / k**2)).sum()
         s = wrapped(x[yaws.node, 2] - yaws.yaw) ** 2 * yaws.information
-        total += part * (s / (1 + s / ROBUST_YAW**2)).sum() + ((lines[:, 1] / ASKEW) ** 2).sum()
+        total += part * (s / (1 + s / ROBUST_YAW**2)).sum() + ((lines[:, 1] / WALL_ANGLE_SIGMA) ** 2).sum()
         for k, wall, n, z, lever, yaw, along, information in zip(*walls, strict=True):
             off = n @ x[k, :2] + z + lever * wrapped(x[k, 2] - yaw) - lines[wall, 0] - lines[wall, 1] * along
             total += off**2 * information / (1 + off**2 * information / ROBUST_YAW**2)

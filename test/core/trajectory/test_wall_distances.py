@@ -220,9 +220,9 @@ def test_noise_is_told_from_what_each_wall_says() -> None:
 
 def test_normals_are_right_angles() -> None:
     angle = np.arange(4) * math.pi / 2
-    for askew in (np.zeros(4), np.array([0.1, -0.2, 0.3, 1.4])):
-        wanted = np.stack([np.cos(angle + askew), np.sin(angle + askew)], 1)
-        assert normals_of(np.arange(4), askew) == pytest.approx(wanted)
+    for wall_angle in (np.zeros(4), np.array([0.1, -0.2, 0.3, 1.4])):
+        wanted = np.stack([np.cos(angle + wall_angle), np.sin(angle + wall_angle)], 1)
+        assert normals_of(np.arange(4), wall_angle) == pytest.approx(wanted)
 
 
 def ahead(*bearings: float, yaw: float = 0.0) -> Windows:
