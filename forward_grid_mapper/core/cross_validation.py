@@ -123,7 +123,8 @@ def only_if_validated(
         'the learned values are refused, and the initial values are kept: the map of the learned values does not '
         'predict held-out readings better than the map of the initial values. Its gain, with the standard error, is '
         f'{at_first:+.3f} ± {validation.error_at_first:.3f} nats a reading by the initial model and '
-        f'{at_learned:+.3f} ± {validation.error_at_learned:.3f} by the learned one; both must be larger than {SURE:g} standard error. '
+        f'{at_learned:+.3f} ± {validation.error_at_learned:.3f} by the learned one; both must be larger than '
+        f'{SURE:g} standard error. '
         '--keep-going writes the learned values in any case'
     )
     return dataclasses.replace(
