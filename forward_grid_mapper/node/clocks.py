@@ -134,9 +134,10 @@ class SensorClocks:
                 continue
             most = max(lags, key=lambda frame: lags[frame])
             others = f' (and {counted(len(lags) - 1, "sensor")} more)' if len(lags) > 1 else ''
+            busy = '; if the node has too little processor time, play the bag more slowly' if lags is behind else ''
             texts.append(
                 f'the stamps of {most}{others} are {lags[most] / NANOSECONDS:.1f} s {side} those of odometry: if a '
-                'clock is wrong, its readings are mapped with wrong poses; synchronise the clocks (NTP, PTP)'
+                f'clock is wrong, its readings are mapped with wrong poses; synchronise the clocks (NTP, PTP){busy}'
             )
             if lags.keys() - self._told:
                 self._told |= lags.keys()
