@@ -72,8 +72,7 @@ def _predicted(scans: Scans, nodes: Floats, block: NDArray[np.int64], span: floa
     near = np.hypot(*(nodes[:, :2] - nodes[middle, :2]).T) < NEAR
     near &= np.abs(progress - progress[middle]) < span
     near[block] = False
-    # the whole search: judgements need more accurate maps than matching
-    around = scans.map(np.flatnonzero(near), nodes[middle], nodes, shifts=True)
+    around = scans.map(np.flatnonzero(near), nodes[middle], nodes)
     count = sum(len(scans.scan[k].readings) for k in block)
     if around is None or count < FEWEST:
         return float('nan')

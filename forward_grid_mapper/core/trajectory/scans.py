@@ -38,7 +38,7 @@ class Scans:
     predictions : dict
         Cache of `holding_out.predicted`.
     shifts : bool
-        Whether the search for local maps that are matched with has moves of occupied cells, as in `Search`.
+        Whether the search for local maps has moves of occupied cells, as in `Search`.
     """
 
     def __init__(
@@ -65,9 +65,9 @@ class Scans:
         self.scan = [Scan(mixed[begin:end], whole.weight) for begin, end in itertools.pairwise(first.tolist())]
 
     def with_shifts(self) -> Scans:
-        """Return the same scans, with local maps of the whole search; predictions are those of both."""
+        """Return the same scans, with local maps of the whole search."""
         out = copy.copy(self)
-        out.shifts = True
+        out.shifts, out.predictions = True, {}
         return out
 
     def joint(self, members: NDArray[np.int64], poses: Floats) -> Scan:
@@ -83,12 +83,7 @@ class Scans:
         return Scan(np.concatenate(parts) if parts else self.scan[0].readings[:0], self.scan[0].weight)
 
     def map(
-        self,
-        members: NDArray[np.int64],
-        origin: Floats,
-        nodes: Floats,
-        most: int = MOST_ON_MAP,
-        shifts: bool = False,
+        self, members: NDArray[np.int64], origin: Floats, nodes: Floats, most: int = MOST_ON_MAP
     ) -> LocalMap | None:
         """Return the local map of some windows; None if they have fewer readings than `FEWEST_ON_MAP`.
 
@@ -102,8 +97,6 @@ class Scans:
             Of the first n windows; they include `members`.
         most : int
             Most readings that it is made from.
-        shifts : bool
-            Whether the search has moves of occupied cells, whatever `self.shifts` is.
         """
         if self.count[members].sum() < FEWEST_ON_MAP:
             return None
@@ -111,7 +104,7 @@ class Scans:
         if len(which) > most:
             # sensors take turns, so every n-th reading may be of a few of them only
             which = np.sort(np.random.default_rng(len(which)).choice(which, most, replace=False))
-        return local_map(self._placed(which, nodes, origin), self._parameters, self._stop, shifts or self.shifts)
+        return local_map(self._placed(which, nodes, origin), self._parameters, self._stop, self.shifts)
 
     def objective(self, nodes: Floats) -> float:
         """Return J of the map of the whole drive, with nodes of shape (K, 3), nats; without held-out readings."""
