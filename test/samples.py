@@ -13,6 +13,7 @@ from forward_grid_mapper.core.common.parameters import ModelParameters, Paramete
 from forward_grid_mapper.core.common.readings import Readings
 from forward_grid_mapper.core.messages.message_types import OdometryMessage, Pose2, RangeMessage
 from forward_grid_mapper.core.messages.pose_association import PoseAssociator
+from forward_grid_mapper.core.search.search import Search
 
 PLAIN_MODEL: dict[str, Any] = {
     'max_incidence_angle': math.pi / 2,
@@ -37,6 +38,13 @@ def plain_model(**values: Any) -> ModelParameters:
 
 def plain_search(**values: Any) -> SearchParameters:
     return SearchParameters(**{**PLAIN_SEARCH, **values})
+
+
+class FlipsAlone(Search):
+    """A search that shifts no cell."""
+
+    def _shift(self, watch: object) -> int:
+        return 0
 
 
 def random_readings(rng: np.random.Generator, grid: Grid, count: int, z_max: float = 0.0) -> Readings:

@@ -94,15 +94,15 @@ def at_poses(readings: Readings, poses: Floats) -> Readings:
     return replace(readings, x=x, y=y, yaw=yaw)
 
 
-def local_map(readings: Readings, parameters: Parameters, stop: NDArray[np.uint8], shifts: bool = True) -> LocalMap:
-    """Return the local map of readings; their poses are in the frame of the map. `shifts` is that of `Search`.
+def local_map(readings: Readings, parameters: Parameters, stop: NDArray[np.uint8]) -> LocalMap:
+    """Return the local map of readings; their poses are in the frame of the map.
 
     Raises
     ------
     Cancelled
         If `stop` was set.
     """
-    grid, evidence, traversed, _ = _searched(readings, parameters, stop, OF_LOCAL_MAPS, shifts)
+    grid, evidence, traversed, _ = _searched(readings, parameters, stop, OF_LOCAL_MAPS)
     return soft_map(evidence, grid, traversed, parameters.model)
 
 
@@ -116,20 +116,20 @@ def explained(readings: Readings, parameters: Parameters, stop: NDArray[np.uint8
     Cancelled
         If `stop` was set.
     """
-    _, evidence, _, found = _searched(readings, parameters, stop, memory_for_pairs(parameters), True)
+    _, evidence, _, found = _searched(readings, parameters, stop, memory_for_pairs(parameters))
     each = parameters.model.likelihood_exponent * evidence.log_likelihoods
     return evidence.tempered_log_likelihood + found.log_prior, each
 
 
 def _searched(
-    readings: Readings, parameters: Parameters, stop: NDArray[np.uint8], memory: float, shifts: bool
+    readings: Readings, parameters: Parameters, stop: NDArray[np.uint8], memory: float
 ) -> tuple[Grid, Evidence, NDArray[np.bool_], SearchResult]:
     """Return the grid of readings, their evidence, the traversed cells, and the result of the search."""
     grid = grid_of(readings, parameters.model, parameters.grid)
     evidence = Evidence(grid, parameters.model, memory, 1, stop)
     evidence.extend(readings)
     traversed = traversed_cells(readings, grid)
-    return grid, evidence, traversed, Search(evidence, parameters.search, traversed.ravel(), shifts=shifts).run()
+    return grid, evidence, traversed, Search(evidence, parameters.search, traversed.ravel()).run()
 
 
 def soft_map(evidence: Evidence, grid: Grid, traversed: NDArray[np.bool_], model: ModelParameters) -> LocalMap:

@@ -158,8 +158,7 @@ class Refiner:
         if reason:
             return Refinement(False, reason, readings, odometry, {})
         windows = cut(readings, odometry)
-        # where walls hold the drive, quick local maps do as well; matching alone needs those of the whole search
-        scans = Scans(windows, self._parameters, self._stop, held_out(len(windows)), shifts=False)
+        scans = Scans(windows, self._parameters, self._stop, held_out(len(windows)))
         drive = _Drive(readings, odometry, windows, scans)
         by_walls = self._at_right_angles(drive, least_moved)
         if by_walls.sure:
@@ -236,7 +235,6 @@ class Refiner:
     def _at_any_angle(self, drive: _Drive, by_walls: _Attempt, least_moved: float) -> Refinement:
         """Return the trajectory by matching alone, if it is better than that by walls at right angles."""
         readings, odometry, windows, scans = drive
-        scans = scans.with_shifts()
         known = by_walls.nodes if by_walls.refinement.accepted else None
         apart = usual_step(odometry)
         if apart > SCAN_MATCHED:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import itertools
 
 import numpy as np
@@ -37,19 +36,12 @@ class Scans:
         Windows whose readings are only predicted.
     predictions : dict
         Cache of `holding_out.predicted`.
-    shifts : bool
-        Whether the search for local maps has moves of occupied cells, as in `Search`.
     """
 
     def __init__(
-        self,
-        windows: Windows,
-        parameters: Parameters,
-        stop: NDArray[np.uint8],
-        held_out: NDArray[np.bool_],
-        shifts: bool = True,
+        self, windows: Windows, parameters: Parameters, stop: NDArray[np.uint8], held_out: NDArray[np.bool_]
     ) -> None:
-        self.windows, self._parameters, self._stop, self.shifts = windows, parameters, stop, shifts
+        self.windows, self._parameters, self._stop = windows, parameters, stop
         first, resolution = windows.first, parameters.grid.resolution
         self.resolution = resolution
         self.held_out = held_out
@@ -63,12 +55,6 @@ class Scans:
         mixed = whole.readings[np.lexsort((np.random.default_rng(0).random(len(window)), window))]
         self.count = np.where(held_out, 0, np.diff(first))
         self.scan = [Scan(mixed[begin:end], whole.weight) for begin, end in itertools.pairwise(first.tolist())]
-
-    def with_shifts(self) -> Scans:
-        """Return the same scans, with local maps of the whole search."""
-        out = copy.copy(self)
-        out.shifts, out.predictions = True, {}
-        return out
 
     def joint(self, members: NDArray[np.int64], poses: Floats) -> Scan:
         """Return the readings of several windows as one scan; `poses` of their nodes have the shape (members, 3)."""
@@ -104,7 +90,7 @@ class Scans:
         if len(which) > most:
             # sensors take turns, so every n-th reading may be of a few of them only
             which = np.sort(np.random.default_rng(len(which)).choice(which, most, replace=False))
-        return local_map(self._placed(which, nodes, origin), self._parameters, self._stop, self.shifts)
+        return local_map(self._placed(which, nodes, origin), self._parameters, self._stop)
 
     def objective(self, nodes: Floats) -> float:
         """Return J of the map of the whole drive, with nodes of shape (K, 3), nats; without held-out readings."""

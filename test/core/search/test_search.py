@@ -24,7 +24,7 @@ from forward_grid_mapper.core.search.flips import gain_of
 from forward_grid_mapper.core.search.prior import Prior, independent_prior, odds_given_neighbours, wall_prior
 from forward_grid_mapper.core.search.search import FEW, LEAST, Progress, Search
 from forward_grid_mapper.core.sensor.forward_model import log_likelihood
-from samples import plain_model, plain_search, random_readings
+from samples import FlipsAlone, plain_model, plain_search, random_readings
 
 GRID = Grid(0.1, 0, 0, 12, 9)
 MODEL = plain_model(p_hit=0.6, p_rand=0.1, p_lost=0.1, sigma=0.06)
@@ -36,12 +36,12 @@ def make(
     model: ModelParameters = MODEL,
     stop: np.ndarray | None = None,
     start: np.ndarray | None = None,
-    shifts: bool = True,
+    kind: type[Search] = Search,
     **search: object,
 ) -> Search:
     evidence = Evidence(grid, model, stop=stop, start=start)
     evidence.extend(readings)
-    return Search(evidence, plain_search(**search), shifts=shifts)
+    return kind(evidence, plain_search(**search))
 
 
 def independent(prior: float, grid: Grid = GRID) -> Prior:
@@ -82,7 +82,7 @@ def test_the_objective_never_falls_and_ends_at_an_optimum(seed: int, prior: floa
     rng = np.random.default_rng(seed)
     some = (random_readings, naive.awkward_readings)[seed % 2]
     readings = some(rng, grid, int(rng.integers(1, 150)))
-    search = make(readings, grid, prior=prior, shifts=shifts)
+    search = make(readings, grid, prior=prior, kind=Search if shifts else FlipsAlone)
     maps = search.evidence.state.maps
     # what the kernels evaluate is compared with the forward model elsewhere, awkward readings included
     exact = some is random_readings
@@ -189,7 +189,7 @@ def test_shift_moves_do_not_end_lower() -> None:
     for seed in range(20):
         readings = random_readings(np.random.default_rng(seed), GRID, 120)
         ends = [
-            objective(readings, make(readings, shifts=shifts).run().occupied, MODEL, 0.5) for shifts in (False, True)
+            objective(readings, make(readings, kind=kind).run().occupied, MODEL, 0.5) for kind in (FlipsAlone, Search)
         ]
         gained.append(ends[1] - ends[0])
     assert min(gained) > -1e-3

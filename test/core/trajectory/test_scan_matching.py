@@ -79,29 +79,6 @@ def scans_of(recording: Recording, odometry: Odometry) -> Scans:
     return Scans(windows, for_matching(Parameters()), np.zeros(1, np.uint8), held_out(len(windows)))
 
 
-def test_matching_alone_has_local_maps_of_the_whole_search(bent, scans, monkeypatch) -> None:
-    recording, odometry = bent
-    seen = []
-
-    def match_drive(odometry, scans, *rest) -> None:
-        seen.append(scans)
-
-    monkeypatch.setattr(refinement, 'match_drive', match_drive)
-    monkeypatch.setattr(Refiner, '_heading', no_walls)
-    Refiner(Parameters()).run(recording.readings, odometry)
-    assert seen[0].shifts
-    quick = Scans(
-        scans.windows, for_matching(Parameters()), np.zeros(1, np.uint8), held_out(len(scans.windows)), shifts=False
-    )
-    quick.predictions[b'', b'', 0.0] = 1.0
-    whole, nodes, members = quick.with_shifts(), scans.windows.node, np.arange(10)
-    assert not whole.predictions and not quick.shifts
-    one, other, right = (each.map(members, np.zeros(3), nodes).cells for each in (quick, whole, scans))
-    np.testing.assert_array_equal(other, right)
-    # the moves change a few cells of the walls
-    assert 0.0 < np.mean(one[:, 0] != other[:, 0]) < 0.1
-
-
 def quietly(part: float) -> None:
     """Receives how much is done."""
 
