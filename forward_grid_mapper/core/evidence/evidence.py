@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..common.grid import UNKNOWN, Grid, Window, united
-from ..common.parameters import ModelParameters
+from ..common.parameter_groups import ModelParameters
 from ..common.readings import Readings
 from ..runtime.cancelling import NEVER, check
 from ..runtime.memory import THREAD_MEMORY
