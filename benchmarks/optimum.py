@@ -15,7 +15,7 @@ import math
 import numpy as np
 
 from forward_grid_mapper.core.common.grid import Grid
-from forward_grid_mapper.core.common.parameters import ModelParameters, SearchParameters
+from forward_grid_mapper.core.common.parameter_groups import ModelParameters, SearchParameters
 from forward_grid_mapper.core.common.readings import Readings
 from forward_grid_mapper.core.evidence.evidence import Evidence
 from forward_grid_mapper.core.search.search import Search

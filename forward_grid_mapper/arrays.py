@@ -103,7 +103,7 @@ def _numbers(name: str, values: ArrayLike, instead: str) -> NDArray[np.float64]:
         raise InputError(f'{name} must be numbers, not of the type {array.dtype}')
     try:
         return np.asarray(array, np.float64)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise InputError(f'{name} must be numbers: {error}') from None
 
 

@@ -59,7 +59,7 @@ class Sonar:
         try:
             finite = all(map(math.isfinite, (self.x, self.y, self.yaw, self.max_range, self.min_range, self.pitch)))
             self.field_of_view / 1.0
-        except TypeError as error:
+        except (TypeError, OverflowError) as error:
             raise InputError(f'{self}: not a number: {error}') from None
         if abs(self.yaw) > TURN:
             raise InputError(f'yaw = {self.yaw:g} rad is more than a full turn; did you mean radians({self.yaw:g})?')
@@ -178,8 +178,11 @@ def make_maps(
         raise InputError(f'the names of sensors must be strings, such as {str(odd[0])!r} in place of {odd[0]!r}')
     if not isinstance(parameters or {}, Mapping) or not all(isinstance(name, str) for name in parameters or {}):
         raise InputError('parameters must be a mapping from names to values, such as {"resolution": 0.05}')
-    if not isinstance(sensor_of, (str, Sequence, np.ndarray)):
-        raise InputError('sensor_of must be the name of a sensor, or one name for each range')
+    if not isinstance(sensor_of, (str, Sequence)):
+        # a column of a table is an array as well
+        sensor_of = np.asarray(sensor_of).tolist()
+        if not isinstance(sensor_of, (str, list)):
+            raise InputError('sensor_of must be the name of a sensor, or one name for each range')
     chosen = Parameters.from_flat(parameters or {})
     odometry = arrays.poses_of(arrays.stamps('pose_stamps', pose_stamps), poses)
     stamps = arrays.stamps('range_stamps', range_stamps)

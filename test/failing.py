@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from forward_grid_mapper.core import online_map
-from forward_grid_mapper.core.evidence import evidence, learned_normals
+from forward_grid_mapper.core.evidence import evidence, indexed_readings, learned_normals
 from forward_grid_mapper.core.search import search
 
 NUMPY = (
@@ -20,8 +20,9 @@ NUMPY = (
 )
 
 OURS: tuple[tuple[Any, str], ...] = (
-    *((evidence, name) for name in ('cone_table', 'reading_state_table', 'no_tiles', 'more_chunks', 'empty_pairs')),
-    *((evidence, name) for name in ('workspace_for', 'on_larger_grid', 'box_of', '_maps')),
+    *((evidence, name) for name in ('cone_table', 'reading_state_table', 'on_larger_grid', 'box_of')),
+    *((module, name) for module in (evidence, indexed_readings) for name in ('no_tiles', 'empty_maps')),
+    *((indexed_readings, name) for name in ('more_chunks', 'empty_pairs', 'workspace_for')),
     *((learned_normals, name) for name in ('normals_of', 'renewed')),
     *((evidence.Evidence, name) for name in ('_reserve', '_make_room', '_insert', 'grow', 'extend', 'renew_normals')),
     *((online_map, name) for name in ('map_grid', 'grid_of', 'wall_prior', 'mark_traversed', 'Evidence', 'Search')),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from forward_grid_mapper.core.common.grid import Grid
-from forward_grid_mapper.core.common.parameters import ModelParameters
+from forward_grid_mapper.core.common.parameter_groups import ModelParameters
 from forward_grid_mapper.core.common.readings import Readings
 
 LINE = Grid(0.1, 0, 0, 62, 1)

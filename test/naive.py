@@ -23,7 +23,7 @@ from forward_grid_mapper.core.common.constants import (
     STRAIGHT_RUN,
 )
 from forward_grid_mapper.core.common.grid import Grid
-from forward_grid_mapper.core.common.parameters import ModelParameters
+from forward_grid_mapper.core.common.parameter_groups import ModelParameters
 from forward_grid_mapper.core.common.readings import Readings
 from forward_grid_mapper.core.evidence.state import State
 from forward_grid_mapper.core.evidence.tile_index import Tiles

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from forward_grid_mapper.core.common.grid import Grid
-from forward_grid_mapper.core.common.parameters import ModelParameters, Parameters, SearchParameters
+from forward_grid_mapper.core.common.parameter_groups import ModelParameters, SearchParameters
+from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.common.readings import Readings
 from forward_grid_mapper.core.messages.message_types import OdometryMessage, Pose2, RangeMessage
 from forward_grid_mapper.core.messages.pose_association import PoseAssociator

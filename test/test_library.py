@@ -143,6 +143,24 @@ def test_poses_of_sensors_are_compared_with_the_readings_once(tmp_path: Path, mo
     assert asked == [{name: (s.x, s.y, s.yaw) for name, s in arrays['sensors'].items()}]
 
 
+class Column:
+    """A column of a table, as of pandas, which is an array but no sequence."""
+
+    def __init__(self, values: list[str]) -> None:
+        self._values = values
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
+        return np.array(self._values, dtype or object)
+
+
+def test_names_of_sensors_may_be_a_column_of_a_table() -> None:
+    arrays = given()
+    names = arrays.pop('sensor_of')
+    np.testing.assert_array_equal(make_maps(**arrays, sensor_of=Column(names)).maps.ml, expected().ml)
+    with pytest.raises(InputError, match='no sensor is called sonar'):
+        make_maps(**arrays, sensor_of=np.array('sonar'))
+
+
 def test_numpy_scalars_are_numbers() -> None:
     chosen = {'resolution': np.float64(0.2), 'max_iterations': np.int64(50), 'p_hit': np.float32(0.5)}
     assert make_maps(**given(), parameters=chosen).maps.grid.resolution == 0.2
@@ -154,6 +172,8 @@ def test_numpy_scalars_are_numbers() -> None:
         ({'sensors': [Sonar(0.0, 0.0, 0.0, 0.5, 3.0)]}, 'sensors must be a mapping'),
         ({'sensors': {'f': (0, 0, 0, 0.5, 3)}}, 'sensors must be a mapping'),
         ({'sensor_of': 5}, 'sensor_of must be'),
+        ({'sensor_of': {'sonar'}}, 'sensor_of must be'),
+        ({'pose_stamps': [10**400, 1]}, 'pose_stamps must be numbers'),
         ({'parameters': 'resolution=0.1'}, 'parameters must be a mapping'),
         ({'parameters': {1: 2}}, 'parameters must be a mapping'),
         ({'ranges': np.array([1j])}, 'ranges must be real numbers'),
@@ -230,6 +250,8 @@ def test_units_are_checked() -> None:
         Sonar(15.0, 12.0, 0.0, 0.5, 3.0)
     with pytest.raises(InputError, match='not a number'):
         Sonar('a', 0.0, 0.0, 0.5, 3.0)
+    with pytest.raises(InputError, match='not a number'):
+        Sonar(10**400, 0.0, 0.0, 0.5, 3.0)
     with pytest.raises(InputError, match='leave no valid range'):
         Sonar(0.0, 0.0, 0.0, 0.5, 3.0, 4.0)
     with pytest.raises(InputError, match='must be finite'):

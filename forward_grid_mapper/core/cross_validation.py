@@ -17,7 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .common.grid import UNKNOWN
-from .common.parameters import ModelParameters, Parameters
+from .common.parameter_groups import ModelParameters
+from .common.parameters import Parameters
 from .common.readings import Floats, Readings
 from .joint_learning import SURE, CrossValidation, Learned, Watch, learn_jointly
 from .mapping import Mapper

@@ -18,7 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .common.grid import part_of
-from .common.parameters import ModelParameters, Parameters
+from .common.parameter_groups import ModelParameters
+from .common.parameters import Parameters
 from .common.readings import Readings
 from .common.words import counted
 from .learning.lost_walls import Stretch, lost_walls

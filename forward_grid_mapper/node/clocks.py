@@ -8,8 +8,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from ..core.common.words import counted
+from ..core.messages.message_account import MOST_FRAMES
 from ..core.messages.message_types import NANOSECONDS
-from ..core.messages.pose_association import MOST_FRAMES, PoseAssociator
+from ..core.messages.pose_association import PoseAssociator
 from ..core.messages.rep117 import LONGEST_NAME
 
 LASTING = 10.0

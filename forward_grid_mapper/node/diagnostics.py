@@ -54,7 +54,9 @@ class Health:
 
     def taken(self, sent: int) -> None:
         """Note that a reading was taken which was published at `sent`, nanoseconds of the system's clock."""
-        self._slowest = max(self._slowest, time.time_ns() - sent)
+        # not every middleware says when
+        if sent:
+            self._slowest = max(self._slowest, time.time_ns() - sent)
 
     def statuses(
         self,

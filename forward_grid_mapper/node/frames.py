@@ -137,7 +137,9 @@ class Extrinsics:
         pose = self._look_up(base_frame, frame, stamp)
         if isinstance(pose, Pose2) and (frame in self._used or len(self._used) < MOST_MISSING):
             first = self._used.setdefault(frame, pose)
-            if max(abs(a - b) for a, b in zip(first, pose, strict=True)) > STILL:
+            # what looks back may have a yaw of -180 degrees at one time and of 180 at another
+            turned = math.remainder(pose.yaw - first.yaw, math.tau)
+            if max(abs(pose.x - first.x), abs(pose.y - first.y), abs(turned)) > STILL:
                 self._moved.add(frame)
         return pose
 

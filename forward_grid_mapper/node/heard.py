@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 
-from ..core.messages.pose_association import MOST_FRAMES
+from ..core.messages.message_account import MOST_FRAMES
 from ..core.messages.rep117 import LONGEST_NAME
 
 TIME_OUT = 3.0

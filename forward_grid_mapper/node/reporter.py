@@ -8,8 +8,9 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 
 from ..core.messages.extrinsics import STEEP
+from ..core.messages.message_account import MOST_FRAMES
 from ..core.messages.mounts import far_mounts
-from ..core.messages.pose_association import MOST_FRAMES, PoseAssociator
+from ..core.messages.pose_association import PoseAssociator
 from ..core.messages.rep117 import OF_POSES, REASONS, sensor_rejections
 from . import diagnostics
 from .background import Worker

@@ -48,8 +48,14 @@ class Part:
 
     def bounds(self, first: int) -> tuple[float, float]:
         """Return the stamps, nanoseconds, that it lies between, the last one excluded; `first` is the drive's."""
-        begin = first + self.start * NANOSECONDS
-        return begin, begin + self.duration * NANOSECONDS
+        begin = first + _nanoseconds(self.start)
+        return begin, begin + _nanoseconds(self.duration)
+
+
+def _nanoseconds(seconds: float) -> float:
+    """Return seconds as a whole number, since a stamp as a float is off by up to 128 and may be after the message."""
+    found = seconds * NANOSECONDS
+    return round(found) if math.isfinite(found) else found
 
 
 WHOLE = Part()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +34,13 @@ def test_of_a_bag_and_one_of_its_files_the_bag_is_read(tmp_path: Path) -> None:
         assert [drive.source['bag'] for drive in drives.drives] == [str(bag)]
         assert len(drives.drives[0].associator.buffer) == len(whole.ranges)
         assert sum('it is read once' in warning for warning in drives.source['warnings']) == len(words) - 1
+
+
+@pytest.mark.parametrize('first', [1_700_000_000_123_456_789, 1_700_000_000_123_456_790 + 100])
+def test_a_part_begins_and_ends_to_the_nanosecond(first: int) -> None:
+    assert Part(0.0, 60.0).bounds(first) == (first, first + 60 * NANOSECONDS)
+    assert Part(1.5).bounds(first) == (first + 3 * NANOSECONDS // 2, math.inf)
+    assert Part(1e300, 1e308).bounds(first)[1] == math.inf
 
 
 def test_a_part_where_the_first_message_has_no_stamp(tmp_path: Path) -> None:

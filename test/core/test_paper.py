@@ -14,7 +14,8 @@ import naive
 from forward_grid_mapper.commands.experiment_maps import ONE_SUM
 from forward_grid_mapper.core.common.errors import ParameterError
 from forward_grid_mapper.core.common.grid import Grid
-from forward_grid_mapper.core.common.parameters import ModelParameters, Parameters, find
+from forward_grid_mapper.core.common.parameter_groups import ModelParameters
+from forward_grid_mapper.core.common.parameters import Parameters, find
 from forward_grid_mapper.core.common.readings import Readings
 from forward_grid_mapper.core.evidence.evidence import Evidence
 from forward_grid_mapper.core.evidence.fixed_point import QUANTUM

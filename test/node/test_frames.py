@@ -221,6 +221,16 @@ def test_the_extrinsics_are_asked_for_anew_after_a_jump_where_odometry_is_the_ma
     assert extrinsics('base', 'sonar', 1 * NANOSECONDS) == Pose2(0.2, 0.0, 0.0)
 
 
+def test_a_sensor_that_looks_back_is_fixed(buffer: Buffer, transforms: Transforms) -> None:
+    """Rounding decides whether its yaw is 180 or -180 degrees."""
+    yaws = iter((math.pi - 1e-12, -math.pi + 1e-12))
+    buffer.known['base', 'rear'] = lambda stamp: transform(-0.1, 0.0, yaw=next(yaws))
+    extrinsics = Extrinsics({}, transforms)
+    first, second = extrinsics('base', 'rear', 0), extrinsics('base', 'rear', NANOSECONDS)
+    assert isinstance(first, Pose2) and isinstance(second, Pose2) and first.yaw > 3.0 and second.yaw < -3.0
+    assert set(extrinsics.fixed) == {'rear'}
+
+
 def test_sensors_that_turn_on_the_robot_are_not_fixed(buffer: Buffer, transforms: Transforms) -> None:
     extrinsics = Extrinsics({'given': Pose2(1.0, 2.0, 3.0)}, transforms)
     buffer.known['base', 'fixed'] = transform(0.1, 0.0)

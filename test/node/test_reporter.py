@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from types import SimpleNamespace
 from typing import Any
 
@@ -12,7 +13,7 @@ pytest.importorskip('rclpy', reason='the tests of the node need rclpy')
 from stand_ins import PlainNode, Taking
 
 from forward_grid_mapper.core.common.grid import Grid
-from forward_grid_mapper.core.messages.message_types import Pose2
+from forward_grid_mapper.core.messages.message_types import NANOSECONDS, Pose2
 from forward_grid_mapper.node import diagnostics
 from forward_grid_mapper.node.diagnostics import Health
 from forward_grid_mapper.node.frames import Extrinsics, MapFrame, Transforms
@@ -57,6 +58,20 @@ def test_the_reason_is_that_of_the_last_second_also_after_a_reset() -> None:
     drive(robot, 255, 0, 15, 'x' * 1000)
     level, message = judged(robot, health)
     assert level == WARN and '55 of 65' in message and 'most of them as empty_frame_id' in message
+
+
+def test_a_middleware_that_states_no_times_delays_nothing() -> None:
+    robot, health = Taking(), Health()
+    robot.intake.subscribe()
+
+    def delay() -> str:
+        found = health.statuses('mapper', robot.intake, robot.associator, None, '', Grid(0.1, 0, 0, 1, 1), {})[0]
+        return next(pair.value for pair in found.values if pair.key == 'longest delay of a reading (ms)')
+
+    health.taken(0)
+    assert delay() == '0.0'
+    health.taken(time.time_ns() - 2 * NANOSECONDS)
+    assert 2000 <= float(delay()) < 10_000
 
 
 def test_a_stamp_of_odometry_that_stands_still_is_told_of(monkeypatch: pytest.MonkeyPatch) -> None:

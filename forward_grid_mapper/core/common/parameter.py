@@ -11,6 +11,9 @@ import numpy as np
 
 from .errors import ParameterError
 
+LARGEST = 1 << 1000
+"""Beyond all bounds of parameters, and still a float."""
+
 
 def param(
     default: Any,
@@ -103,7 +106,8 @@ class Parameter:
         if self.type is tuple and isinstance(value, list) and all(isinstance(v, str) and v for v in value):
             value = tuple(value)
         if self.type is float and isinstance(value, int) and not isinstance(value, bool):
-            value = float(value)
+            # the largest whole numbers are no floats
+            value = float(min(max(value, -LARGEST), LARGEST))
         if type(value) is not self.type:
             raise ParameterError(f'{self.name}: {value!r} is not {wanted}; admitted: {self.range} {self.unit}'.rstrip())
         if self.choices and value not in self.choices:

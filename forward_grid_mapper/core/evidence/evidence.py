@@ -4,70 +4,42 @@ from __future__ import annotations
 
 import math
 from contextlib import suppress
-from functools import partial
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..common.grid import UNKNOWN, Grid, Window, united
-from ..common.parameters import ModelParameters
+from ..common.parameter_groups import ModelParameters
 from ..common.readings import Readings
-from ..runtime.cancelling import NEVER, check
-from ..runtime.memory import THREAD_MEMORY
-from ..runtime.threads import parts, run_each
-from ..sensor.cone_table import CONE, Cones, Floats, cone_table
-from ..sensor.density import hit_probability
+from ..runtime.cancelling import NEVER
+from ..sensor.cone_table import Floats, cone_table
 from ..sensor.surface_normals import SurfaceNormals, no_normals, on_larger_grid, touched
 from .fixed_point import QUANTUM
-from .indexing import BAND, FREE, LARGEST, UNSTORED, UNUSED, WORDS, insert_readings, reading_state_table
+from .indexed_readings import IndexedReadings, empty_maps
+from .indexing import LARGEST, UNUSED, WORDS, reading_state_table
 from .learned_normals import first_normals, has_limit, keep_bearings, renewed_normals
 from .neighbourhood import note_flips, set_patterns
-from .pairs import WORD, WORDS_PER_BAND_PAIR, Lattice, empty_pairs, workspace_for
+from .pairs import WORDS_PER_BAND_PAIR
 from .renewal import box_of, find_changed, renew
-from .state import READING_STATE, Maps, Model, State, Work
-from .tile_index import more_chunks, no_tiles
-from .updates import add_multiplicity, evaluate_all, evaluate_flipped, forget
+from .state import State
+from .tile_index import no_tiles
+from .updates import add_multiplicity, evaluate_all, evaluate_flipped
 
 MOST_UNUSED = 0.25
 """Fraction of the allocated words that may be unused before all pairs are packed again."""
 
-BYTES_A_CONE_CELL = 64
-"""Bytes of a workspace for each cell of the largest cone."""
-
 NOBODY = np.zeros(0, np.int64)
 
 
-class _Before(NamedTuple):
-    """State that must be restored if adding readings fails."""
-
-    head: NDArray[np.int32]
-    fill: NDArray[np.int32]
-    latest: NDArray[np.int32]
-    used: int
-    totals: NDArray[np.int64]
-    normals: SurfaceNormals
-
-
-def _maps(grid: Grid, occupied: NDArray[np.uint8]) -> Maps:
-    """Return the state of the cells of a grid without readings; `occupied` is the map, shape `grid.shape`."""
-    seen, evidence = np.zeros(grid.size, np.int32), np.zeros(grid.size, np.int64)
-    pattern = np.zeros(grid.size, np.uint8)
-    set_patterns(occupied.ravel(), grid.shape, pattern)
-    return Maps(occupied.ravel(), evidence, seen, pattern)
-
-
-class Evidence:
+class Evidence(IndexedReadings):
     """Readings, a map, and the gain of flipping each of its cells.
 
     If a method fails (no memory, or `stop` was set), the evidence stays consistent with the map and the readings.
 
     Attributes
     ----------
-    grid : Grid
-    model : ModelParameters
-    state : State
-        For the kernels. Arrays that grow are replaced, so callers must not store it.
+    grid, model, state
+        As in `IndexedReadings`.
     """
 
     def __init__(
@@ -100,52 +72,13 @@ class Evidence:
         normals : SurfaceNormals, optional
             Of the cells of `grid`, if known beforehand; then the grid cannot grow.
         """
-        self.grid, self.model, self._threads = grid, model, threads
-        self._words = int(min(memory / WORD, 2.0**60))
-        self._totals = np.zeros(6, np.int64)
-        self._size = self._indexed = 0
         learns = has_limit(model)
         self._sums = np.zeros((3, grid.size), np.int64) if learns and renewable else None
         self._since: Window | None = None
         self._given_normals = normals is not None
-        self.state = State(
-            normals=no_normals() if normals is None else normals,
-            lattice=Lattice(grid.height, grid.width, grid.resolution),
-            model=Model(
-                hit_probability(model, grid.resolution),
-                1.0 - model.p_rand - model.p_lost,
-                model.likelihood_exponent * QUANTUM,
-            ),
-            cones=np.empty(0, CONE),
-            reading_states=np.empty(0, READING_STATE),
-            pairs=empty_pairs(0),
-            tiles=no_tiles(grid.height, grid.width),
-            maps=_maps(grid, np.zeros(grid.shape, np.uint8) if start is None else np.array(start, np.uint8)),
-            workspace=workspace_for(0),
-            observing=np.empty((0, 2), np.int32),
-            clock=np.zeros(1, np.int64),
-            stop=np.zeros(1, np.uint8) if stop is None else stop,
-        )
-
-    def __len__(self) -> int:
-        return self._size
-
-    @property
-    def pairs(self) -> int:
-        """Number of pairs of a cell and a reading."""
-        return int(self._totals[FREE] + self._totals[BAND])
-
-    @property
-    def unstored(self) -> int:
-        """Number of readings whose pairs are not stored, for lack of memory."""
-        return int(self._totals[UNSTORED])
-
-    @property
-    def nbytes(self) -> int:
-        """Memory of pairs, readings and cells, without surface normals, bytes."""
-        s = self.state
-        kept = (s.cones, s.reading_states, s.pairs.cell, s.tiles.chunks, s.observing, *s.maps)
-        return sum(int(array.nbytes) for array in kept)
+        stop = np.zeros(1, np.uint8) if stop is None else stop
+        occupied = np.zeros(grid.shape, np.uint8) if start is None else np.array(start, np.uint8)
+        super().__init__(grid, model, memory, threads, stop, occupied, no_normals() if normals is None else normals)
 
     @property
     def tempered_log_likelihood(self) -> float:
@@ -170,11 +103,6 @@ class Evidence:
         reading_states = self.state.reading_states[: self._size][which]
         return float((reading_states['likelihood'].astype(np.int64) * reading_states['multiplicity']).sum() * QUANTUM)
 
-    @property
-    def cones(self) -> Cones:
-        """The cones of the readings, shape (N,); valid until readings are added or the grid grows."""
-        return self.state.cones[: self._size]
-
     def of_occupancy(self) -> Floats:
         """Return γ [log p(Z | cell occupied, rest of the map) − log p(Z | cell free, rest of the map)], nats.
 
@@ -182,13 +110,6 @@ class Evidence:
         """
         maps, nats = self.state.maps, self.state.model.nats
         out: Floats = np.where(maps.occupied == 1, -nats, nats) * maps.evidence
-        return out
-
-    @property
-    def z_max(self) -> Floats:
-        """The largest range of each reading, metres, shape (N,)."""
-        far = self.state.cones['z_max'][: self._size] - self.model.surface_offset
-        out: Floats = far * self.grid.resolution
         return out
 
     def observed(self) -> NDArray[np.int8]:
@@ -237,6 +158,8 @@ class Evidence:
                 raise
         except BaseException:
             self._take_out(begin, before)
+            if not begin and self._sums is not None:
+                self._sums[:] = 0
             raise
         self._size = end
         if self._sums is not None:
@@ -253,11 +176,6 @@ class Evidence:
         if self._sums is not None:
             keep_bearings(repeated, self.grid, self._sums)
             self._since = since
-
-    @staticmethod
-    def _check_indices(readings: NDArray[np.int64], size: int) -> None:
-        if len(readings) and not 0 <= readings.min() <= readings.max() < size:
-            raise ValueError(f'readings {readings.min()} to {readings.max()} are asked for, and there are {size}')
 
     def grow(self, grid: Grid) -> None:
         """Change to a larger grid, whose new cells are free; if it fails, nothing is changed.
@@ -286,7 +204,7 @@ class Evidence:
             cones=cones,
             reading_states=s.reading_states.copy(),
             tiles=no_tiles(grid.height, grid.width),
-            maps=_maps(grid, occupied),
+            maps=empty_maps(grid, occupied),
         )
         larger = None
         if sums is not None:
@@ -392,42 +310,6 @@ class Evidence:
                 self.grow(self.grid)
         return window
 
-    def summed(self, begin: int, end: int, work: Work, total: NDArray[np.int64], beside: int = 0) -> None:
-        """Run work on several threads, each for a part of the readings `begin` to `end`, and sum the results.
-
-        Each thread has its own workspace and array. Integer sums do not depend on the number of threads.
-
-        Parameters
-        ----------
-        begin, end : int
-        work : callable
-        total : int64
-            The results are added to it.
-        beside : int
-            Additional memory of each thread, bytes.
-
-        Raises
-        ------
-        Cancelled
-            If `stop` was set.
-        """
-        largest = int(self._totals[LARGEST])
-        own = [(self.state, total)]
-        each = total.nbytes + beside + BYTES_A_CONE_CELL * largest
-        most = len(parts(begin, end, min(self._threads, 1 + THREAD_MEMORY // max(each, 1))))
-        try:
-            while len(own) < most:
-                s = self.state._replace(workspace=workspace_for(largest))
-                own.append((s, np.zeros_like(total)))
-        except MemoryError:
-            # with fewer threads, the result is the same
-            pass
-        portions = zip(own, parts(begin, end, len(own)), strict=True)
-        run_each([partial(work, s, first, last, array) for (s, array), (first, last) in portions])
-        check(self.state.stop)
-        for _, array in own[1:]:
-            np.add(total, array, out=total)
-
     def _evaluate_and_add(self, begin: int, end: int, new: bool) -> None:
         def work(s: State, first: int, last: int, evidence: NDArray[np.int64]) -> None:
             evaluate_all(s._replace(maps=s.maps._replace(evidence=evidence)), first, last, new)
@@ -439,61 +321,9 @@ class Evidence:
         self.state.maps.evidence[:] = 0
         evaluate_all(self.state._replace(stop=NEVER), 0, end, new)
 
-    def _index_so_far(self) -> _Before:
-        s = self.state
-        tiles = s.tiles
-        lists = tiles.head.copy(), tiles.fill.copy(), tiles.latest.copy()
-        return _Before(*lists, int(tiles.used[0]), self._totals.copy(), s.normals)
-
-    def _insert(self, begin: int, end: int) -> None:
-        """Index readings whose cones are set, and allocate memory for their pairs."""
-        self._indexed = begin
-        while self._indexed < end:
-            s = self.state
-            self._indexed = insert_readings(s, (self._indexed, end, self._words), self._totals)
-            check(s.stop)
-            if self._indexed < end:
-                self.state = s._replace(tiles=more_chunks(s.tiles))
-        self._make_room(int(self._totals[WORDS]))
-
-    def _take_out(self, begin: int, before: _Before) -> None:
-        """Undo the indexing from reading `begin` on."""
-        s = self.state
-        forget(s, begin, self._indexed)
-        s.tiles.head[:], s.tiles.fill[:], s.tiles.latest[:] = before.head, before.fill, before.latest
-        s.tiles.used[0] = before.used
-        self._indexed = begin
-        self._totals[:] = before.totals
-        self.state = s._replace(normals=before.normals)
-        if not begin and self._sums is not None:
-            self._sums[:] = 0
-
     def _learn_normals(self, end: int) -> None:
         """Estimate normals and limits of the incidence angle from the first readings."""
         self._indexed = 0
         sums = np.zeros((3, self.grid.size), np.int64) if self._sums is None else self._sums
         normals = first_normals(self.state, end, self.grid, self.model, sums, self.summed)
         self.state = self.state._replace(normals=normals)
-
-    def _reserve(self, size: int) -> None:
-        """Allocate memory for `size` readings, and for half as many more if there are readings already."""
-        s = self.state
-        if size <= len(s.reading_states):
-            return
-        room = size if not self._size else max(size, self._size * 3 // 2)
-        cones, reading_states = np.empty(room, CONE), np.zeros(room, READING_STATE)
-        cones[: self._size], reading_states[: self._size] = s.cones[: self._size], s.reading_states[: self._size]
-        self.state = s._replace(cones=cones, reading_states=reading_states, observing=np.empty((room, 2), np.int32))
-
-    def _make_room(self, words: int) -> None:
-        """Allocate so many words of pairs, and a workspace for the largest cone."""
-        s = self.state
-        largest, words = int(self._totals[LARGEST]), min(words, self._words)
-        if words > len(s.pairs.cell):
-            kept = len(s.pairs.cell)
-            pairs = empty_pairs(words if not kept else max(words, min(words * 3 // 2, self._words)))
-            pairs.cell[:kept] = s.pairs.cell
-            s = s._replace(pairs=pairs)
-        if largest + 3 > len(s.workspace.new):
-            s = s._replace(workspace=workspace_for(largest))
-        self.state = s

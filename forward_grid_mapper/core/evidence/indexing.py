@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..common.parameters import ModelParameters
+from ..common.parameter_groups import ModelParameters
 from ..common.readings import Readings
 from ..runtime.jit import kernel
 from ..sensor.cone import rows_of, runs_of

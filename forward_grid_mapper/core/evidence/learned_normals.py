@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..common.grid import Grid, Window
-from ..common.parameters import ModelParameters
+from ..common.parameter_groups import ModelParameters
 from ..runtime.cancelling import NEVER
 from ..sensor.incidence import count, edges_of, narrowed, no_counts, slots_of, with_own_angles
 from ..sensor.surface_normals import SurfaceNormals, gather, normals_of, renewed, touched

@@ -19,7 +19,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..common.parameters import ModelParameters, find
+from ..common.parameter_groups import ModelParameters
+from ..common.parameters import find
 from ..sensor.density import hit_parameter
 from ..sensor.forward_model import ForwardModel
 

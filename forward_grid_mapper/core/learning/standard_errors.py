@@ -26,7 +26,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..common.constants import HIT_LENGTH
-from ..common.parameters import ModelParameters, find
+from ..common.parameter_groups import ModelParameters
+from ..common.parameters import find
 from ..common.readings import Floats, Readings
 from ..sensor.density import hit_probability
 from ..sensor.forward_model import Expectations, ForwardModel

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from ..common.constants import EXTENSION, FREE_MARGIN
 from ..common.grid import UNKNOWN
-from ..common.parameters import SearchParameters
+from ..common.parameter_groups import SearchParameters
 from ..evidence.evidence import Evidence
 from ..search.prior import has_walls
 from .free_space import expected_passes

@@ -31,7 +31,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..common.constants import LEAST_EVIDENCE, LEAST_NOTICING
-from ..common.parameters import SearchParameters
+from ..common.parameter_groups import SearchParameters
 from ..evidence.neighbourhood import patterns
 from ..sensor.cone_table import Floats
 from .free_space import Passes

@@ -21,7 +21,7 @@ from .extrinsics import ExtrinsicsLookup, Later, Mount, project_all
 from .map_extent import possible
 from .message_batch import Ints, MessageBatch, Odometry
 from .message_types import Pose2, RangeMessage
-from .pose_association import MOST_FRAMES, PoseAssociator
+from .pose_association import PoseAssociator
 from .pose_history import Poses
 from .rep117 import LONGEST_NAME, Measurement, Measurements, measure_all
 from .stamp_order import JUMP
@@ -197,9 +197,7 @@ class BatchAssociator(PoseAssociator):
         bad = np.flatnonzero(reasons != '')
         kinds = Counter((frames[k], str(reasons[k])) for k in bad[np.argsort(places[bad], kind='stable')].tolist())
         for (frame, reason), count in kinds.items():
-            if reason == 'unknown_extrinsics' and len(self.unknown_frames) < MOST_FRAMES:
-                self.unknown_frames.add(frame)
-            self._reject(frame, reason, count)
+            self._reject_unplaced(frame, reason, count)
 
 
 def _first_after(stamp: Ints, odometry: Odometry, newest: int | None) -> Ints:

@@ -20,6 +20,7 @@ from ..common.readings import Readings
 from .extrinsics import ExtrinsicsLookup, Later, Mount, project
 from .limit_watch import LimitWatch
 from .map_extent import MapExtent, possible
+from .message_account import MessageAccount
 from .message_types import NANOSECONDS, OdometryMessage, Pose2, RangeMessage
 from .pose_history import PoseHistory
 from .reading_buffer import ReadingBuffer
@@ -30,11 +31,6 @@ from .stamp_order import JUMP, JUMPED_BACK, WAS_AHEAD, order_of
 RETRY = NANOSECONDS // 20
 """Interval, in message time or by the clock, at which a pose that may still become known is looked up again."""
 
-MOST_FRAMES = 1000
-"""Most sensor frames with counts of their own; others are counted as `OTHERS`."""
-
-OTHERS = '(other frames)'
-
 MOST_WAITING = 100_000
 """Most readings that may wait for odometry, so that memory is bounded without odometry."""
 
@@ -42,23 +38,15 @@ LONGEST_LAG = 60.0
 """Longest time that a reading waits for odometry that keeps coming but has not reached its stamp, seconds."""
 
 
-class PoseAssociator:
+class PoseAssociator(MessageAccount):
     """Takes Range and Odometry messages one by one, in any interleaving, and stores the readings that get a pose.
+
+    ``received == len(buffer) + waiting + sum(rejected.values())``, always, as long as the buffer is not cleared.
 
     Attributes
     ----------
-    received, odometry_received : int
-        Range and Odometry messages so far. ``received == len(buffer) + waiting + sum(rejected.values())``, always,
-        as long as the buffer is not cleared.
-    rejected, odometry_rejected : Counter of str
-        Messages by reason (`REASONS`, `ODOMETRY_REASONS`).
-    rejected_by_frame : dict of frame_id → Counter
-    unknown_frames : set of str
-        Sensor frames whose pose on the robot is unknown at present.
     map_frame, base_frame : str
         The frames of the first odometry message; empty before it.
-    time_jumps : int
-        Number of times that the clock of odometry jumped back.
     behind : bool
         Whether more than `at_once` readings can be placed now; then call `settle` before the next message.
     settled : int
@@ -95,6 +83,7 @@ class PoseAssociator:
             Most readings that one call places or rejects, so that odometry after a long pause blocks nothing; 0 is no
             bound.
         """
+        super().__init__()
         self._clock = clock
         self._extrinsics = extrinsics
         self.parameters = (parameters or Parameters()).association
@@ -103,11 +92,6 @@ class PoseAssociator:
         self._patient = patient
         self.buffer = ReadingBuffer(self.parameters.max_readings)
         self.limits = LimitWatch()
-        self.received = self.odometry_received = self.time_jumps = 0
-        self.rejected: Counter[str] = Counter()
-        self.odometry_rejected: Counter[str] = Counter()
-        self.rejected_by_frame: dict[str, Counter[str]] = {}
-        self.unknown_frames: set[str] = set()
         self.map_frame = self.base_frame = ''
         self._waiting: list[Measurement] = []
         self._path, self._history = RobotPath(), PoseHistory(patient)
@@ -174,11 +158,6 @@ class PoseAssociator:
         self._newest_range = max(message.stamp, self._newest_range or message.stamp)
         self._settle()
 
-    def reject(self, message: RangeMessage, reason: str, count: int = 1) -> None:
-        """Count one Range message, or several from its frame, as rejected for an external reason."""
-        self.received += count
-        self._reject(message.frame_id, reason, count)
-
     def clear(self, parameters: Parameters | None = None) -> None:
         """Remove readings, counts and path; odometry is kept, so that the next reading gets a pose.
 
@@ -191,16 +170,12 @@ class PoseAssociator:
         self.record.begin_anew()
         self.buffer.clear()
         self.limits.clear()
-        self.rejected.clear()
-        self.odometry_rejected.clear()
-        self.rejected_by_frame.clear()
-        self.unknown_frames.clear()
+        self.begin_account()
         self._waiting.clear()
         self._held.clear()
         self._retrying, self.behind = 0, False
         self._newest_range, self._next_try, self._next_look = None, 0, 0
         self._path.clear()
-        self.received = self.odometry_received = self.time_jumps = 0
         self._extent.clear()
 
     def add_odometry(self, message: OdometryMessage, sent: int = 0) -> None:
@@ -246,7 +221,7 @@ class PoseAssociator:
             self._reject(measured.frame_id, 'no_odometry' if newest is None else 'after_odometry')
         self._waiting.clear()
         for measured, _, why in self._held:
-            self._reject_unplaced(measured, why.reason)
+            self._reject_unplaced(measured.frame_id, why.reason)
         self._held.clear()
 
     def restore(self, readings: Readings) -> int:
@@ -272,19 +247,6 @@ class PoseAssociator:
     def extend_path(self, point: tuple[float, float]) -> None:
         """Add a point to the path of the robot, if it is far enough from the last one."""
         self._path.extend(point)
-
-    def _reject(self, frame_id: str, reason: str, count: int = 1) -> None:
-        self.rejected[reason] += count
-        known = self.rejected_by_frame
-        new = len(known) < MOST_FRAMES and len(frame_id) <= LONGEST_NAME
-        name = frame_id if frame_id.isprintable() else frame_id.encode('unicode_escape').decode()
-        frame = name if name in known or new else OTHERS
-        self.rejected_by_frame.setdefault(frame, Counter())[reason] += count
-
-    def _reject_unplaced(self, measured: Measurement, reason: str) -> None:
-        if reason == 'unknown_extrinsics' and len(self.unknown_frames) < MOST_FRAMES:
-            self.unknown_frames.add(measured.frame_id)
-        self._reject(measured.frame_id, reason)
 
     def _drop_ahead(self) -> None:
         """Drop the newest pose, whose stamp was ahead of those before and after it; readings placed by it stay."""
@@ -350,7 +312,7 @@ class PoseAssociator:
             left -= 1
             measured, pose, why = self._held.popleft()
             if measured.stamp < limit and measured.arrival < oldest:
-                self._reject_unplaced(measured, why.reason)
+                self._reject_unplaced(measured.frame_id, why.reason)
             else:
                 self._add_extrinsics(measured, pose)
         return left
@@ -400,7 +362,7 @@ class PoseAssociator:
             self._held.append((measured, pose, extrinsic))
             return
         if extrinsic is None:
-            self._reject_unplaced(measured, 'unknown_extrinsics')
+            self._reject_unplaced(measured.frame_id, 'unknown_extrinsics')
             return
         self.unknown_frames.discard(measured.frame_id)
         if isinstance(extrinsic, str):

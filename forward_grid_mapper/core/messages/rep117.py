@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..common.parameters import AssociationParameters
+from ..common.parameter_groups import AssociationParameters
 from ..common.readings import Floats
 from .message_batch import REASON, Ranges
 from .message_types import RangeMessage

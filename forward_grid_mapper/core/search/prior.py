@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..common.constants import FORBIDDEN
-from ..common.parameters import SearchParameters
+from ..common.parameter_groups import SearchParameters
 from ..evidence.neighbourhood import NEIGHBOURS, offset, opposite, patterns
 from ..runtime.jit import allocating_kernel, kernel
 from ..sensor.cone_table import Floats

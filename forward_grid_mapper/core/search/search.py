@@ -32,7 +32,7 @@ from numpy.typing import NDArray
 
 from ..common.constants import FORBIDDEN, LONGEST_GAP, SHORT_WALL
 from ..common.grid import Window
-from ..common.parameters import SearchParameters
+from ..common.parameter_groups import SearchParameters
 from ..evidence.evidence import Evidence
 from ..evidence.neighbourhood import NEIGHBOURS
 from ..evidence.state import State

@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from ..common.parameters import ModelParameters
+from ..common.parameter_groups import ModelParameters
 from .density import density, hit_probability
 
 

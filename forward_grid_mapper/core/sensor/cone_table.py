@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from ..common.errors import InputError
 from ..common.grid import Grid
-from ..common.parameters import GridParameters, ModelParameters
+from ..common.parameter_groups import GridParameters, ModelParameters
 from ..common.readings import Readings
 from ..runtime.jit import allocating_kernel, kernel
 from .cone import Cone, make_cone, rows_of, runs_of

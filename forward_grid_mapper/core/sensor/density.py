@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..common.constants import HIT_LENGTH, MOST_HIT
-from ..common.parameters import ModelParameters
+from ..common.parameter_groups import ModelParameters
 from ..common.readings import Floats, Readings
 from ..runtime.jit import allocating_kernel, kernel
 

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..common.grid import Grid
-from ..common.parameters import ModelParameters
+from ..common.parameter_groups import ModelParameters
 from ..common.readings import Readings
 from ..runtime.jit import allocating_kernel, kernel
 from .cone_table import Cones, Floats, cone_table, walk_resized

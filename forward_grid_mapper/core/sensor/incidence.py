@@ -34,7 +34,7 @@ from ..common.constants import (
     WEIGHT_CELL,
 )
 from ..common.grid import Grid, Window
-from ..common.parameters import ModelParameters
+from ..common.parameter_groups import ModelParameters
 from ..runtime.cancelling import NEVER
 from ..runtime.jit import kernel
 from .cone import rows_of, runs_of, strength

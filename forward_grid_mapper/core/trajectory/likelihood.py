@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..common.constants import THROUGH
-from ..common.parameters import ModelParameters
+from ..common.parameter_groups import ModelParameters
 from ..common.readings import Readings
 from ..runtime.jit import kernel
 from ..sensor.cone_table import effective_sigma, reach_of

@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..common.grid import Grid
-from ..common.parameters import ModelParameters, Parameters
+from ..common.parameter_groups import ModelParameters
+from ..common.parameters import Parameters
 from ..common.readings import Readings
 from ..evidence.evidence import Evidence
 from ..evidence.learned_normals import NO_INCIDENCE_LIMIT

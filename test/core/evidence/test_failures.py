@@ -17,6 +17,7 @@ from forward_grid_mapper.core.common.errors import Cancelled
 from forward_grid_mapper.core.common.grid import Grid
 from forward_grid_mapper.core.common.readings import Readings
 from forward_grid_mapper.core.evidence import evidence as module
+from forward_grid_mapper.core.evidence import indexed_readings
 from forward_grid_mapper.core.evidence.evidence import Evidence
 from forward_grid_mapper.core.maps.free_space import expected_passes
 from forward_grid_mapper.core.runtime import threads
@@ -115,7 +116,8 @@ def test_cancelled_in_the_middle_everything_is_as_it_was(
         step(whole)
     fails(whole)
     untouched = told(evidence)
-    real = getattr(module, kernel)
+    where = indexed_readings if kernel == 'insert_readings' else module
+    real = getattr(where, kernel)
 
     def halfway(s: Any, *rest: Any) -> Any:
         if s.stop is not stop:
@@ -130,7 +132,7 @@ def test_cancelled_in_the_middle_everything_is_as_it_was(
         return done
 
     with monkeypatch.context() as patch:
-        patch.setattr(module, kernel, halfway)
+        patch.setattr(where, kernel, halfway)
         with pytest.raises(Cancelled):
             fails(evidence)
     stop[0] = 0
@@ -174,10 +176,10 @@ def test_threads_for_which_there_is_no_memory_are_done_without(monkeypatch: pyte
     one = Evidence(GRID, model, start=occupied.reshape(GRID.shape))
     one.extend(readings)
     used: list[int] = []
-    real = module.run_each
-    monkeypatch.setattr(module, 'run_each', lambda work: used.append(len(work)) or real(work))
+    real = indexed_readings.run_each
+    monkeypatch.setattr(indexed_readings, 'run_each', lambda work: used.append(len(work)) or real(work))
     for limit in (10**9, 5 * 24 * GRID.size, 0):
-        monkeypatch.setattr(module, 'THREAD_MEMORY', limit)
+        monkeypatch.setattr(indexed_readings, 'THREAD_MEMORY', limit)
         used.clear()
         many = Evidence(GRID, model, threads=12, start=occupied.reshape(GRID.shape))
         many.extend(readings)

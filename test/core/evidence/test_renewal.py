@@ -9,7 +9,7 @@ import pytest
 from test_evidence import snapshot
 
 from forward_grid_mapper.core.common.grid import Grid
-from forward_grid_mapper.core.common.parameters import ModelParameters
+from forward_grid_mapper.core.common.parameter_groups import ModelParameters
 from forward_grid_mapper.core.common.readings import Readings
 from forward_grid_mapper.core.evidence import evidence as module
 from forward_grid_mapper.core.evidence.evidence import UNUSED, Evidence

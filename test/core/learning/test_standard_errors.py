@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from line_world import LINE, TRUTH, drawn, line_map
 
-from forward_grid_mapper.core.common.parameters import ModelParameters
+from forward_grid_mapper.core.common.parameter_groups import ModelParameters
 from forward_grid_mapper.core.common.readings import Readings
 from forward_grid_mapper.core.joint_learning import settle
 from forward_grid_mapper.core.learning.standard_errors import LEARNED, Estimate, estimates, estimating_functions

@@ -9,7 +9,8 @@ import pytest
 
 import naive
 from forward_grid_mapper.core.common.grid import Grid
-from forward_grid_mapper.core.common.parameters import ModelParameters, Parameters
+from forward_grid_mapper.core.common.parameter_groups import ModelParameters
+from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.common.readings import Readings
 from forward_grid_mapper.core.evidence.evidence import Evidence
 from forward_grid_mapper.core.mapping import Mapper

@@ -11,7 +11,7 @@ import pytest
 import naive
 from forward_grid_mapper.core.common.constants import FREE_GROWTH, FREE_MARGIN, LONGEST_GAP, MOST_AGAINST_EXTENSION
 from forward_grid_mapper.core.common.grid import Grid
-from forward_grid_mapper.core.common.parameters import ModelParameters
+from forward_grid_mapper.core.common.parameter_groups import ModelParameters
 from forward_grid_mapper.core.common.readings import Readings
 from forward_grid_mapper.core.evidence.evidence import Evidence
 from forward_grid_mapper.core.evidence.fixed_point import QUANTUM

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 import naive
 from forward_grid_mapper.core.common.constants import LEAST_EVIDENCE, LEAST_NOTICING
-from forward_grid_mapper.core.common.parameters import SearchParameters
+from forward_grid_mapper.core.common.parameter_groups import SearchParameters
 from forward_grid_mapper.core.maps import uncertainty
 from forward_grid_mapper.core.maps.free_space import Passes
 from forward_grid_mapper.core.maps.uncertainty import calibrated, discounted, marginals, uncertainty_map

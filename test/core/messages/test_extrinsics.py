@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from forward_grid_mapper.core.common.parameters import AssociationParameters
+from forward_grid_mapper.core.common.parameter_groups import AssociationParameters
 from forward_grid_mapper.core.messages.extrinsics import STEEP, Mount, mount_of, project, shadow_of
 from forward_grid_mapper.core.messages.message_types import OdometryMessage, Pose2, RangeMessage
 from forward_grid_mapper.core.messages.pose_association import PoseAssociator

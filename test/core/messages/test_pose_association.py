@@ -12,8 +12,9 @@ from hypothesis import strategies as st
 
 from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.messages.extrinsics import LATER, Later
+from forward_grid_mapper.core.messages.message_account import MOST_FRAMES
 from forward_grid_mapper.core.messages.message_types import NANOSECONDS, OdometryMessage, Pose2, RangeMessage
-from forward_grid_mapper.core.messages.pose_association import MOST_FRAMES, PoseAssociator
+from forward_grid_mapper.core.messages.pose_association import PoseAssociator
 from forward_grid_mapper.core.messages.pose_history import HISTORY
 from forward_grid_mapper.core.messages.rep117 import REASONS, measure
 

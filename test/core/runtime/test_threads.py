@@ -11,7 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from forward_grid_mapper.core.common.grid import Grid
-from forward_grid_mapper.core.common.parameters import ModelParameters, Parameters, SearchParameters
+from forward_grid_mapper.core.common.parameter_groups import ModelParameters, SearchParameters
+from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.evidence.evidence import Evidence
 from forward_grid_mapper.core.mapping import Mapper
 from forward_grid_mapper.core.runtime import threads

@@ -15,7 +15,7 @@ from forward_grid_mapper.core.common.constants import (
     PASSAGE,
 )
 from forward_grid_mapper.core.common.grid import Grid
-from forward_grid_mapper.core.common.parameters import SearchParameters
+from forward_grid_mapper.core.common.parameter_groups import SearchParameters
 from forward_grid_mapper.core.common.readings import Readings
 from forward_grid_mapper.core.evidence.evidence import Evidence
 from forward_grid_mapper.core.evidence.fixed_point import QUANTUM

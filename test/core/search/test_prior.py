@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
 import naive
-from forward_grid_mapper.core.common.parameters import SearchParameters
+from forward_grid_mapper.core.common.parameter_groups import SearchParameters
 from forward_grid_mapper.core.evidence.neighbourhood import (
     EAST,
     NORTH,

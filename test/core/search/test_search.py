@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 import naive
 from forward_grid_mapper.core.common.errors import Cancelled
 from forward_grid_mapper.core.common.grid import Grid
-from forward_grid_mapper.core.common.parameters import ModelParameters, SearchParameters
+from forward_grid_mapper.core.common.parameter_groups import ModelParameters, SearchParameters
 from forward_grid_mapper.core.common.readings import Readings
 from forward_grid_mapper.core.evidence.evidence import Evidence
 from forward_grid_mapper.core.evidence.updates import flip

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 import naive
 from forward_grid_mapper.core.common.grid import Grid, cone_boxes
-from forward_grid_mapper.core.common.parameters import GridParameters, ModelParameters
+from forward_grid_mapper.core.common.parameter_groups import GridParameters, ModelParameters
 from forward_grid_mapper.core.common.readings import Readings
 from forward_grid_mapper.core.sensor.cone import axis_run, rows_of, runs_of, within
 from forward_grid_mapper.core.sensor.cone_table import (

@@ -11,7 +11,7 @@ import pytest
 import naive
 from forward_grid_mapper.core.common.constants import MOST_HIT
 from forward_grid_mapper.core.common.grid import Grid
-from forward_grid_mapper.core.common.parameters import ModelParameters
+from forward_grid_mapper.core.common.parameter_groups import ModelParameters
 from forward_grid_mapper.core.common.readings import Readings
 from forward_grid_mapper.core.learning.model_update import learn
 from forward_grid_mapper.core.sensor.density import CUT, hit_parameter, hit_probability

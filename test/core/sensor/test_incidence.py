@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 import naive
 from forward_grid_mapper.core.common.constants import NEIGHBOURHOOD, WEIGHT_CELL
 from forward_grid_mapper.core.common.grid import Grid
-from forward_grid_mapper.core.common.parameters import ModelParameters
+from forward_grid_mapper.core.common.parameter_groups import ModelParameters
 from forward_grid_mapper.core.common.readings import Readings
 from forward_grid_mapper.core.evidence.evidence import Evidence
 from forward_grid_mapper.core.runtime.cancelling import NEVER
