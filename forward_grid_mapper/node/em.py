@@ -22,7 +22,7 @@ from ..core.maps.map_set import MapSet
 from ..core.runtime.memory import shortage
 from ..core.runtime.threads import cores
 from ..core.search.search import Progress
-from ..files.quality_warning import deaf, quality_warning
+from ..files.quality_warning import quality_warning, without_echoes
 from .background import Worker, reason
 from .refining import RefiningMapper
 
@@ -151,7 +151,7 @@ class EmWorker:
         """Add the health of sensors and warnings; the maps are valid without them."""
         try:
             outcome.health = sensor_health(maps)
-            outcome.warnings = [*deaf(maps.readings), *input_warnings(maps.readings)]
+            outcome.warnings = [*without_echoes(maps.readings), *input_warnings(maps.readings)]
         except Exception as error:
             outcome.warnings = [f'sensors could not be judged: {error!r}']
 
