@@ -24,7 +24,7 @@ from .core.messages.rep117 import ODOMETRY_REASONS, REASONS, rejection_warnings,
 from .files.pose_files import poses_from_csv, poses_from_tum
 from .files.quality_warning import data_warnings
 from .files.results import write_results
-from .recordings.drive import LogOddsMapOfAll, thinning_note, to_and_fro_note
+from .recordings.drive import FullLiveMap, alternation_note, thinning_note
 
 __all__ = ['Sonar', 'SonarMaps', 'make_maps', 'poses_from_csv', 'poses_from_tum']
 
@@ -196,7 +196,7 @@ def make_maps(
         raise InputError(f'there are {len(odometry)} poses and {len(values)} ranges; both are needed')
     mounted: dict[str, Pose2] = {name: Mount(s.x, s.y, s.yaw, -s.pitch) for name, s in sensors.items()}
     associator = PoseAssociator(lambda base, frame, stamp: mounted.get(frame), chosen, patient=True)
-    live = LogOddsMapOfAll(associator, chosen)
+    live = FullLiveMap(associator, chosen)
     for pose in odometry:
         associator.add_odometry(pose)
     for i in np.argsort(stamps, kind='stable').tolist():
@@ -217,7 +217,7 @@ def make_maps(
     before = [
         *_of_the_node(chosen),
         *arrays.twofold(odometry),
-        *to_and_fro_note(associator),
+        *alternation_note(associator),
         *_told_of_poses(associator),
         *associator.limits.warnings(),
         *rejection_warnings(associator.rejected, len(values), 'ranges'),

@@ -1,4 +1,4 @@
-"""Reading and writing recorded messages: ROS 2 mcap and sqlite3 bags, ROS 1 bags."""
+"""Reads and writes recorded messages: ROS 2 mcap and sqlite3 bags, ROS 1 bags."""
 
 from .choice import Topics
 from .reader import Bag

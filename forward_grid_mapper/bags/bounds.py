@@ -1,4 +1,4 @@
-"""Bounds on what a bag may unpack to, so that a small crafted file takes neither all memory nor all day.
+"""Bounds on decompression, so that a small crafted bag uses neither all memory nor all time.
 
 Every decompression of a bag, rosbags' own included, goes through `unpack`.
 """
@@ -20,19 +20,19 @@ from rosbags.rosbag2 import storage_mcap
 from .source import Damage
 
 LARGEST_CHUNK = 128 << 20
-"""Bytes that one chunk may unpack to. Recorders close a chunk at 1 to 4 MB, or after one message that is larger."""
+"""Largest decompressed size of a chunk. Recorders close a chunk at 1 to 4 MB, or after one message that is larger."""
 
 LARGEST_MESSAGE = 16 << 20
-"""Bytes that one message of a bag with compressed messages may unpack to; a Range has 60, an Odometry 720."""
+"""Largest decompressed size of a message in a bag with compressed messages; a Range has 60, an Odometry 720."""
 
 FREE = 256 << 20
-"""Bytes that a file may unpack to, however small it is."""
+"""Decompressed size that is allowed for a file of any size."""
 
 RATIO = 100
-"""Times its own size that a file may unpack to beyond `FREE`. Ranges and odometry shrink to a tenth or so."""
+"""Largest ratio of decompressed to compressed size beyond `FREE`. For ranges and odometry it is about 10."""
 
 LARGEST_METADATA = 16 << 20
-"""Bytes of a metadata.yaml; one of a bag with ten thousand files has 3 MB."""
+"""Largest metadata.yaml, bytes; that of a bag with ten thousand files has 3 MB."""
 
 _DECOMPRESSORS: dict[str, Callable[[], Any]] = {
     'bz2': bz2.BZ2Decompressor,
@@ -42,31 +42,31 @@ _DECOMPRESSORS: dict[str, Callable[[], Any]] = {
 
 
 def most_unpacked(size: int) -> int:
-    """Return how many bytes a file of `size` bytes may unpack to."""
+    """Return the largest decompressed size that is allowed for a file of `size` bytes."""
     return FREE + RATIO * size
 
 
 def megabytes(size: int) -> str:
-    """Return a number of bytes for people."""
+    """Return a number of bytes in words."""
     return f'{size / 1e6:,.0f} MB'
 
 
 def unpack(compression: str, data: bytes, most: int) -> bytes:
-    """Decompress frame after frame; data that are cut off give their beginning.
+    """Decompress all frames; truncated data give their beginning.
 
     Parameters
     ----------
     compression : {'', 'none', 'bz2', 'lz4', 'zstd'}
     data : bytes
     most : int
-        Bytes of the result at the most; not much more memory is taken before the error.
+        Largest size of the result, bytes; not much more memory is used before the error.
 
     Raises
     ------
     Damage
-        If the compression is another one, or the result would be larger.
+        If the compression is unknown, or the result would be larger.
     Exception
-        Of the kinds of the libraries, if the data are damaged.
+        Of the library, if the data are damaged.
     """
     if compression in ('', 'none'):
         return data
@@ -90,7 +90,7 @@ def unpack(compression: str, data: bytes, most: int) -> bytes:
 
 
 class Budget:
-    """What the chunks of one file may unpack to together; a reader may unpack a chunk more than once.
+    """Bounds the decompressed size of all chunks of a file; a chunk that is read again counts again.
 
     Parameters
     ----------
@@ -102,35 +102,35 @@ class Budget:
         self._most = self._left = most_unpacked(size)
 
     def unpack(self, compression: str, data: bytes, stated: int = LARGEST_CHUNK) -> bytes:
-        """Decompress a chunk that states its size, or has the largest admitted one.
+        """Decompress a chunk with a stated size, or at most the largest allowed one.
 
         Raises
         ------
         Damage
-            If it unpacks to more than it states, or all of them to more than is admitted.
+            If its size is larger than stated, or the total is larger than allowed.
         """
         if stated > LARGEST_CHUNK:
             raise Damage(f'a chunk states {megabytes(stated)}, more than the {megabytes(LARGEST_CHUNK)} admitted')
-        # what was refused already takes no more time
+        # once the budget is spent, no more time is spent either
         self.spend(0)
         raw = unpack(compression, data, stated)
         self.spend(len(raw))
         return raw
 
     def spend(self, size: int) -> None:
-        """Count what a chunk unpacked to.
+        """Count the decompressed size of a chunk.
 
         Raises
         ------
         Damage
-            If all of them unpack to more than is admitted.
+            If the total is larger than allowed.
         """
         self._left -= size
         if self._left < 0:
             raise Damage(f'its chunks unpack to more than {megabytes(self._most)}')
 
     def metered(self, decompress: Callable[[bytes], bytes]) -> Callable[[bytes], bytes]:
-        """Return a function that decompresses, and counts the result."""
+        """Return a decompression function that counts its results."""
 
         def counted(data: bytes) -> bytes:
             self.spend(0)
@@ -146,7 +146,7 @@ _opening: ContextVar[Budget | None] = ContextVar('_opening', default=None)
 
 @contextmanager
 def bounded(size: int) -> Iterator[None]:
-    """Let rosbags unpack in the block only what a file of `size` bytes may: some files it unpacks as it opens them."""
+    """Bound decompression by rosbags in the block for a file of `size` bytes: it decompresses some as it opens them."""
     token = _opening.set(Budget(size))
     try:
         yield
@@ -162,7 +162,7 @@ def _unpack_for_rosbags(compression: str, data: bytes, stated: int) -> bytes:
 
 
 def _bound_rosbags() -> None:
-    """Put bounded decompressors into rosbags' tables: its own trust the size that the compressed data state."""
+    """Put bounded decompressors into rosbags' tables: its own ones trust the size stated in the data."""
     for name in ('lz4', 'zstd'):
         storage_mcap.DECOMPRESSORS[name] = partial(_unpack_for_rosbags, name)
     for name in ('lz4', 'bz2'):

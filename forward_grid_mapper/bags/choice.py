@@ -1,4 +1,4 @@
-"""Which of a bag's topics to map from."""
+"""Selects the topics of a bag to map from."""
 
 from __future__ import annotations
 
@@ -9,23 +9,23 @@ from ..core.common.errors import BagError
 from ..core.common.shell import quoted
 from ..core.common.words import counted
 from .decoder import TF_MESSAGE
-from .namespaces import Parted, ranges_of
+from .namespaces import Assigned, ranges_of
 from .poses import BASE_FRAMES, ODOMETRY, POSES
 
 __all__ = ['ODOMETRY', 'RANGE', 'Topics', 'choose_topics']
 
 RANGE = 'sensor_msgs/msg/Range'
 
-WISHES = ('goal', 'initialpose', 'initial_pose')
-"""Parts of the names of topics whose poses say where the robot should be, or is believed to be once."""
+GOALS = ('goal', 'initialpose', 'initial_pose')
+"""Parts of names of topics whose poses are goals, or initial estimates."""
 
 Contents = Mapping[str, tuple[str, int]]
 
 
 class Topics(NamedTuple):
-    """The topics to map from, named as the bag names them; `odom_type` is one of `POSES`.
+    """The topics to map from, with their names in the bag; `odom_type` is one of `POSES`.
 
-    `left_out` are topics of ranges that are taken for those of other robots.
+    `left_out` are topics of ranges that seem to belong to other robots.
     """
 
     range_topics: tuple[str, ...]
@@ -34,7 +34,7 @@ class Topics(NamedTuple):
     left_out: tuple[str, ...] = ()
 
     def notes(self) -> list[str]:
-        """Return what the user should know of the choice."""
+        """Return notes on the choice for the user."""
         if not self.left_out:
             return []
         every = ' '.join(map(quoted, (*self.range_topics, *self.left_out)))
@@ -51,9 +51,9 @@ def choose_topics(
     frames_of: Callable[[str], str],
     any_poses: bool = False,
 ) -> Topics:
-    """Return the named topics, or where none is named those found by type.
+    """Return the named topics, or else those found by type.
 
-    Where robots have a namespace each, the ranges found are those of the namespace of the odometry.
+    If each robot has a namespace, the topics of ranges are those in the namespace of the odometry.
 
     Parameters
     ----------
@@ -62,26 +62,26 @@ def choose_topics(
     range_topics, odom_topic
         The user's choice; a leading slash makes no difference.
     frames_of : callable
-        Describes the frames of an odometry topic, for the user to choose by.
+        Describes the frames of an odometry topic for the user.
     any_poses : bool
-        Whether other messages with poses of the robot will do, `POSES`: stamped poses where there is no Odometry, and
-        transforms where their topic is named.
+        Whether other messages with poses of the robot are allowed, `POSES`: stamped poses if there is no Odometry, and
+        transforms if their topic is named.
 
     Raises
     ------
     BagError
-        If a named topic is not there, or none or too many are found.
+        If a named topic is missing, or none or too many are found.
     """
     ranges = choose_range_topics(contents, range_topics)
     kinds = tuple(POSES) if any_poses else (ODOMETRY,)
     if odom_topic is not None:
         topic = _named(contents, odom_topic, kinds, '--odom-topic')
         kind = contents[topic][0]
-        mine = Parted(ranges, ()) if range_topics is not None else ranges_of(topic, _of_type(contents, kind), ranges)
-        return Topics(mine.taken, topic, kind, mine.left_out)
-    # stamped poses only where there is no odometry, since they may be goals; transforms only if asked for
+        mine = Assigned(ranges, ()) if range_topics is not None else ranges_of(topic, _of_type(contents, kind), ranges)
+        return Topics(mine.own, topic, kind, mine.left_out)
+    # stamped poses only without odometry, since they may be goals; transforms only if named
     found = _of_type(contents, ODOMETRY) or [
-        t for kind in kinds if kind != TF_MESSAGE for t in _of_type(contents, kind) if not _is_wish(t)
+        t for kind in kinds if kind != TF_MESSAGE for t in _of_type(contents, kind) if not _is_goal(t)
     ]
     if not found:
         raise BagError(
@@ -99,12 +99,12 @@ def choose_topics(
 
 
 def choose_range_topics(contents: Contents, range_topics: Sequence[str] | None) -> tuple[str, ...]:
-    """Return the named topics of ranges, or where none is named all there are; the parameters are as above.
+    """Return the named topics of ranges, or else all; the parameters are as above.
 
     Raises
     ------
     BagError
-        If a named topic is not there, or there is none.
+        If a named topic is missing, or there is none.
     """
     if range_topics is None:
         ranges = tuple(_of_type(contents, RANGE))
@@ -119,18 +119,18 @@ def choose_range_topics(contents: Contents, range_topics: Sequence[str] | None) 
 
 
 def _choosing(odometry: str, found: Sequence[str], ranges: Sequence[str]) -> str:
-    """Return the options that choose an odometry topic, and the ranges of its robot where there are others."""
+    """Return the options that select an odometry topic, and the ranges of its robot if there are others."""
     mine = ranges_of(odometry, found, ranges)
-    words = ['--odom-topic', odometry, *(['--range-topics', *mine.taken] if mine.left_out else [])]
+    words = ['--odom-topic', odometry, *(['--range-topics', *mine.own] if mine.left_out else [])]
     return ' '.join(map(quoted, words))
 
 
-def _is_wish(topic: str) -> bool:
-    return any(word in topic.lower() for word in WISHES)
+def _is_goal(topic: str) -> bool:
+    return any(word in topic.lower() for word in GOALS)
 
 
 def _moving(contents: Contents, kinds: Sequence[str]) -> str:
-    """Return what to do where transforms may have the poses; empty where they have none."""
+    """Return a remedy if transforms may have the poses; otherwise ''."""
     topics = _of_type(contents, TF_MESSAGE)
     if not topics or TF_MESSAGE not in kinds:
         return ''
@@ -138,7 +138,7 @@ def _moving(contents: Contents, kinds: Sequence[str]) -> str:
 
 
 def _of_type(contents: Contents, msgtype: str) -> list[str]:
-    # transforms that stand still are no poses of a robot
+    # topics with only static transforms have no poses of a robot
     return sorted(
         topic
         for topic, (kind, count) in contents.items()

@@ -1,4 +1,4 @@
-"""Serialized messages of a channel, many at once: those of a known layout by numpy, all others one by one."""
+"""Deserializes messages of a channel: known layouts by numpy, many at once, and all others one by one."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from .layouts import Layout, Path, by_length
 from .poses import paths_of_pose
 
 MOST_LAYOUTS = 64
-"""Layouts of a channel; sensors that share a topic have one each."""
+"""Most layouts of a channel; if sensors share a topic, each has its own."""
 
 VALUES: tuple[Path, ...] = tuple((name,) for name in ('range', 'min_range', 'max_range', 'field_of_view', 'variance'))
 _STAMP: tuple[Path, ...] = (('sec',), ('nanosec',))
@@ -39,7 +39,7 @@ class _Known:
         return same
 
     def batch(self, places: Places, rows: Bytes) -> list[MessageBatch]:
-        """Return messages of this layout; none where they say nothing of the robot."""
+        """Return messages of this layout; none if they contain no data of the robot."""
         if self._first is None:
             return []
         seconds, nanoseconds, *values = (self._layout.column(path, rows) for path in self._paths)
@@ -64,7 +64,7 @@ class Columns:
     decoder : Decoder
         Of the channel.
     convert : callable
-        Makes a message of what the decoder returns, or None where it says nothing of the robot.
+        Converts a decoded message, or returns None if it contains no data of the robot.
     """
 
     def __init__(self, decoder: Decoder, convert: Convert) -> None:
@@ -73,14 +73,14 @@ class Columns:
         self._count = 0
 
     def decode(self, places: Places, data: Sequence[bytes]) -> tuple[list[MessageBatch], list[int]]:
-        """Return what messages say, and the places of those that do not fit their type."""
+        """Return the decoded messages, and the places of those that do not fit their type."""
         found: list[MessageBatch] = []
         bad: list[int] = []
         for which, rows in by_length(data):
             left = np.arange(len(which))
             for known in self._known.get(rows.shape[1], ()):
                 left = self._take(known, places[which], rows, left, found)
-            while len(left) and (new := self._learned(data[which[left[0]]])) is not None:
+            while len(left) and (new := self._new_layout(data[which[left[0]]])) is not None:
                 left = self._take(new, places[which], rows, left, found)
             wrong, slow = self._one_by_one((int(places[k]), data[k]) for k in which[left].tolist())
             bad += wrong
@@ -91,7 +91,7 @@ class Columns:
     def _take(
         known: _Known, places: Places, rows: Bytes, left: NDArray[np.int64], found: list[MessageBatch]
     ) -> NDArray[np.int64]:
-        """Add what is of a layout to `found`; return what is left."""
+        """Add the messages of a layout to `found`; return the remaining ones."""
         if not len(left):
             return left
         same = known.matching(rows[left] if len(left) < len(rows) else rows)
@@ -99,8 +99,8 @@ class Columns:
             found += known.batch(places[left[same]], rows[left[same]])
         return left[~same]
 
-    def _learned(self, data: bytes) -> _Known | None:
-        """Return the layout of a message; None if there is none, or there are too many, or it cannot be trusted."""
+    def _new_layout(self, data: bytes) -> _Known | None:
+        """Return the layout of a message; None if there is none, if there are too many, or if it is unreliable."""
         if self._count >= MOST_LAYOUTS:
             return None
         try:
@@ -112,7 +112,7 @@ class Columns:
             first = self._convert(message)
             if any(kind not in _SECONDS for kind in kinds) or not layout.agrees(self._decoder, paths):
                 return None
-        except Exception:  # whatever rosbags says of bytes that do not fit, or this of a type that is another one
+        except Exception:  # errors of rosbags for bytes that do not fit, or ours for an unexpected type
             return None
         self._count += 1
         made = _Known(layout, first, paths, np.frombuffer(data, np.uint8))
@@ -124,7 +124,7 @@ class Columns:
         for place, data in messages:
             try:
                 converted = self._convert(self._decoder(data))
-            except Exception:  # of many kinds, for bytes that do not fit or a definition with other fields
+            except Exception:  # of many classes, for bytes that do not fit or a definition with other fields
                 bad.append(place)
                 continue
             if converted is not None:
@@ -133,16 +133,16 @@ class Columns:
 
 
 class InOrder(Columns):
-    """Decodes messages of which each says something only together with those before it."""
+    """Decodes messages in order, since each depends on those before it."""
 
     def decode(self, places: Places, data: Sequence[bytes]) -> tuple[list[MessageBatch], list[int]]:
-        """Return what messages say, and the places of those that do not fit their type."""
+        """Return the decoded messages, and the places of those that do not fit their type."""
         bad, found = self._one_by_one(zip(places.tolist(), data, strict=True))
         return found, bad
 
 
 def _paths(message: Any) -> list[Path]:
-    """Return where seconds, nanoseconds and values of a message are, as `Ranges` or `planar_pose_of` orders them."""
+    """Return the paths of seconds, nanoseconds and values of a message, as ordered in `Ranges` or `planar_pose_of`."""
     if hasattr(message, 'field_of_view'):
         values = VALUES if hasattr(message, 'variance') else VALUES[:-1]
         header: Path = ('header',)

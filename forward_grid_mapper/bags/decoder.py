@@ -1,4 +1,4 @@
-"""From serialized bytes to message objects, by the definition in the bag or else by those ROS ships."""
+"""Deserializes messages, by the definition in the bag or else by those of ROS."""
 
 from __future__ import annotations
 
@@ -12,34 +12,34 @@ from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_
 from .source import Channel, Damage
 
 TF_MESSAGE = 'tf2_msgs/msg/TFMessage'
-# ROS 1 has tf2_msgs, but rosbags' store of Noetic's types leaves it out.
+# ROS 1 has tf2_msgs, but rosbags' type store of Noetic lacks it.
 TF_MESSAGE_ROS1 = get_types_from_msg('geometry_msgs/TransformStamped[] transforms', TF_MESSAGE)
 _IDL_SEPARATOR = '=' * 80 + '\n'
 
 LARGEST_DEFINITION = 1 << 18
-"""Characters of a message definition; that of Odometry has 10 000 with all comments."""
+"""Most characters of a message definition; that of Odometry has 10 000 with all comments."""
 
 MOST_FIELDS = 10_000
-"""Values in a message, arrays of fixed length counted out: rosbags writes some lines of code for each."""
+"""Most values in a message, including elements of arrays: rosbags generates some lines of code for each."""
 
 LONGEST_SEQUENCE = 100_000
-"""Elements of a sequence in a message; a Range and an Odometry have none, a TFMessage some for each frame."""
+"""Most elements of a sequence in a message; a Range and an Odometry have none, a TFMessage some for each frame."""
 
 Fields = Mapping[str, Any]
-"""What rosbags makes of a definition: constants and (name, descriptor) of the fields, by message type."""
+"""Definitions parsed by rosbags: constants and (name, descriptor) of the fields, by message type."""
 
 
 class Decoder:
     """Decodes the messages of one type and definition.
 
-    Where the bag holds no definition, those of Jazzy and Humble are tried: `sensor_msgs/Range` gained `variance` in
-    between, and the length of a message shows which of the two it is.
+    Without a definition in the bag, those of Jazzy and Humble are tried: `sensor_msgs/Range` gained `variance` between
+    them, and the length of a message shows which one fits.
 
     Attributes
     ----------
     msgtype : str
     ros1 : bool
-        Whether messages are in ROS 1's encoding.
+        Whether messages have the encoding of ROS 1.
     """
 
     def __init__(self, msgtype: str, encoding: str, definition_format: str, definition: str) -> None:
@@ -54,12 +54,12 @@ class Decoder:
         Raises
         ------
         Exception
-            Of many kinds, if the bytes do not fit the definition.
+            Of many classes, if the bytes do not fit the definition.
         """
         for store in self._stores[:-1]:
             try:
                 return self._decode(store, data)
-            except Exception:  # this definition does not fit; the last one's error is the one to report
+            except Exception:  # this definition does not fit; the error of the last one is reported
                 continue
         return self._decode(self._stores[-1], data)
 
@@ -84,13 +84,13 @@ def _cached(msgtype: str, encoding: str, definition_format: str, definition: str
 
 
 def decoder_of(channel: Channel) -> Decoder:
-    """Return the decoder for a channel's messages; the same for channels of one type."""
+    """Return the decoder for a channel's messages; channels of the same type share it."""
     return _cached(channel.msgtype, channel.encoding, channel.definition_format, channel.definition)
 
 
 @lru_cache(maxsize=2)
 def default_stores(*, ros1: bool) -> list[Any]:
-    """Return rosbags type stores with the definitions that ROS ships, the newest first."""
+    """Return rosbags type stores with the definitions of ROS, the newest first."""
     stores = [Stores.ROS1_NOETIC] if ros1 else [Stores.ROS2_JAZZY, Stores.ROS2_HUMBLE]
     made = [get_typestore(store) for store in stores]
     for store in made:
@@ -101,13 +101,13 @@ def default_stores(*, ros1: bool) -> list[Any]:
 
 
 def _embedded_store(msgtype: str, definition_format: str, definition: str) -> Any:
-    """Return a type store with the bag's own definition, None if there is none, or it is unreadable or too large."""
+    """Return a type store with the bag's own definition; None if that is missing, unreadable or too large."""
     if definition_format not in ('msg', 'idl') or not definition.strip() or len(definition) > LARGEST_DEFINITION:
         return None
     types: dict[str, Any] = {}
     try:
         if definition_format == 'msg':
-            # rosbags takes a tenth of a millisecond for an empty line
+            # rosbags needs a tenth of a millisecond for an empty line
             lines = (line for line in definition.splitlines() if line.strip())
             types.update(get_types_from_msg('\n'.join(lines) + '\n', msgtype))
         else:
@@ -122,7 +122,7 @@ def _embedded_store(msgtype: str, definition_format: str, definition: str) -> An
         store.max_sequence_length = LONGEST_SEQUENCE
         store.register({name: types[name] for name in needed})
         return store if msgtype in store.types else None
-    except Exception:  # the parser's errors are of many kinds; the default definition serves as well
+    except Exception:  # the parser's errors are of many classes; the default definition is used instead
         return None
 
 
@@ -148,13 +148,13 @@ def _needed(types: Fields, msgtype: str) -> set[str]:
 
 
 def _size(types: Fields, msgtype: str, known: dict[str, tuple[int, int] | None]) -> tuple[int, int]:
-    """Return the least number of bytes of a message, and how many values it has beside the elements of sequences.
+    """Return the smallest number of bytes of a message, and its number of values without elements of sequences.
 
     Raises
     ------
     Damage
-        If a type contains itself, or an array or a sequence has elements without a byte, so that no length of a
-        message bounds their number.
+        If a type contains itself, or an array or a sequence has elements of zero bytes, so that the length of a message
+        does not bound their number.
     """
     if msgtype in known:
         result = known[msgtype]
@@ -162,7 +162,7 @@ def _size(types: Fields, msgtype: str, known: dict[str, tuple[int, int] | None])
             raise Damage(f'{msgtype} contains itself')
         return result
     if msgtype not in types:
-        # a time or a duration, which the store knows
+        # a time or a duration, which the store defines
         return 8, 2
     known[msgtype] = None
     least = values = 0

@@ -1,8 +1,8 @@
-"""Where the numbers of a message lie among its bytes, so that those of many messages can be read at once.
+"""Positions of numbers in serialized messages, so that many messages can be read at once.
 
-Strings and the lengths of sequences decide where everything behind them is. So a layout holds for all messages of its
-length in which these bytes are the same, as those of one sensor are. It is made from the definition by which rosbags
-decodes, and is used only if it finds in bytes of chance what rosbags finds there.
+Strings and the lengths of sequences determine the position of everything after them. So a layout holds for all
+messages of the same length in which these bytes are the same, such as those of one sensor. It is made from the
+definition by which rosbags decodes, and is used only if it agrees with rosbags on random bytes.
 """
 
 from __future__ import annotations
@@ -18,31 +18,31 @@ from rosbags.interfaces import Nodetype
 from .source import Damage
 
 Path = tuple[str | int, ...]
-"""A field within a message: names of fields, and numbers of elements."""
+"""A field of a message: names of fields, and indices of elements."""
 
 _KINDS = {
     **{f'{sign}int{bits}': f'{sign[:1] or "i"}{bits // 8}' for sign in ('', 'u') for bits in (8, 16, 32, 64)},
     **{'float32': 'f4', 'float64': 'f8', 'bool': 'u1', 'byte': 'u1', 'char': 'u1', 'octet': 'u1'},
 }
-"""Types of numpy by those of messages."""
+"""Types of numpy for those of messages."""
 
 MOST_ELEMENTS = 256
-"""Elements of a sequence up to which there is a layout, such as transforms of one message."""
+"""Most elements of a sequence in a layout, such as transforms of one message."""
 
 
 class Layout:
-    """Where the fields of a message are.
+    """Positions of the fields of a message.
 
     Attributes
     ----------
     fields : dict
         Position and type of each number, by its path.
     fixed : int64, shape (K,)
-        The bytes that have to be the same.
+        The bytes that must be the same.
     """
 
     def __init__(self, store: Any, msgtype: str, data: bytes, ros1: bool) -> None:
-        """Follow a message that rosbags can decode.
+        """Make the layout of a message that rosbags can decode.
 
         Raises
         ------
@@ -115,7 +115,7 @@ class Layout:
         return np.ascontiguousarray(rows[:, at : at + kind.itemsize]).view(kind).ravel()
 
     def agrees(self, decode: Any, paths: Sequence[Path]) -> bool:
-        """Return whether rosbags finds the same in these fields as the layout, whatever the bytes that may vary."""
+        """Return whether rosbags and the layout decode these fields equally, for any values of variable bytes."""
         rng = np.random.default_rng(0)
         for _ in range(3):
             row = rng.integers(0, 256, len(self._data), np.uint8)
@@ -131,12 +131,12 @@ class Layout:
 
 
 def attribute(message: Any, path: Path) -> Any:
-    """Return a field of a message that rosbags decoded."""
+    """Return a field of a message decoded by rosbags."""
     return functools.reduce(lambda of, name: of[name] if isinstance(name, int) else getattr(of, name), path, message)
 
 
 def by_length(data: Sequence[bytes]) -> Iterator[tuple[NDArray[np.int64], NDArray[np.uint8]]]:
-    """Yield, for each length of messages, which they are and their bytes, shape (N, length)."""
+    """Yield, for each length, the indices of such messages and their bytes, shape (N, length)."""
     lengths = np.fromiter(map(len, data), np.int64, len(data))
     for length in np.unique(lengths).tolist():
         which = np.flatnonzero(lengths == length)

@@ -1,7 +1,7 @@
-"""The messages of an MCAP file by its index, as rosbags yields them, in a third of the time.
+"""The messages of an MCAP file by its index, in the order of rosbags, in a third of the time.
 
-rosbags goes through the records of a chunk by reading them piece by piece. Here they are looked at where they are. A
-chunk that is not as it should be is left to rosbags, so that it is judged, and its damage told, as ever.
+rosbags reads the records of a chunk piece by piece. Here they are decoded in place. A chunk with a fault is left to
+rosbags, so that its damage is handled and reported as usual.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from .source import RawMessage
 
 _MESSAGE = 0x05
 _HEAD = struct.Struct('<BQH4xQ8x')
-"""Opcode and length of a record, and of a message its channel and its log time, and what is before its data."""
+"""Opcode and length of a record; channel and log time of a message; padding before its data."""
 
 
 def indexed_messages(reader: Any, keys: Collection[int]) -> Iterator[RawMessage]:
@@ -31,7 +31,7 @@ def indexed_messages(reader: Any, keys: Collection[int]) -> Iterator[RawMessage]
     Raises
     ------
     Exception
-        That of rosbags for a damaged chunk, once all messages before the chunk have been yielded.
+        The error of rosbags for a damaged chunk, after all messages before the chunk.
     """
     storage = reader.storage
     connections = {c.id: c for c in storage.connections if c.id in keys}
@@ -39,7 +39,7 @@ def indexed_messages(reader: Any, keys: Collection[int]) -> Iterator[RawMessage]
     chunks.sort(key=lambda chunk: chunk.message_start_time)
     held: list[tuple[int, int, int, bytes]] = []
     for chunk in chunks:
-        # what lies before this chunk is complete
+        # all messages before this chunk are known
         held.sort(key=lambda message: message[:2])
         begin = next((k for k, message in enumerate(held) if message[0] >= chunk.message_start_time), len(held))
         yield from ((key, time, data) for time, _, key, data in held[:begin])
@@ -53,7 +53,7 @@ def _messages_of(chunk: Any, connections: dict[int, Any], file: Any) -> list[tup
     first, last, at = chunk.message_start_time, chunk.message_end_time, chunk.chunk_start_offset
     found = _walked(_unpacked(chunk, file), set(connections), first, last, at)
     if found is None:
-        # it begins with a mark that is no message
+        # the first item is a mark, not a message
         by_rosbags = list(storage_mcap.msgsrc(chunk, connections, first, last + 1, file))[1:]
         return [(m.timestamp, at, m.connection.id, bytes(m.data)) for m in by_rosbags]  # type: ignore[union-attr, arg-type]
     return found
@@ -70,7 +70,7 @@ def _unpacked(chunk: Any, file: Any) -> bytes:
 def _walked(
     raw: bytes, keys: Collection[int], first: int, last: int, number: int
 ) -> list[tuple[int, int, int, bytes]] | None:
-    """Return the messages among the records of a chunk; None if the records do not fill it."""
+    """Return the messages among the records of a chunk; None if the records do not exactly fill it."""
     found = []
     at, end, head, unpack = 0, len(raw), _HEAD.size, _HEAD.unpack_from
     while at < end:

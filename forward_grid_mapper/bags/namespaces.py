@@ -1,4 +1,4 @@
-"""Which of a bag's topics are of one robot, where several robots have a namespace each."""
+"""Assigns a bag's topics to robots, if each of several robots has a namespace."""
 
 from __future__ import annotations
 
@@ -6,39 +6,39 @@ from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 
-class Parted(NamedTuple):
+class Assigned(NamedTuple):
     """Topics of the robot that is mapped, and those of others."""
 
-    taken: tuple[str, ...]
+    own: tuple[str, ...]
     left_out: tuple[str, ...]
 
 
-def ranges_of(odometry: str, others: Sequence[str], ranges: Sequence[str]) -> Parted:
-    """Return which topics of ranges are of the robot whose odometry is taken.
+def ranges_of(odometry: str, others: Sequence[str], ranges: Sequence[str]) -> Assigned:
+    """Return the topics of ranges of the robot whose odometry is used.
 
-    A robot's namespace is the nearest one around its odometry that holds ranges too: `/r1` for `/r1/odometry/filtered`.
+    A robot's namespace is the nearest one around its odometry that contains ranges: `/r1` for `/r1/odometry/filtered`.
 
     Parameters
     ----------
     odometry : str
-        The topic that is taken.
+        The topic that is used.
     others : sequence of str
-        All topics of such messages.
+        All topics of odometry.
     ranges : sequence of str
-        All topics of ranges. They are all taken where none is of the robot, or all odometry is of one namespace.
+        All topics of ranges. All are used if none is of the robot, or if all odometry is in one namespace.
     """
     homes = {topic: _home(topic, ranges) for topic in {odometry, *others}}
-    taken = tuple(topic for topic in ranges if _nearest(topic, homes.values()) == homes[odometry])
-    if not taken or len(set(homes.values())) == 1:
-        return Parted(tuple(ranges), ())
-    return Parted(taken, tuple(topic for topic in ranges if topic not in taken))
+    own = tuple(topic for topic in ranges if _nearest(topic, homes.values()) == homes[odometry])
+    if not own or len(set(homes.values())) == 1:
+        return Assigned(tuple(ranges), ())
+    return Assigned(own, tuple(topic for topic in ranges if topic not in own))
 
 
 def by_precedence(static_topics: Iterable[str], chosen: Sequence[str]) -> list[str]:
-    """Return topics of fixed transforms, first those that say least of the robot whose topics are `chosen`.
+    """Return topics of static transforms in ascending precedence for the robot whose topics are `chosen`.
 
-    Those in a namespace around a chosen topic say most, the first chosen one's before all; then comes `/tf_static`.
-    Those of other namespaces say something only where no chosen topic has one in its own.
+    Those in a namespace around a chosen topic take precedence, that of the first chosen one most of all; next is
+    `/tf_static`. Those of other namespaces are used only if no chosen topic has one in its own.
     """
     topics = sorted(set(static_topics))
     around = {_parent(topic): topic for topic in topics}
@@ -48,7 +48,7 @@ def by_precedence(static_topics: Iterable[str], chosen: Sequence[str]) -> list[s
 
 
 def _home(odometry: str, ranges: Sequence[str]) -> str:
-    """Return the nearest namespace around a topic that holds ranges; '' is the one around all."""
+    """Return the nearest namespace around a topic that contains ranges; '' is the root."""
     home = _parent(odometry)
     while home and not any(_holds(home, topic) for topic in ranges):
         home = _parent(home)

@@ -1,4 +1,4 @@
-"""From a path to the storage files of a bag, each open for reading, or a message that says why not."""
+"""Opens the storage files of a bag, or raises an error with the reason."""
 
 from __future__ import annotations
 
@@ -31,26 +31,26 @@ _REPAIR = {
 _ZSTD_MAGIC = b'\x28\xb5\x2f\xfd'
 
 STORAGE_SUFFIXES = ('.mcap', '.db3', '.bag', '.mcap.zstd', '.db3.zstd')
-"""How the names of storage files end."""
+"""Suffixes of storage files."""
 
 MOST_FILES = 100_000
-"""Lines in which a list of files is looked for."""
+"""Most lines in which a list of files is searched."""
 
 
 class _Metadata(NamedTuple):
-    """What metadata.yaml says: names of the storage files, and how they are compressed: '', 'file' or 'message'."""
+    """Contents of metadata.yaml: names of the storage files, and their compression: '', 'file' or 'message'."""
 
     files: list[str]
     compression: str
 
 
 def repair_hint(path: Path) -> str:
-    """Return how to repair a damaged bag."""
+    """Return a hint on the repair of a damaged bag."""
     if path.is_dir():
         return f'repair it with `ros2 bag reindex {quoted(path)}`'
     try:
         magic = _magic(path)
-    except OSError:  # the suffix will do
+    except OSError:  # the suffix is used instead
         magic = b''
     suffix = next((kind[0] for key, kind in _KINDS.items() if magic.startswith(key)), path.suffix)
     command = _REPAIR.get(suffix, 'ros2 bag reindex {0}').format(quoted(path))
@@ -70,12 +70,12 @@ def open_sources(path: Path) -> tuple[list[Source], str | None]:
     sources : list of Source
         One for each storage file, in the order of recording.
     damage : str or None
-        Why some of the bag cannot be read.
+        The reason why a part of the bag cannot be read.
 
     Raises
     ------
     BagError
-        If there is no bag or nothing of it can be read.
+        If there is no bag, or nothing of it can be read.
     """
     try:
         if not path.exists():
@@ -91,7 +91,7 @@ def open_sources(path: Path) -> tuple[list[Source], str | None]:
         raise
     except PermissionError as error:
         raise BagError(f'No permission to read {error.filename or path}. Change its mode or owner.') from None
-    except Exception as error:  # OSError and whatever a storage library makes of damaged bytes
+    except Exception as error:  # OSError, and errors of storage libraries for damaged bytes
         raise BagError(f'{path} cannot be read ({one_line(error)}); {repair_hint(path)}.') from error
 
 
@@ -119,23 +119,23 @@ def _open_folder(folder: Path) -> tuple[list[Source], str | None]:
 
 
 def is_storage_file(path: Path) -> bool:
-    """Return whether a path is called as the files of bags are."""
+    """Return whether a path has the suffix of a storage file."""
     return path.name.endswith(STORAGE_SUFFIXES)
 
 
 def plain_name(path: Path) -> str:
-    """Return the name that a storage file has without compression."""
+    """Return the name of a storage file without the suffix of compression."""
     return path.name.removesuffix('.zstd')
 
 
 def _packed_or_not(file: Path) -> Path:
-    """Return a file that the metadata list, or what it became when somebody unpacked or compressed it."""
+    """Return a file of the metadata, or its decompressed or compressed form if only that exists."""
     others = (file.with_name(plain_name(file)), file.with_name(f'{file.name}.zstd'))
     return file if file.exists() else next(filter(Path.exists, others), file)
 
 
 def storage_files(folder: Path) -> list[Path]:
-    """Return the storage files in a folder by name; a compressed one only where it was not unpacked beside itself."""
+    """Return the storage files in a folder by name; without compressed ones whose decompressed file is there."""
     files = sorted(filter(is_storage_file, folder.iterdir()), key=_natural_order)
     names = {file.name for file in files}
     return [file for file in files if file.name == plain_name(file) or plain_name(file) not in names]
@@ -152,14 +152,14 @@ def _of_several(folder: Path, present: Sequence[Path]) -> str:
 
 
 def _unlisted(present: Sequence[Path], listed: Sequence[Path]) -> list[Path]:
-    """Return the storage files of a folder that are none of those listed, by whatever name; none if none is listed."""
+    """Return the storage files of a folder that are not listed, also under other names; none if none is listed."""
     names = {plain_name(file) for file in listed}
     both = _without_repetition([*listed, *present])
     return [file for file in both[len(listed) :] if listed and plain_name(file) not in names]
 
 
 def _without_repetition(files: Iterable[Path]) -> list[Path]:
-    """Return the files in their order, each once, by whatever name: a reading that counts twice is wrong evidence."""
+    """Return the files in their order without repetitions under any name: a repeated reading is wrong evidence."""
     found: dict[object, Path] = {}
     for file in files:
         try:
@@ -176,11 +176,11 @@ def _open_each(files: list[Path], compression: str) -> tuple[list[Source], list[
         try:
             sources.append(_open_listed(file, compression))
         except BaseException as error:
-            # the other files of a split bag are still worth having
+            # the other files of a split bag are still used
             if isinstance(error, BagError) and not isinstance(error, NoSpaceError):
                 problems.append(str(error).rstrip('.'))
                 continue
-            # what was unpacked must not stay in the temporary folder
+            # decompressed files must not remain in the temporary folder
             for source in sources:
                 source.close()
             raise
@@ -188,14 +188,14 @@ def _open_each(files: list[Path], compression: str) -> tuple[list[Source], list[
 
 
 def _open_single(file: Path) -> Source:
-    # only the folder's metadata say how its files, or the messages in them, are compressed
+    # only the folder's metadata state the compression of its files or their messages
     metadata = _read_metadata(file.parent)
     listed = metadata is not None and file.name in metadata.files
     return _open_listed(file, metadata.compression if metadata is not None and listed else '')
 
 
 def _open_listed(file: Path, compression: str) -> Source:
-    # some that unpack a bag leave its metadata as they were
+    # some tools that decompress a bag do not change its metadata
     if compression == 'file' and not _is_plain(file):
         return open_unpacked(file, _open_file)
     source = _open_file(file)
@@ -208,7 +208,7 @@ def _is_plain(file: Path) -> bool:
 
 def _open_file(file: Path) -> Source:
     if not file.is_file():
-        # a pipe would be waited for, a device may have no end
+        # reading a pipe would wait, and a device may have no end
         raise BagError(f'{file} is not a regular file; give a bag folder or a .mcap, .db3 or .bag file.')
     magic = _magic(file)
     suffix, scanner = next((kind for key, kind in _KINDS.items() if magic.startswith(key)), ('', None))
@@ -227,7 +227,7 @@ def _open_file(file: Path) -> Source:
                 return source
         except PermissionError:
             raise
-        except Exception as error:  # rosbags lets struct, zstd and assertion errors through
+        except Exception as error:  # rosbags does not catch struct, zstd and assertion errors
             reason = one_line(error)
     scan = scanner(file)
     if not scan.channels and (scan.damage or reason):
@@ -236,7 +236,7 @@ def _open_file(file: Path) -> Source:
 
 
 def _open_by_index(file: Path, suffix: str, scan: Callable[[], Source]) -> Source | None:
-    """Open an MCAP file or a ROS 1 bag with rosbags, which goes by the suffix; None if its index does not do."""
+    """Open an MCAP file or a ROS 1 bag with rosbags, by the suffix; None if its index cannot be used."""
     size = file.stat().st_size
     reader: Any = rosbag1.Reader(file) if suffix == '.bag' else rosbag2.Reader(file)
     reader.open()
@@ -253,28 +253,28 @@ def _open_by_index(file: Path, suffix: str, scan: Callable[[], Source]) -> Sourc
 
 
 def _has_full_index(reader: Any) -> bool:
-    """Return whether rosbags finds all messages of an MCAP file by its index, and can so sort them by time."""
+    """Return whether rosbags finds all messages of an MCAP file by its index, and so can sort them by time."""
     chunks = reader.storage.chunks
     return bool(chunks) and all(chunk.channel_count for chunk in chunks)
 
 
 def _is_bounded(reader: Any, size: int) -> bool:
-    """Return whether the chunks of an MCAP file's index are different ones, and unpack to no more than is admitted."""
+    """Return whether the chunks in an MCAP file's index are distinct, and not larger than allowed when decompressed."""
     chunks = reader.storage.chunks
     different = len({chunk.chunk_start_offset for chunk in chunks}) == len(chunks)
     return different and sum(chunk.uncompressed_size for chunk in chunks) <= most_unpacked(size)
 
 
 def _read_metadata(folder: Path) -> _Metadata | None:
-    """Return what metadata.yaml says, None if there is none.
+    """Return the contents of metadata.yaml, None if there is none.
 
-    The file is made by a program, and only two of its keys matter: looked for line by line, they are found in a file
-    that is damaged elsewhere too.
+    A program made the file, and only two of its keys are needed: a search line by line finds them even if the file is
+    damaged elsewhere.
 
     Raises
     ------
     BagError
-        If it is absurdly large.
+        If it is far too large.
     """
     path = folder / 'metadata.yaml'
     if not path.is_file():
@@ -282,7 +282,7 @@ def _read_metadata(folder: Path) -> _Metadata | None:
     try:
         with path.open('rb') as file:
             content = file.read(LARGEST_METADATA + 1)
-    except OSError:  # locked; the storage files can do without
+    except OSError:  # not readable; the storage files suffice
         return None
     if len(content) > LARGEST_METADATA:
         raise BagError(f'{path} has more than {megabytes(LARGEST_METADATA)}; it is not the metadata of a bag.')
@@ -296,7 +296,7 @@ def _read_metadata(folder: Path) -> _Metadata | None:
 
 
 def _block_items(lines: list[str]) -> Iterator[str]:
-    """Yield the items of a YAML list that has each on lines of its own, the first beginning with a dash."""
+    """Yield the items of a YAML list with each item on its own lines, the first of which begins with a dash."""
     item = ''
     depth = -1
     for line in lines:
@@ -316,7 +316,7 @@ def _block_items(lines: list[str]) -> Iterator[str]:
 
 
 def _flow_items(lines: list[str], first: int, begin: str) -> Iterator[str]:
-    """Yield the items of a YAML list in brackets that begins with `begin` and may go on in the lines after `first`."""
+    """Yield the items of a YAML list in brackets that begins with `begin` and may continue after the line `first`."""
     text = ' '.join([begin.strip()[1:], *lines[first + 1 : first + 1 + MOST_FILES]])
     for match in re.finditer(r'("(?:[^"\\]|\\.)*"|\'(?:[^\']|\'\')*\'|[^],"\'][^],]*)|(\])', text):
         if match[2]:
@@ -326,7 +326,7 @@ def _flow_items(lines: list[str], first: int, begin: str) -> Iterator[str]:
 
 
 def _unquoted(item: str) -> str:
-    """Return what a YAML scalar says; of escapes only those of a quote, a backslash and a code are known."""
+    """Return the value of a YAML scalar; the only escapes are those of quotes, backslashes and character codes."""
     if item[:1] == "'" and item[-1:] == "'" and len(item) > 1:
         return item[1:-1].replace("''", "'")
     if item[:1] == '"' and item[-1:] == '"' and len(item) > 1:

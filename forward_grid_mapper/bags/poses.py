@@ -1,4 +1,4 @@
-"""Poses of the robot in messages that are no Odometry: stamped poses, and transforms that move."""
+"""Poses of the robot in messages other than Odometry: stamped poses, and moving transforms."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ POSE = 'geometry_msgs/msg/PoseStamped'
 POSE_WITH_COVARIANCE = 'geometry_msgs/msg/PoseWithCovarianceStamped'
 
 BASE_FRAMES = ('base_link', 'base_footprint')
-"""Frames of a robot's base (REP 105), the one that is taken first. A pose without a child frame is of the first."""
+"""Frames of a robot's base (REP 105), in order of preference. A pose without a child frame is of the first."""
 
 
 def _pose(message: Any) -> OdometryMessage:
@@ -42,7 +42,7 @@ def _transform(message: Any) -> OdometryMessage | None:
 
 
 def _of_base(message: Any) -> int | None:
-    """Return which of a message's transforms moves the robot's base."""
+    """Return the index of the transform that moves the robot's base."""
     for frame in BASE_FRAMES:
         for number, item in enumerate(message.transforms):
             if str(item.child_frame_id).lstrip('/') == frame:
@@ -55,14 +55,14 @@ _TRANSFORM = [('translation', name) for name in 'xy'] + [('rotation', name) for 
 
 
 def paths_of_pose(message: Any) -> tuple[Path, tuple[Path, ...]]:
-    """Return where the header of a message of `POSES` is, and x, y and the quaternion of its pose.
+    """Return the paths of the header of a message of `POSES`, and of x, y and the quaternion of its pose.
 
-    Of transforms without the robot's base they are those of the first.
+    If no transform is that of the robot's base, they are those of the first.
 
     Raises
     ------
     Exception
-        Of many kinds, if it is another message.
+        Of many classes, if it is another message.
     """
     if hasattr(message, 'transforms'):
         item: Path = ('transforms', _of_base(message) or 0)
@@ -77,4 +77,4 @@ POSES: dict[str, Callable[[Any], OdometryMessage | None]] = {
     POSE_WITH_COVARIANCE: _pose_with_covariance,
     TF_MESSAGE: _transform,
 }
-"""How each type of message becomes a pose of the robot, those first that are looked for first."""
+"""Conversions of message types to poses of the robot, in order of preference."""

@@ -1,4 +1,4 @@
-"""Reading a recorded bag: what is in it, and its ranges and odometry in the order they were recorded."""
+"""Reads a recorded bag: its topics, and its ranges and odometry in the order of recording."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ from .opening import open_sources, repair_hint
 from .poses import POSES
 from .source import Channel, RawMessage, Source, one_line
 from .static_transforms import StaticTransforms
-from .transform_chain import TransformChain, chain_of, standing
+from .transform_chain import TransformChain, chain_of, constant_transforms
 
 _CONVERSIONS: dict[str, Callable[[Any], RangeMessage | OdometryMessage | None]] = {RANGE: range_message, **POSES}
 _PROGRESS_STEP = 1000
-MOST_LOOKED_AT = 20_000
-"""Messages in which frames are looked for: the first half of them, and others all over the bag."""
+MOST_SEARCHED = 20_000
+"""Most messages in which frames are searched: half of them at the begin, the others all over the bag."""
 
 BATCH = 16
-"""Steps of progress after which what was read is decoded: 12 MB of Odometry."""
+"""Steps of progress after which messages are decoded: 12 MB of Odometry."""
 
 
 class Bag:
@@ -61,7 +61,7 @@ class Bag:
         Raises
         ------
         BagError
-            If there is no bag or nothing of it can be read.
+            If there is no bag, or nothing of it can be read.
         """
         self._sources, self._damage = open_sources(self.path)
         return self
@@ -77,7 +77,7 @@ class Bag:
 
     @property
     def truncated(self) -> str | None:
-        """One line about what could not be read; complete only after reading. None for a sound bag."""
+        """One line about what could not be read, complete only after reading; None for an undamaged bag."""
         reasons = self._reasons()
         if reasons is None:
             return None
@@ -96,29 +96,29 @@ class Bag:
     def choose_topics(
         self, range_topics: Sequence[str] | None = None, odom_topic: str | None = None, any_poses: bool = False
     ) -> Topics:
-        """Return the topics to map from: those named, else all Range topics and the only Odometry topic.
+        """Return the topics to map from: those named, or else all Range topics and the only Odometry topic.
 
-        With `any_poses` the only topic of stamped poses does where there is no Odometry.
+        With `any_poses`, the only topic of stamped poses is allowed if there is no Odometry.
 
         Raises
         ------
         BagError
-            If a named topic is not there, or there is none, or several Odometry topics and none named.
+            If a named topic is missing, or there is none, or several Odometry topics and none is named.
         """
         return choose_topics(self.topics(), range_topics, odom_topic, self._frames_of, any_poses)
 
     def choose_range_topics(self, range_topics: Sequence[str] | None = None) -> Topics:
-        """Return the topics to map from where the poses come from elsewhere: those of ranges, and no odometry.
+        """Return the topics to map from if the poses are from elsewhere: those of ranges, without odometry.
 
         Raises
         ------
         BagError
-            If a named topic is not there, or there is none.
+            If a named topic is missing, or there is none.
         """
         return Topics(choose_range_topics(self.topics(), range_topics), '')
 
     def base_frame(self) -> str:
-        """Return the frame whose pose the bag's odometry gives; empty where there is none."""
+        """Return the frame whose pose the bag's odometry gives; '' if there is none."""
         wanted = {(channel.topic, ODOMETRY) for channel in self._channels() if channel.msgtype == ODOMETRY}
         for _, message in self._decoded(wanted):
             if message is not None:
@@ -128,19 +128,19 @@ class Bag:
     def messages(
         self, topics: Topics, progress: Callable[[int, int], None] | None = None
     ) -> Iterator[RangeMessage | OdometryMessage]:
-        """Yield the messages of the chosen topics one by one, as `batches` has them."""
+        """Yield the messages of the chosen topics one by one, in the order of `batches`."""
         for batch in self.batches(topics, progress):
             yield from batch.one_by_one()
 
     def batches(self, topics: Topics, progress: Callable[[int, int], None] | None = None) -> Iterator[MessageBatch]:
-        """Yield the messages of the chosen topics by log time, file after file of a split bag, many at once.
+        """Yield the messages of the chosen topics by log time, many at once; the files of a split bag in order.
 
         Parameters
         ----------
         topics : Topics
             From `choose_topics`.
         progress : callable, optional
-            Called with (done, total) messages every now and then, and at the end.
+            Called with (done, total) messages repeatedly, and at the end.
 
         Raises
         ------
@@ -183,7 +183,7 @@ class Bag:
     def _raw(
         self, wanted: Collection[tuple[str, str]], chain: TransformChain | None, tell: Callable[[int], None]
     ) -> Iterator[tuple[dict[int, Channel], dict[tuple[int, ...], Columns], list[RawMessage]]]:
-        """Yield channels by key, what decodes some of them, and some messages; `tell` hears how many have been read."""
+        """Yield channels by key, decoders for some of them, and some messages; `tell` receives numbers of messages."""
         for source in self._sources:
             channels = {c.key: c for c in source.channels if (c.topic, c.msgtype) in wanted}
             if not channels:
@@ -195,9 +195,9 @@ class Bag:
             while more:
                 before = len(held)
                 try:
-                    # what was read before an error stays
+                    # messages before an error are kept
                     held.extend(islice(messages, _PROGRESS_STEP))
-                except Exception as error:  # rosbags lets many kinds through; the next file of a split bag may be sound
+                except Exception as error:  # rosbags raises many classes; the next file of a split bag may be undamaged
                     source.damage = source.damage or one_line(error)
                 more = len(held) - before == _PROGRESS_STEP
                 tell(len(held) - before)
@@ -206,12 +206,12 @@ class Bag:
                     held = []
 
     def static_transforms(self, topics: Topics | None = None) -> StaticTransforms:
-        """Return the transforms on `/tf_static` and on the `tf_static` of namespaces, as `by_precedence` has them.
+        """Return the transforms on `/tf_static` and on the `tf_static` of namespaces, in the order of `by_precedence`.
 
         Parameters
         ----------
         topics : Topics, optional
-            What is mapped from; without it, `/tf_static` is believed more than any namespace.
+            The topics to map from; without them, `/tf_static` takes precedence over any namespace.
         """
         parts: dict[str, StaticTransforms] = {}
         for channel, message in self._static():
@@ -230,18 +230,18 @@ class Bag:
         """Return the parent of each frame that transforms of this topic, or of `/tf`, place; they may move."""
         topics = self._moving_topics() if topic is None else {topic}
         parents: dict[str, str] = {}
-        for message in self._looked_at(topics):
+        for message in self._searched(topics):
             for item in message.transforms:
                 parents[str(item.child_frame_id).lstrip('/')] = str(item.header.frame_id).lstrip('/')
         return parents
 
-    def standing_transforms(self) -> StaticTransforms:
-        """Return the transforms on `/tf` that stay the same, besides those on `/tf_static`, which are believed more.
+    def constant_transforms_on_tf(self) -> StaticTransforms:
+        """Return the constant transforms on `/tf`, and those on `/tf_static`, which take precedence.
 
         Simulators, and the static_transform_publisher of ROS 1's tf, repeat fixed transforms there.
         """
         transforms = StaticTransforms('/tf')
-        for parent, child, numbers in standing(self._looked_at(self._moving_topics())):
+        for parent, child, numbers in constant_transforms(self._searched(self._moving_topics())):
             _add(transforms, parent, child, numbers[:3], numbers[3:])
         transforms.take(self.static_transforms())
         return transforms
@@ -250,7 +250,7 @@ class Bag:
         return {c.topic for c in self._channels() if c.msgtype == TF_MESSAGE and c.topic.split('/')[-1] == 'tf'}
 
     def originals(self, topics: Topics) -> Iterator[tuple[str, Any]]:
-        """Yield topic and message of the chosen topics by log time, whole and as rosbags decodes them."""
+        """Yield topic and message of the chosen topics by log time, as rosbags decodes them."""
         for channel, message in self._decoded(self._begin(topics)):
             if message is not None:
                 yield channel.topic, message
@@ -265,7 +265,7 @@ class Bag:
         return ((channel, message) for channel, message in found if message is not None)
 
     def _begin(self, topics: Topics) -> set[tuple[str, str]]:
-        """Return the (topic, type) pairs of the topics, whose undecodable messages are counted anew."""
+        """Return the (topic, type) pairs of the topics, and set their counts of undecodable messages to 0."""
         wanted = {(topic, RANGE) for topic in topics.range_topics} | {(topics.odom_topic, topics.odom_type)}
         for topic, _ in wanted:
             self.undecodable.pop(topic, None)
@@ -285,7 +285,7 @@ class Bag:
     ) -> Iterator[tuple[Channel, Any]]:
         """Yield the messages of these (topic, type) pairs, None for one that does not fit its definition.
 
-        `chosen` says of each message whether it is to be decoded; without it, all are.
+        `chosen` yields for each message whether to decode it; without it, all are decoded.
         """
         chosen = repeat(True) if chosen is None else chosen
         for source in self._sources:
@@ -299,27 +299,27 @@ class Bag:
                         continue
                     try:
                         message = decoders[key](data)
-                    except Exception:  # rosbags lets many kinds through for bytes that do not fit
+                    except Exception:  # rosbags raises many classes for bytes that do not fit
                         self._count_undecodable(channels[key])
                         message = None
                     yield channels[key], message
-            except Exception as error:  # as above; the next file of a split bag may be sound
+            except Exception as error:  # as above; the next file of a split bag may be undamaged
                 source.damage = source.damage or one_line(error)
 
     def _count_undecodable(self, channel: Channel) -> None:
         self.undecodable[channel.topic] = self.undecodable.get(channel.topic, 0) + 1
 
     def _chain(self, topics: Topics) -> TransformChain | None:
-        """Return what makes poses of the robot out of transforms, where it takes several of them."""
+        """Return the chain that gives the robot's pose, if several transforms are needed."""
         if topics.odom_type != TF_MESSAGE:
             return None
-        return chain_of(self._looked_at({topics.odom_topic}))
+        return chain_of(self._searched({topics.odom_topic}))
 
-    def _looked_at(self, topics: Collection[str]) -> Iterator[Any]:
-        """Yield messages with transforms of these topics, not all of them where there are many."""
+    def _searched(self, topics: Collection[str]) -> Iterator[Any]:
+        """Yield messages with transforms of these topics; only a selection if there are many."""
         wanted = {(topic, TF_MESSAGE) for topic in topics}
         total = sum(c.total for c in self._channels() if (c.topic, c.msgtype) in wanted)
-        found = self._decoded(wanted, _some(total, MOST_LOOKED_AT))
+        found = self._decoded(wanted, _selected(total, MOST_SEARCHED))
         return (message for _, message in found if message is not None)
 
     def _frames_of(self, topic: str) -> str:
@@ -336,18 +336,18 @@ def skipped(count: int, topic: str) -> str:
     return f'{count} messages on {topic} do not fit their type and were skipped'
 
 
-def _some(total: int, most: int) -> Iterator[bool]:
-    """Yield which of `total` things are some `most` of them: the first, and then others at random, always the same."""
+def _selected(total: int, most: int) -> Iterator[bool]:
+    """Yield for each of `total` things whether it is among about `most`: the first ones, then a fixed random choice."""
     yield from repeat(True, most // 2)
     share = most / 2 / max(total - most // 2, 1)
-    # at random, since publishers that take turns would fall in with any step
+    # at random, since any regular step may coincide with publishers that alternate
     draw = random.Random(0).random
     while True:
         yield draw() < share
 
 
 def _decoding(channels: Mapping[int, Channel], chain: TransformChain | None) -> dict[tuple[int, ...], Columns]:
-    """Return what decodes channels, by their keys; those of a chain are decoded together, in their order."""
+    """Return the decoders of channels, by their keys; those of a chain are decoded together, in order."""
     moving = tuple(key for key, c in channels.items() if chain is not None and c.msgtype == TF_MESSAGE)
     found: dict[tuple[int, ...], Columns] = {
         (key,): Columns(decoder_of(c), _CONVERSIONS[c.msgtype]) for key, c in channels.items() if key not in moving
@@ -369,5 +369,5 @@ def _add(
     try:
         transforms.add(parent, child, offset, quaternion)
     except InputError as error:
-        # One bad frame elsewhere on the robot must not stop a map that does not need it.
+        # A wrong transform elsewhere on the robot must not prevent a map that does not need it.
         transforms.rejected[child.lstrip('/')] = str(error)

@@ -1,4 +1,4 @@
-"""Common ground of the scanners that read a damaged file from front to back, without its index."""
+"""Base class of the scanners that read a damaged file from front to back, without its index."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from .source import Channel, RawMessage
 
 
 class Scan(ABC):
-    """Reads a file from front to back; a subclass knows the format.
+    """Reads a file from front to back; a subclass implements the format.
 
-    The first pass, on construction, finds the channels and counts their messages. Files without an index are not in
-    the order of time, so `messages` keeps what it is asked for in memory and sorts it.
+    The first pass, in the constructor, finds the channels and counts their messages. Files without an index are not
+    in the order of time, so `messages` keeps the requested messages in memory and sorts them.
     """
 
     def __init__(self, path: Path) -> None:
@@ -35,7 +35,7 @@ class Scan(ABC):
         return Counter(key for key, _, _ in self._pass())
 
     def close(self) -> None:  # noqa: B027 (for any scan, not for its subclass to fill in)
-        """Nothing is held open between passes."""
+        """Do nothing: no file is open between passes."""
 
     def _pass(self) -> Iterator[RawMessage]:
         self._budget = Budget(self._path.stat().st_size)

@@ -1,4 +1,4 @@
-"""Reading an MCAP file record by record (https://mcap.dev/spec), for files without a usable index."""
+"""Reads an MCAP file record by record (https://mcap.dev/spec), for files without a usable index."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _FORMATS = {'ros2msg': 'msg', 'ros1msg': 'msg', 'ros2idl': 'idl', 'omgidl': 'idl
 
 
 class McapScan(Scan):
-    """Messages of an MCAP file; damaged chunks are skipped, a chunk that was cut off gives its beginning."""
+    """Messages of an MCAP file; damaged chunks are skipped, a truncated chunk gives its beginning."""
 
     def _walk(self) -> Iterator[RawMessage]:
         self._schemas: dict[int, tuple[str, str, str]] = {}
@@ -52,7 +52,7 @@ class McapScan(Scan):
                         self._schema(content)
                     elif opcode == _CHANNEL:
                         self._channel(content)
-                except Exception as error:  # whatever a decompressor or a decoder says of damaged bytes
+                except Exception as error:  # errors of decompressors or decoders for damaged bytes
                     self._note(one_line(error))
             else:
                 file.seek(length, 1)
@@ -67,7 +67,7 @@ class McapScan(Scan):
         if not whole:
             self._note('the file is cut off')
         elif len(raw) != size or (crc and crc32(raw) != crc):
-            # Not even its record boundaries can be trusted.
+            # The boundaries of its records are not reliable either.
             return self._note('a chunk does not match its checksum')
         yield from self._records(BytesIO(raw), len(raw), in_chunk=True)
         return None

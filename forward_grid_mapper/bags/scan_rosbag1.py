@@ -1,4 +1,4 @@
-"""Reading a ROS 1 bag record by record (http://wiki.ros.org/Bags/Format/2.0), for bags without a usable index."""
+"""Reads a ROS 1 bag record by record (http://wiki.ros.org/Bags/Format/2.0), for bags without a usable index."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _MESSAGE, _CHUNK, _CHUNK_INFO, _CONNECTION = 2, 5, 6, 7
 
 
 class Rosbag1Scan(Scan):
-    """Messages of a ROS 1 bag; damaged chunks are skipped, a chunk that was cut off gives its beginning."""
+    """Messages of a ROS 1 bag; damaged chunks are skipped, a truncated chunk gives its beginning."""
 
     def _walk(self) -> Iterator[RawMessage]:
         size = self._path.stat().st_size
@@ -36,7 +36,7 @@ class Rosbag1Scan(Scan):
                 fields = _fields(head)
                 opcode = fields['op'][0]
             except (struct.error, KeyError, IndexError, UnicodeDecodeError):
-                # The boundary of the next record is lost with this one's.
+                # The boundary of the next record is unknown as well.
                 return self._note(f'no record begins at byte {file.tell() - len(data) - len(head) - 8}')
             try:
                 if opcode == _CHUNK and not in_chunk:
@@ -50,7 +50,7 @@ class Rosbag1Scan(Scan):
                     self._connection(fields, _fields(data))
                 elif opcode == _CHUNK_INFO:
                     self._indexed = True
-            except Exception as error:  # whatever a decompressor or a decoder says of damaged bytes
+            except Exception as error:  # errors of decompressors or decoders for damaged bytes
                 self._note(one_line(error))
         return None
 
@@ -69,7 +69,7 @@ class Rosbag1Scan(Scan):
 
 
 def _block(file: BinaryIO, end: int) -> tuple[bytes, bool]:
-    """Return a block that is preceded by its length, and whether it is all there."""
+    """Return a block that is preceded by its length, and whether it is complete."""
     prefix = file.read(4)
     if len(prefix) < 4:
         return b'', False

@@ -1,7 +1,7 @@
-"""Reading a ROS 2 sqlite3 file: sound ones in the order of time, damaged ones up to their first damaged page.
+"""Reads a ROS 2 sqlite3 file: undamaged ones in the order of time, damaged ones up to their first damaged page.
 
-SQL can hide work without end in what looks like a table, so only plain tables are read, and every pass may take only so
-many steps of SQLite's virtual machine as the size of the file justifies.
+SQL can hide endless work in what looks like a table, so only plain tables are read, and the steps of SQLite's virtual
+machine in each pass are bounded by the size of the file.
 """
 
 from __future__ import annotations
@@ -23,17 +23,17 @@ from .source import Channel, Damage, RawMessage, full_type_name, one_line
 MAGIC = b'SQLite format 3\0'
 
 STEPS, STEPS_A_BYTE = 2_000_000, 2
-"""Steps of SQLite's virtual machine in one pass, and more of them for every byte of the file: a row takes some 40 to be
-sorted and read, and has at least 60 bytes. A small file takes half a second."""
+"""Steps of SQLite's virtual machine in one pass, and further ones for every byte of the file: sorting and reading a
+row needs about 40, and it has at least 60 bytes. A small file takes half a second."""
 
 STEPS_A_CALL = 10_000
-"""Steps between two looks at the count."""
+"""Steps between two checks of their number."""
 
 LARGEST_MESSAGE = 128 << 20
-"""Bytes of a message; a longer one counts as damaged, and is not loaded."""
+"""Most bytes of a message; a longer one counts as damaged, and is not loaded."""
 
 MOST_TOPICS = 10_000
-"""Topics of a file; further ones are not read."""
+"""Most topics of a file; further ones are not read."""
 
 _TABLES = ('messages', 'topics', 'message_definitions')
 _ROW = (
@@ -43,27 +43,27 @@ _ROW = (
 
 
 def has_log(file: Path) -> bool:
-    """Return whether a write-ahead log with messages lies beside the file."""
+    """Return whether there is a write-ahead log with messages beside the file."""
     log = file.with_name(file.name + '-wal')
     return log.is_file() and log.stat().st_size > 0
 
 
 def _may_index_log(file: Path) -> bool:
-    """Return whether SQLite finds its index of the log, or can make it: a file beside the log."""
+    """Return whether SQLite finds its index of the log, a file beside the log, or can create it."""
     return file.with_name(file.name + '-shm').exists() or os.access(file.parent, os.W_OK)
 
 
 def is_cut(file: Path) -> bool:
-    """Return whether the file is shorter than its header says; SQLite itself may read missing bytes as zeros."""
+    """Return whether the file is shorter than its header states; SQLite itself may read missing bytes as zeros."""
     with file.open('rb') as stream:
         page_size, pages = struct.unpack('>16xH10xI', stream.read(32).ljust(32, b'\0'))
     size = file.stat().st_size
-    page_size = page_size if page_size > 1 else 65536  # 1 stands for what 16 bits cannot hold
+    page_size = page_size if page_size > 1 else 65536  # 1 means 65536, which does not fit into 16 bits
     return size < pages * page_size or size % page_size > 0
 
 
 class Sqlite3Scan(Scan):
-    """Messages of a sqlite3 file; of a damaged one those up to the first page that is damaged or missing."""
+    """Messages of a sqlite3 file; of a damaged one those before the first page that is damaged or missing."""
 
     def messages(self, keys: Collection[int]) -> Iterator[RawMessage]:
         """Yield the messages of these channels by log time."""
@@ -78,12 +78,12 @@ class Sqlite3Scan(Scan):
                             self._note('a row is damaged')
                     return
             except (sqlite3.Error, OverflowError, Damage) as error:
-                # it sorts before it gives the first row, so that nothing was given yet
+                # it sorts before it yields the first row, so that no message was yielded yet
                 self._note(_reason(error))
         yield from super().messages(keys)
 
     def _count(self) -> Counter[int]:
-        """Return the number of messages by channel, without loading what they hold as long as the file is sound."""
+        """Return the number of messages by channel, without loading their contents if the file is undamaged."""
         if is_cut(self._path):
             self._note('the file is cut off')
         else:
@@ -114,9 +114,9 @@ class Sqlite3Scan(Scan):
         Raises
         ------
         Damage
-            If something other than a plain table has the name of one that is read.
+            If a table's name belongs to something other than a plain table.
         BagError
-            If messages are in a write-ahead log that cannot be read where it is.
+            If messages are in a write-ahead log that cannot be read in its folder.
         """
         # A recorder that was killed leaves its last messages in the write-ahead log, which 'immutable' would ignore.
         options = 'mode=ro' if has_log(self._path) else 'mode=ro&immutable=1'
@@ -125,10 +125,10 @@ class Sqlite3Scan(Scan):
                 f'{self._path} has messages in a log next to it, {self._path.name}-wal, which can only be read in a '
                 'writable folder; copy the bag to one, with all its files.'
             )
-        # a path of any bytes, which SQLite unquotes
+        # a path of any bytes; SQLite unquotes it
         database = sqlite3.connect(f'file:{quote(os.fsencode(self._path.resolve()))}?{options}', uri=True)
         try:
-            # Without this, SQLite refuses a file that is shorter than its header says.
+            # Without this, SQLite refuses a file that is shorter than its header states.
             database.execute('PRAGMA writable_schema=ON')
             left = STEPS + STEPS_A_BYTE * self._path.stat().st_size
 
@@ -148,7 +148,7 @@ class Sqlite3Scan(Scan):
         try:
             rows = database.execute('SELECT topic_type, encoding, encoded_message_definition FROM message_definitions')
             definitions = {row[0]: (str(row[1]).removeprefix('ros2'), str(row[2])) for row in rows}
-        except sqlite3.Error:  # recorded before Iron, or damaged: there are default definitions
+        except sqlite3.Error:  # recorded before Iron, or damaged: default definitions are used
             definitions = {}
         found = database.execute(f'SELECT id, name, type, serialization_format FROM topics LIMIT {MOST_TOPICS}')
         for row in found:

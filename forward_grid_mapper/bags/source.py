@@ -1,4 +1,4 @@
-"""Where raw messages come from: one storage file read by rosbags, with a scanner to fall back on."""
+"""Sources of raw messages: a storage file read by rosbags, or by a scanner where that fails."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ RawMessage = tuple[int, int, bytes]
 
 
 class Damage(Exception):
-    """A record cannot be understood; the text says why."""
+    """A record cannot be understood; the text is the reason."""
 
 
 class Channel(NamedTuple):
@@ -34,7 +34,7 @@ class Source(Protocol):
     ----------
     channels : list of Channel
     damage : str or None
-        Why not everything could be read, as far as is known by now.
+        The reason why not everything could be read, as far as known.
     """
 
     channels: list[Channel]
@@ -48,7 +48,7 @@ class Source(Protocol):
 
 
 def one_line(error: BaseException) -> str:
-    """Return what an exception says, on one line and short enough to quote."""
+    """Return the message of an exception, on one line and short enough to quote."""
     text = ' '.join(str(error).split()).rstrip('.')
     if isinstance(error, KeyError):
         text = f'a record lacks {text}'
@@ -56,7 +56,7 @@ def one_line(error: BaseException) -> str:
 
 
 def full_type_name(msgtype: str) -> str:
-    """Return 'package/msg/Name' for ROS 1's 'package/Name' too."""
+    """Return 'package/msg/Name', also for ROS 1's 'package/Name'."""
     parts = msgtype.split('/')
     return f'{parts[0]}/msg/{parts[1]}' if len(parts) == 2 else msgtype
 
@@ -71,9 +71,9 @@ class RosbagsSource:
     encoding : str
         'cdr' or 'ros1'.
     scan : callable
-        Opens a scanner of the same file, which goes on where rosbags stops at damage.
+        Opens a scanner of the same file, which continues where rosbags stops at damage.
     messages : callable, optional
-        Yields what rosbags would, faster: messages of a reader and some of its channels.
+        Yields the messages of a reader and some of its channels in the order of rosbags, but faster.
     """
 
     def __init__(
@@ -106,7 +106,7 @@ class RosbagsSource:
         connections = [c for key, c in self._connections.items() if key in keys]
         if not connections:
             return
-        # the messages of the latest time that have been given, since several may have it
+        # yielded messages with the latest time, since several may have the same
         last, seen = -1, 0
         at_last: list[tuple[int, bytes]] = []
         try:
@@ -117,7 +117,7 @@ class RosbagsSource:
                 seen += 1
                 at_last.append(message[::2])
                 yield message
-        except Exception as error:  # rosbags lets struct, zstd, sqlite and assertion errors through
+        except Exception as error:  # rosbags does not catch struct, zstd, sqlite and assertion errors
             self.damage = one_line(error)
         expected = sum(c.msgcount for c in connections)
         if self.damage is None and seen < expected:
@@ -131,11 +131,11 @@ class RosbagsSource:
             yield connection.id, time, bytes(data)
 
     def _rest(self, keys: Collection[int], last: int, given: Counter[tuple[int, bytes]]) -> Iterator[RawMessage]:
-        """Yield what a scanner finds from the time `last` on, without those of that time that are `given`."""
+        """Yield the messages that a scanner finds from the time `last` on, except those that are `given`."""
         assert self._scan is not None
         try:
             scan = self._scan()
-        except Exception:  # the damage is known already; the scanner could not get past it
+        except Exception:  # the damage is known already; the scanner could not read past it
             return
         try:
             for key, time, data in scan.messages(keys):

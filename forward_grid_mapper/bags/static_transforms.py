@@ -1,4 +1,4 @@
-"""Where the sensors sit on the robot, from the fixed transforms of a bag."""
+"""Poses of the sensors on the robot, from the static transforms of a bag."""
 
 from __future__ import annotations
 
@@ -17,22 +17,22 @@ Transform = NDArray[np.float64]  # homogeneous, shape (4, 4)
 
 
 SAME = 1e-6
-"""Metres, and sines of angles, that two numbers of one pose may differ by: some publishers have single precision."""
+"""Largest difference between numbers of equal poses, metres, and sines of angles: some have single precision."""
 
 
 class SteepSensorError(InputError):
-    """A sensor looks so steeply up or down that it says nothing of the plane."""
+    """The sensor's axis is too steep for a planar map."""
 
 
 class StaticTransforms:
-    """A tree of frames; names compare without a leading slash.
+    """A tree of frames; leading slashes of names are ignored.
 
     Attributes
     ----------
     rejected : dict
-        Child frames whose transform was not usable, and why; they matter only when one of them is looked up.
+        Child frames with an invalid transform, and the reason; relevant only if one of them is looked up.
     contradicted : dict
-        Child frames that two topics place differently, and which topic is believed; they matter as little.
+        Child frames that two topics place differently, and the topic that is used; relevant only if looked up.
     """
 
     def __init__(self, topic: str = '/tf_static') -> None:
@@ -51,7 +51,7 @@ class StaticTransforms:
         return sorted(set(self._parents) | {parent for parent, _ in self._parents.values()})
 
     def add(self, parent: str, child: str, translation_xyz: Sequence[float], quaternion_xyzw: Sequence[float]) -> None:
-        """Add the pose of `child` in `parent`, in metres; a later one replaces an earlier one, as in tf2.
+        """Add the pose of `child` in `parent`, in metres; it replaces an earlier one, as in tf2.
 
         Raises
         ------
@@ -76,7 +76,7 @@ class StaticTransforms:
         self.rejected.pop(child, None)
 
     def take(self, other: StaticTransforms) -> None:
-        """Add the transforms of another topic, which is believed where this one says something else."""
+        """Add the transforms of another topic, which take precedence."""
         for child, (parent, transform) in other._parents.items():
             known = self._parents.get(child)
             if known is not None and not (known[0] == parent and np.allclose(known[1], transform, atol=SAME)):
@@ -90,13 +90,13 @@ class StaticTransforms:
         self.rejected = {child: why for child, why in self.rejected.items() if child not in self._parents}
 
     def top_of(self, frame: str) -> str:
-        """Return the frame that a frame hangs on and that hangs on no other: itself, where it is not known."""
+        """Return the root of the tree that contains a frame: itself, if it is not known."""
         return next(reversed(self._ancestors(_plain(frame))))
 
     def doubts(self, base_frame: str, sensor_frame: str) -> list[str]:
-        """Return what `contradicted` has about the frames that join a sensor to the robot."""
+        """Return the entries of `contradicted` for the frames that connect a sensor to the robot."""
         to_base, to_sensor = self._ancestors(_plain(base_frame)), self._ancestors(_plain(sensor_frame))
-        # what lies above the frame that both have is not on the way
+        # frames above the common ancestor do not matter
         common = next((frame for frame in to_sensor if frame in to_base), None)
         way = [*takewhile(common.__ne__, to_sensor), *takewhile(common.__ne__, to_base)]
         return [self.contradicted[frame] for frame in way if frame in self.contradicted]
@@ -107,14 +107,14 @@ class StaticTransforms:
         Returns
         -------
         Mount or None
-            `yaw` is the direction of the sensor's x axis. None if the frames are not joined.
+            `yaw` is the direction of the sensor's x axis. None if the frames are not connected.
 
         Raises
         ------
         SteepSensorError
-            If the sensor looks more than 60° up or down.
+            If the sensor's axis points more than 60° up or down.
         InputError
-            If the frames are not joined because of a bad transform.
+            If the frames are not connected because of an invalid transform.
         """
         base_frame, sensor_frame = _plain(base_frame), _plain(sensor_frame)
         to_base, to_sensor = self._ancestors(base_frame), self._ancestors(sensor_frame)
@@ -136,12 +136,12 @@ class StaticTransforms:
         return mount
 
     def _ancestors(self, frame: str) -> dict[str, Transform]:
-        """Return the frame itself and all above it, nearest first, with the pose of `frame` in each."""
+        """Return the frame itself and all its ancestors, nearest first, with the pose of `frame` in each."""
         transform = np.eye(4)
         found = {frame: transform}
         while frame in self._parents:
             frame, step = self._parents[frame]
-            if frame in found:  # a loop; tf2 would not know better either
+            if frame in found:  # a loop, which tf2 cannot resolve either
                 break
             transform = step @ transform
             found[frame] = transform

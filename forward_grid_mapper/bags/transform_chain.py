@@ -1,4 +1,4 @@
-"""Poses of the robot from transforms that move, where several lie between its base and the frame it moves in."""
+"""Poses of the robot from moving transforms, if there are several between its base and the fixed frame."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from ..core.messages.quaternions import heading_of, rotation_of
 from .poses import BASE_FRAMES
 
 Numbers = tuple[float, ...]
-"""A transform as its message has it: x, y, z of the translation, and x, y, z, w of the rotation."""
+"""The numbers of a transform's message: x, y, z of the translation, and x, y, z, w of the rotation."""
 
 
 class _Link:
-    """The pose of a frame in the one above it: the first one of a bag, and whether another one follows."""
+    """The pose of a frame in its parent: the first one of a bag, and whether it changes later."""
 
     def __init__(self, parent: str, child: str, first: Numbers) -> None:
         self.parent, self.child, self.first = parent, child, first
@@ -26,14 +26,14 @@ class _Link:
 
 
 class TransformChain:
-    """Makes poses of the robot out of messages with transforms, which are to come in the order of their recording.
+    """Makes poses of the robot from messages with transforms, which must be given in the order of recording.
 
-    A pose has the stamp of the lowest link that moves, and of each other link the transform that came last.
+    A pose has the stamp of the lowest moving link; for each other link, the latest transform is used.
 
     Parameters
     ----------
     links : sequence
-        From the robot's base up to the frame that its poses are in; one of them moves.
+        From the robot's base up to the fixed frame; one of them moves.
     """
 
     def __init__(self, links: list[_Link]) -> None:
@@ -43,7 +43,7 @@ class TransformChain:
         self._frames = links[-1].parent, links[0].child
 
     def pose(self, message: Any) -> OdometryMessage | None:
-        """Return the pose of the robot's base once a message has taken effect; None if the lowest link is not in it."""
+        """Update the links, and return the pose of the robot's base; None if the lowest moving link is not updated."""
         header = None
         for item in message.transforms:
             frames = _plain(str(item.header.frame_id)), _plain(str(item.child_frame_id))
@@ -66,8 +66,8 @@ class TransformChain:
 def chain_of(messages: Iterable[Any]) -> TransformChain | None:
     """Return the chain from the robot's base up to the topmost link that moves.
 
-    None if a single transform of each message says it all: if the base is one frame, whose parent it moves in. None too
-    if nothing moves, frames make a loop, or one has several parents, of which nobody knows the right one.
+    None if a single transform of each message suffices: if the child frame is the base and its parent the fixed frame.
+    None too if nothing moves, frames form a loop, or one has several parents, so that the right one is unknown.
     """
     links = _links(messages)
     bases = [frame for frame in BASE_FRAMES if frame in links]
@@ -79,20 +79,20 @@ def chain_of(messages: Iterable[Any]) -> TransformChain | None:
     highest = max((k for k, link in enumerate(up) if link.moves), default=None)
     if highest is None or (highest == 0 and len(bases) == 1):
         return None
-    # the walk up ends at a frame without a parent, or in a loop
+    # the search upwards ends at a frame without a parent, or in a loop
     if frame in links or any(link.several for link in up[: highest + 1]):
         return None
     return TransformChain(up[: highest + 1])
 
 
-def standing(messages: Iterable[Any]) -> list[tuple[str, str, Numbers]]:
-    """Return (parent, child, transform) of the frames that all messages place alike."""
+def constant_transforms(messages: Iterable[Any]) -> list[tuple[str, str, Numbers]]:
+    """Return (parent, child, transform) of the frames that have the same pose in all messages."""
     found = _links(messages).values()
     return [(link.parent, link.child, link.first) for link in found if not (link.moves or link.several)]
 
 
 def _links(messages: Iterable[Any]) -> dict[str, _Link]:
-    """Return what places each frame, by its name without a leading slash."""
+    """Return the link of each frame, by its name without a leading slash."""
     links: dict[str, _Link] = {}
     for message in messages:
         for item in message.transforms:

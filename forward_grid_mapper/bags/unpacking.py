@@ -1,4 +1,4 @@
-"""Bags that rosbag2 compressed as a whole: file by file, or message by message."""
+"""Bags that rosbag2 compressed: file by file, or message by message."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from .bounds import LARGEST_MESSAGE, megabytes, most_unpacked, unpack
 from .source import RawMessage, Source, one_line
 
 _PIECE = 1 << 20
-"""Bytes that are unpacked at once."""
+"""Bytes that are decompressed at once."""
 
 
 NO_SPACE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-"""Errors of a disk, or a user's part of it, that is full."""
+"""Errors of a full disk, or an exhausted quota."""
 
 
 class NoSpaceError(BagError):
-    """What a compressed bag holds does not fit the temporary folder; nothing is wrong with the bag."""
+    """The contents of a compressed bag do not fit into the temporary folder; the bag is not damaged."""
 
 
 class UnpackedMessages:
@@ -36,7 +36,7 @@ class UnpackedMessages:
 
     @property
     def damage(self) -> str | None:
-        """Why not everything could be read, as far as is known by now."""
+        """The reason why not everything could be read, as far as known."""
         return self._source.damage
 
     @damage.setter
@@ -44,11 +44,11 @@ class UnpackedMessages:
         self._source.damage = damage
 
     def messages(self, keys: Collection[int]) -> Iterator[RawMessage]:
-        """Yield the messages of these channels by log time; one that cannot be unpacked is empty, and fits no type."""
+        """Yield the messages of these channels by log time; empty, which is invalid, if they cannot be decompressed."""
         for key, time, data in self._source.messages(keys):
             try:
                 raw = unpack('zstd', data, LARGEST_MESSAGE)
-            except Exception:  # too large, or whatever the library says of damaged bytes
+            except Exception:  # too large, or errors of the library for damaged bytes
                 raw = b''
             yield key, time, raw
 
@@ -58,7 +58,7 @@ class UnpackedMessages:
 
 
 class _InFolder:
-    """A source in a temporary folder, which goes with it."""
+    """A source in a temporary folder, which is deleted with it."""
 
     def __init__(self, source: Source, folder: Path) -> None:
         self._source, self._folder = source, folder
@@ -81,14 +81,14 @@ class _InFolder:
 
 
 def open_unpacked(file: Path, open_file: Callable[[Path], Source]) -> Source:
-    """Unpack a storage file, such as bag_0.db3.zstd, into a temporary folder and open it there.
+    """Decompress a storage file, such as bag_0.db3.zstd, into a temporary folder and open it there.
 
     Raises
     ------
     NoSpaceError
-        If it does not fit the temporary folder.
+        If it does not fit into the temporary folder.
     BagError
-        Naming the file, if it is damaged, or unpacks to more than is admitted.
+        Naming the file, if it is damaged, or larger than allowed when decompressed.
     """
     if not file.is_file():
         raise BagError(f'{file} is not a regular file; give a bag folder or a .mcap, .db3 or .bag file.')
@@ -104,7 +104,7 @@ def open_unpacked(file: Path, open_file: Callable[[Path], Source]) -> Source:
         shutil.rmtree(folder, ignore_errors=True)
         if not isinstance(error, Exception):
             raise
-        # the temporary name means nothing to anybody
+        # users do not know the temporary name
         reason = one_line(error).replace(str(unpacked), 'what it holds')
         raise BagError(
             f'{file} is damaged or cut off ({reason}); unpack it with `zstd -d {quoted(file)}`, '

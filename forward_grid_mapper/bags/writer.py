@@ -1,4 +1,4 @@
-"""Writing a bag that `ros2 bag play`, RViz, Foxglove or ROS 1 can show."""
+"""Writes a bag for `ros2 bag play`, RViz, Foxglove or ROS 1."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from .source import one_line
 
 FORMATS = ('mcap', 'sqlite3', 'ros1')
 _GRID = 'nav_msgs/msg/OccupancyGrid'
-# The newest that Jazzy knows.
+# The newest version that Jazzy supports.
 _METADATA_VERSION: Any = 9
 _INFINITE = QosTime(9223372036, 854775807)
 
@@ -37,22 +37,22 @@ def check_bag_path(path: Path, format: str) -> None:
     Raises
     ------
     OutputError
-        If it does not suit the format.
+        If the format does not allow it.
     """
     if format == 'ros1' and path.suffix != '.bag':
         raise OutputError(f'{path} must end in .bag for ROS 1.')
-    # rosbags makes an unquoted URI of a sqlite3 file's path, and would write elsewhere.
+    # rosbags uses a sqlite3 file's path as an unquoted URI, and would write elsewhere.
     if format == 'sqlite3' and set('?#%') & set(str(path.resolve())):
         raise OutputError(f'{path}: a sqlite3 bag cannot have ?, # or % in its path; rename it or use mcap.')
 
 
 class BagWriter:
-    """A bag being written in a `with` block; it takes its final name when the block ends without an exception.
+    """A bag that is written in a `with` block; it gets its final name when the block ends without an exception.
 
     Parameters
     ----------
     path : str or Path
-        Folder to make for 'mcap' and 'sqlite3', file ending in '.bag' for 'ros1'.
+        Folder to be created for 'mcap' and 'sqlite3', file ending in '.bag' for 'ros1'.
     format : {'mcap', 'sqlite3', 'ros1'}
         Storage format.
     """
@@ -75,7 +75,7 @@ class BagWriter:
         Raises
         ------
         OutputError
-            If the path exists, cannot be made, or does not suit the format.
+            If the path exists, cannot be created, or is not allowed for the format.
         """
         if self.path.exists() or self.path.is_symlink():
             raise OutputError(f'{self.path} exists already; choose another path or remove it.')
@@ -91,7 +91,7 @@ class BagWriter:
                 plugin = rosbag2.StoragePlugin[self._format.upper()]
                 self._writer = rosbag2.Writer(inner, version=_METADATA_VERSION, storage_plugin=plugin)
             self._writer.open()
-        except BaseException as error:  # OSError, sqlite3.Error, rosbags' own, Ctrl-C
+        except BaseException as error:  # OSError, sqlite3.Error, errors of rosbags, Ctrl-C
             self._discard()
             if not isinstance(error, Exception):
                 raise
@@ -101,7 +101,7 @@ class BagWriter:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Finish and give the bag its name, or leave nothing after an exception.
+        """Finish and rename the bag, or remove it after an exception.
 
         Raises
         ------
@@ -117,7 +117,7 @@ class BagWriter:
                 (self._staging / self.path.name).rename(self.path)
         except OutputError:
             raise
-        except Exception as problem:  # OSError, sqlite3.Error, rosbags' own
+        except Exception as problem:  # OSError, sqlite3.Error, errors of rosbags
             raise self._output_error(problem) from problem
         finally:
             self._discard()
@@ -138,7 +138,7 @@ class BagWriter:
         self._write(topic, RANGE, content, message.stamp if time is None else time)
 
     def write_odometry(self, topic: str, message: OdometryMessage, time: int | None = None) -> None:
-        """Write a `nav_msgs/Odometry` without covariances or twist; no pose is written as NaN."""
+        """Write a `nav_msgs/Odometry` without covariances or twist; a missing pose is written as NaN."""
         zero = self._make('geometry_msgs/msg/Vector3', x=0.0, y=0.0, z=0.0)
         twist = self._make('geometry_msgs/msg/Twist', linear=zero, angular=zero)
         unknown = np.zeros(36)
@@ -235,7 +235,7 @@ class BagWriter:
             raise self._output_error(error, topic) from error
 
     def _output_error(self, error: Exception, topic: str = '') -> OutputError:
-        """Return what to say of an error while the bag, or a topic of it, was being written."""
+        """Return the output error for an exception while the bag, or a topic of it, was written."""
         number = error.errno if isinstance(error, OSError) else None
         if number in (errno.ENOSPC, errno.EDQUOT) or 'disk is full' in str(error):
             return OutputError(f'{self.path}: the disk is full; free some space, or choose another folder.')
@@ -244,7 +244,7 @@ class BagWriter:
 
     def _discard(self) -> None:
         if self._writer is not None:
-            with suppress(Exception):  # what is left goes with the folder below
+            with suppress(Exception):  # the remaining files are deleted with the folder below
                 self._writer.abort()
             self._writer = None
         if self._staging is not None:
@@ -253,7 +253,7 @@ class BagWriter:
 
 
 def _quality(*, latched: bool) -> Qos:
-    """Return what a recorder would have noted: reliable, and dynamic local for latched topics."""
+    """Return the QoS profile of a recorder: reliable, and transient local for latched topics."""
     return Qos(
         QosHistory.KEEP_LAST,
         1 if latched else 10,

@@ -1,1 +1,1 @@
-"""Files that people and other programs read: maps, reports, pictures and parameters."""
+"""Files for people and other programs: maps, reports, pictures and parameters."""

@@ -1,4 +1,4 @@
-"""A calibration of wheel odometry as a file: what a drive told, how certain, and how to apply it by hand."""
+"""A file with the calibration of wheel odometry: values, standard deviations, and how to apply them by hand."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ NAMES = {
     'bias': 'turn_per_metre_deg',
     'heading': 'direction_deg',
 }
-"""What the figures of the core's calibration are called in the file."""
+"""Keys of the file for the values of the core's calibration."""
 
 MOST = {'scale': 0.5, 'turn_scale': 0.5, 'bias': math.radians(30.0), 'heading': math.radians(45.0)}
-"""The largest figures that a file may have, either way: more is no calibration but another robot."""
+"""Largest values of a file, positive or negative: larger ones would mean that the file is for another robot."""
 
 HOW = {
     'scale': 'factor for every measured distance, or for the radius of both wheels',
@@ -33,9 +33,9 @@ HOW = {
 }
 
 
-def calibration_text(told: Mapping[str, Estimate], drive: str) -> str:
-    """Return the file of a calibration, by the names of `core.trajectory.odometry_model`; empty if nothing is told."""
-    if not told:
+def calibration_text(estimates: Mapping[str, Estimate], drive: str) -> str:
+    """Return the file of a calibration, with the names of `core.trajectory.odometry_model`; '' without values."""
+    if not estimates:
         return ''
     lines = [
         f'# Calibration of the wheel odometry of {_plain(drive)}, estimated from its sonar readings.',
@@ -45,21 +45,21 @@ def calibration_text(told: Mapping[str, Estimate], drive: str) -> str:
     ]
     for name, key in NAMES.items():
         lines.append('')
-        if name not in told:
+        if name not in estimates:
             lines.append(f'# {key}: not known; this drive does not determine it')
             continue
-        value, sigma = _shown(name, *told[name])
+        value, sigma = _shown(name, *estimates[name])
         lines += [f'# {HOW[name]}', f'{key}: {value:.4f}  # ± {sigma:.4f}']
     return '\n'.join(lines) + '\n'
 
 
 def load_calibration(path: Path | str) -> dict[str, float]:
-    """Return the calibration that a file has, by the names of `core.trajectory.odometry_model`.
+    """Return the calibration of a file, with the names of `core.trajectory.odometry_model`.
 
     Raises
     ------
     ParameterError
-        Naming the file, if it cannot be read, or holds anything else than such figures.
+        Naming the file, if it cannot be read, or contains anything else.
     """
     path = Path(path)
     try:
@@ -86,12 +86,12 @@ def load_calibration(path: Path | str) -> dict[str, float]:
 
 
 def _shown(name: str, value: float, sigma: float) -> tuple[float, float]:
-    """Return a figure as the file has it."""
+    """Return a value, and its σ, in the units of the file."""
     if NAMES[name].endswith('factor'):
         return 1.0 + value, sigma
     return math.degrees(value), math.degrees(sigma)
 
 
 def _plain(text: str) -> str:
-    """Return a name without what would end a comment."""
+    """Return a name without characters that would end a comment."""
     return text if text.isprintable() else text.encode('unicode_escape').decode()

@@ -1,4 +1,4 @@
-"""Drawing of a composed picture; it needs matplotlib, and is imported only when a picture is wanted."""
+"""Drawing of a composed picture; requires matplotlib, and is imported only if a picture is wanted."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ from matplotlib.ticker import MaxNLocator
 from matplotlib.transforms import Affine2D
 from numpy.typing import NDArray
 
-from .output_folder import told_apart
+from .output_folder import distinguished
 from .panels import DRIVES, PATH, UNKNOWN_COLOUR, Box, Picture, coarse, paths_of
 
-# Free is white and unknown a cool tint, so that they differ to every eye; in between runs a warm scale, so that an
-# uncertain cell looks like neither. Path, dots and the path by odometry are blue, vermilion and purple of
-# the Okabe-Ito palette.
+# Free is white and unknown a cool tint, so that everyone can distinguish them; values between use a warm scale, so
+# that an uncertain cell resembles neither. Path, dots and the path of odometry are blue, vermilion and purple of the
+# Okabe-Ito palette.
 _FREE, _OCCUPIED, UNKNOWN = '#ffffff', '#14171c', UNKNOWN_COLOUR
 DOT, BEFORE = '#d55e00', '#cc79a7'
 INK, FRAME = '#22262b', '#8b96a3'
@@ -40,16 +40,16 @@ _DART = Outline([(1.0, 0.0), (-0.8, 0.75), (-0.4, 0.0), (-0.8, -0.75), (1.0, 0.0
 DPI = 150
 # Lengths of the page in inches.
 EDGE, HEAD, _FOOT, _LABELS, CAPTION, GAP = 0.3, 0.8, 0.8, 0.55, 0.42, 0.3
-# Below this width the legend would run into the scale of probabilities.
+# Below this width the legend would overlap the scale of probabilities.
 _MIN_WIDTH = 11.3
-# Drives whose start and end are marked, and those that are named, each with so many characters at most.
+# Most drives whose start and end are marked; most drives that are named, and most characters of each name.
 _MOST_MARKED, _MOST_NAMED, _NAME = 12, 4, 20
 WIDE = 2.6
-# Pixels of a cell, at least: below that walls of one cell are hardly seen.
+# Fewest pixels of a cell: in smaller cells, walls of one cell are hardly visible.
 _CELL = 2.5
-# Dots, or points of a path, that are drawn at once: drawing takes no break, and other threads have to wait.
+# Dots, or points of a path, per call of matplotlib: a call is not interrupted, and other threads wait.
 _AT_ONCE = 2000
-# Longest scale bar, as a part of the panel's width.
+# Longest scale bar, as a fraction of the panel's width.
 _BAR = 0.2
 
 
@@ -77,13 +77,13 @@ def draw(path: Path, picture: Picture) -> None:
     _head(figure, picture)
     _foot(figure, picture)
     with warnings.catch_warnings():
-        # of the names of bags; a box stands for a letter that the font lacks
+        # for names of bags; a box replaces a character that the font lacks
         warnings.filterwarnings('ignore', 'Glyph')
         figure.savefig(path)
 
 
 def draw_map(axes: Axes, values: NDArray[Any], extent: Box, pixel: float) -> None:
-    """Draw a map in cells of at least `_CELL` pixels; `pixel` is the length that a pixel stands for, metres."""
+    """Draw a map in cells of at least `_CELL` pixels; `pixel` is the size of a pixel, metres."""
     left, right, bottom, top = extent
     cell = (right - left) / values.shape[1]
     step = max(1, math.ceil(_CELL * pixel / cell - 1e-9))
@@ -97,7 +97,7 @@ def draw_map(axes: Axes, values: NDArray[Any], extent: Box, pixel: float) -> Non
 
 
 def draw_scale(axes: Axes, view: Box) -> None:
-    """Draw a bar of a round length into the lower left corner."""
+    """Draw a scale bar of a round length in the lower left corner."""
     width, height = view[1] - view[0], view[3] - view[2]
     longest = max(_BAR * width, 1e-3)
     power = 10.0 ** math.floor(math.log10(longest))
@@ -132,7 +132,7 @@ def _layout(panels: int, aspect: float) -> tuple[int, int, float, float]:
 
 
 def _frame(axes: Axes, title: str, view: tuple[float, float, float, float], outer: tuple[bool, bool]) -> None:
-    """Set limits, caption and scale; `outer` says whether the panel bears the labels of the y and the x axis."""
+    """Set limits, caption and scale; `outer` is whether the panel has labels of the y and of the x axis."""
     axes.set_xlim(view[0], view[1])
     axes.set_ylim(view[2], view[3])
     axes.set_aspect('equal', adjustable='datalim')
@@ -154,7 +154,7 @@ def _frame(axes: Axes, title: str, view: tuple[float, float, float, float], oute
 def _draw_overlay(axes: Axes, picture: Picture, pixel: float) -> None:
     dots, paths = picture.unexplained_xy, _coloured(picture)
     if len(dots):
-        # together they cover a hundredth of the panel at most, so that the map stays visible beneath them
+        # together, dots cover at most 1 % of the panel, so that the map remains visible
         extent, points = axes.get_window_extent(), 72.0 / axes.figure.dpi
         size = float(np.clip(0.01 * extent.width * extent.height * points**2 / len(dots), 0.8, 9.0))
         for x, y in (dots[k : k + _AT_ONCE].T for k in range(0, len(dots), _AT_ONCE)):
@@ -168,7 +168,7 @@ def _draw_overlay(axes: Axes, picture: Picture, pixel: float) -> None:
         _draw_path(axes, _thinned(path, pixel), 3.9, color='white', linewidth=2.4, alpha=0.9)
     for path, colour in paths:
         _draw_path(axes, _thinned(path, pixel), 4.0, color=colour, linewidth=1.4)
-    # of many drives the marks would hide the map
+    # with many drives, the marks would hide the map
     for path, colour in paths if len(paths) <= _MOST_MARKED else []:
         for marker, xy in zip(_path_markers(_heading(path)), (path[0], path[-1]), strict=True):
             axes.add_line(_marker_line(marker, xy[0], xy[1], colour))
@@ -181,19 +181,19 @@ def _draw_path(axes: Axes, path: NDArray[np.float64], order: float, **style: Any
 
 
 def _thinned(path: NDArray[np.float64], pixel: float) -> NDArray[np.float64]:
-    """Return a path without points in the same quarter of a pixel as the one before; the last one stays."""
+    """Return a path without points in the same quarter of a pixel as the one before; the last point is kept."""
     moved = np.any(np.diff(np.floor(4 * path / pixel), axis=0), axis=1)
     return path[np.r_[True, moved[:-1], True]] if len(path) > 2 else path
 
 
 def _coloured(picture: Picture) -> list[tuple[NDArray[np.float64], str]]:
-    """Return the paths of the drives that have one, each with its colour."""
+    """Return the paths that are not empty, each with the colour of its drive."""
     paths = paths_of(picture.path_xy)
     return [(path, DRIVES[k % len(DRIVES)]) for k, path in enumerate(paths) if len(path)]
 
 
 def _heading(path: np.ndarray) -> float:
-    """Return the direction in degrees in which the path ends; the last few centimetres are noise."""
+    """Return the direction of the path's end, degrees; the last few centimetres are ignored as noise."""
     away = path[-1] - path
     far = np.flatnonzero(np.hypot(away[:, 0], away[:, 1]) > 0.1)
     return math.degrees(math.atan2(away[far[-1], 1], away[far[-1], 0])) if len(far) else 0.0
@@ -233,12 +233,12 @@ def _head(figure: Figure, picture: Picture) -> None:
 
 
 def _named(picture: Picture) -> list[Line2D]:
-    """Return what says which colour is which drive's; nothing for a single one."""
+    """Return the legend of the colours of drives; empty for a single drive."""
     count = len(paths_of(picture.path_xy))
     if len(_coloured(picture)) < 2:
         return []
     # a dollar sign would start a formula
-    names = [name.replace('$', r'\$') for name in told_apart(picture.drives)[:_MOST_NAMED]]
+    names = [name.replace('$', r'\$') for name in distinguished(picture.drives)[:_MOST_NAMED]]
     names = [name if len(name) <= _NAME else f'…{name[1 - _NAME :]}' for name in names]
     handles = [Line2D([], [], color=DRIVES[k], linewidth=1.6, label=f'{k + 1}: {name}') for k, name in enumerate(names)]
     if count > len(names):

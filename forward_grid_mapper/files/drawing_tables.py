@@ -1,4 +1,4 @@
-"""Drawing of tables of maps and of a density; it needs matplotlib, as `drawing` does."""
+"""Drawing of tables of maps, and of a density; requires matplotlib, like `drawing`."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def draw_table(path: Path, title: str, rows: Sequence[Sequence[Tile]], view: tup
 
 
 def draw_density(path: Path, title: str, tile: Tile, curve: Curve) -> None:
-    """Write a map with its cone, and the density below it on the same scale of metres, to `path`."""
+    """Write a map with a cone, and the density below it on the same scale of metres, to `path`."""
     figure = Figure(figsize=(9.0, 8.8), dpi=DPI, facecolor='white')
     FigureCanvasAgg(figure)
     figure.text(0.05, 0.955, title, fontsize=14, fontweight='bold', color=INK)
@@ -86,7 +86,7 @@ def _draw_ways(axes: Axes, tile: Tile) -> None:
 
 
 def _draw_cones(axes: Axes, readings: Readings) -> None:
-    """Draw what was measured: faint cones, with the arcs where they end where there was an echo."""
+    """Draw faint cones, with arcs at the range of echoes."""
     degrees = np.degrees(np.stack([readings.yaw - readings.half_angle, readings.yaw + readings.half_angle], axis=1))
     rows = zip(readings.x, readings.y, readings.z, degrees, readings.echo, strict=True)
     sectors, arcs = [], []

@@ -1,4 +1,4 @@
-"""Figures of several maps, for comparing many at a glance, and of a density."""
+"""Figures of several maps, for comparison, and of a density."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from .panels import Box, Curve, Tile
 
 
 def write_figure(path: Path | str, title: str, rows: Sequence[Sequence[Tile]], view: Box) -> None:
-    """Draw rows of maps of the same place, each showing the box `view` (left, right, bottom, top in metres).
+    """Draw rows of maps of the same place, each with the box `view` (left, right, bottom, top in metres).
 
     Raises
     ------
@@ -25,7 +25,7 @@ def write_figure(path: Path | str, title: str, rows: Sequence[Sequence[Tile]], v
 
 
 def write_density(path: Path | str, title: str, tile: Tile, curve: Curve) -> None:
-    """Draw a map with a cone, and below it the density of what the sonar measures.
+    """Draw a map with a cone, and below it the density of the measured range.
 
     Raises
     ------

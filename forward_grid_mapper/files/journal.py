@@ -1,12 +1,12 @@
-"""A journal: a folder that holds every accepted reading on disk, so that a node that dies loses at most a second.
+"""A journal: a folder with every accepted reading on disk, so that a node that crashes loses at most a second.
 
-The folder holds `drive_0001.journal`, `drive_0002.journal` and so on, a new one after every reset, and `lock`, by which
-one node at a time writes. While a node writes, SQLite's log (`drive_0001.journal-wal`) lies beside its file. Nothing is
-ever deleted.
+The folder contains `drive_0001.journal`, `drive_0002.journal` and so on, a new file after every reset, and `lock`, by
+which only one node at a time can write. While a node writes, SQLite's log (`drive_0001.journal-wal`) is beside its
+file. Nothing is ever deleted.
 
-A thread commits at once what it is given, which no kill of the process undoes: `synchronous=NORMAL` waits for the disk
-only when SQLite moves its log into the file, once in 4 MB. A second thread asks the disk once a second to keep the log,
-so that a power cut takes little more than a second. The node's own thread never waits for the disk.
+A thread commits rows as soon as it receives them; killing the process does not undo this: `synchronous=NORMAL` waits
+for the disk only when SQLite moves its log into the file, once in 4 MB. A second thread syncs the log once a second,
+so that a power cut loses little more than a second. The node's own thread never waits for the disk.
 """
 
 from __future__ import annotations
@@ -31,23 +31,23 @@ from .output_folder import expanded, output_errors
 from .syncing import Syncer
 
 MOST_PENDING = 32 << 20
-"""Bytes that wait for a disk that is full or slow; half a million readings. What comes then is not in the journal."""
+"""Most bytes that wait for a full or slow disk; half a million readings. Later readings are not in the journal."""
 
 BATCH = 4 << 20
-"""Bytes that are committed at once, so that what fits is written when a disk is nearly full."""
+"""Bytes of one commit, so that as many rows as fit are written to a nearly full disk."""
 
 RETRY = 1.0
-"""Seconds after which a write that failed is tried again."""
+"""Seconds between attempts to write."""
 
 PATIENCE = 10.0
-"""Seconds that the start waits for a slow disk at the most, at each step."""
+"""Longest time that the start waits for a slow disk in each step, seconds."""
 
-LOOK = 1.0
-"""Seconds between two looks whether the file is still there, where nothing is written meanwhile."""
+CHECK_PERIOD = 1.0
+"""Seconds between two checks that the file still exists, if nothing is written."""
 
 
 def drives(folder: Path) -> list[Path]:
-    """Return the files of a journal, oldest first; empty if the folder is none.
+    """Return the files of a journal, oldest first; empty if the folder is not a journal.
 
     Raises
     ------
@@ -59,7 +59,7 @@ def drives(folder: Path) -> list[Path]:
 
 
 def drive_file(path: Path) -> Path | None:
-    """Return the journal file that `path` names: itself, or the newest of a journal's folder; None if it is neither."""
+    """Return the journal file at `path`: itself, or the newest one of a journal's folder; None if it is neither."""
     try:
         if path.is_dir():
             return next(reversed(drives(path)), None)
@@ -69,9 +69,9 @@ def drive_file(path: Path) -> Path | None:
 
 
 class _Item(NamedTuple):
-    """Rows to be written into the file of a drive.
+    """Rows that wait for the file of a drive.
 
-    `readings` and `size` are the readings and bytes that they hold, `following` the number of the reading after them.
+    `readings` and `size` are their numbers of readings and bytes, `following` is the number of the next reading.
     """
 
     drive: Drive
@@ -83,7 +83,7 @@ class _Item(NamedTuple):
 
 @dataclass(frozen=True)
 class _Everything:
-    """The rows of a whole drive. They are made when they are written: it may be long work, and the node cannot wait."""
+    """The rows of a whole drive, made by the writing thread, since this may take long and the node cannot wait."""
 
     head: list[Insert]
     readings: Readings
@@ -97,31 +97,31 @@ class _Everything:
 
 
 class Journal:
-    """A journal that is open for writing. Its methods return at once; a thread does the work.
+    """A journal open for writing. Its methods return at once; a thread does the work.
 
     Attributes
     ----------
     contents : Contents
-        What the file held when it was opened, once `restore` was exhausted.
+        Contents of the file when it was opened, once `restore` is exhausted.
     trouble : str
-        Why nothing can be written at the moment; empty if all is well.
+        The reason why nothing can be written at the moment; '' if none.
     notice : str
-        What was found wrong with a file last, and was dealt with; empty if nothing was.
+        The last fault of a file that was repaired; '' if none.
     noticed : float
-        When, by `time.monotonic`.
+        Its time, by `time.monotonic`.
     lost : int
-        Readings that will never be in the journal.
+        Number of readings that will never be in the journal.
     parameters : dict
-        Parameters of the node that the file is to name, those that are not the defaults.
+        Parameters of the node that are not the defaults, to be stored in the file.
     """
 
     def __init__(self, folder: Path | str, warn: Callable[[str], object]) -> None:
-        """Take the folder of a journal; call `restore` before anything else.
+        """Lock the folder of a journal; call `restore` before anything else.
 
         Raises
         ------
         OutputError
-            If another process has it, or the folder cannot be made or written.
+            If another process has locked it, or the folder cannot be made or written.
         """
         self.folder = expanded(folder).absolute()
         self._warn = warn
@@ -153,23 +153,23 @@ class Journal:
 
     @property
     def path(self) -> Path:
-        """The file of the drive that goes on."""
+        """The file of the current drive."""
         return self._drive.path
 
     @property
     def gone(self) -> bool:
-        """Whether the file vanished or was damaged, so that `renew` has to write what is in memory to a new one."""
+        """Whether the file vanished or was damaged, so that `renew` must write the readings in memory to a new one."""
         return self._drive.gone
 
     @property
     def unwritten(self) -> int:
-        """Readings that wait to be written."""
+        """Number of readings that wait to be written."""
         return self._unwritten
 
     def restore(self) -> Iterator[Readings]:
-        """Yield the readings of the drive that goes on, and begin to take more.
+        """Yield the readings of the current drive, and begin to accept new ones.
 
-        A file that is damaged, or of the previous format, is left as it is: its readings are written to a new one.
+        A file that is damaged, or has the previous format, is not changed: its readings are written to a new one.
 
         Raises
         ------
@@ -179,7 +179,7 @@ class Journal:
         source, contents = self._source, self.contents
         if source is not None and self._writer.resume(self._drive):
             yield from self._writer.readings(contents)
-            # it was sound a moment ago
+            # it was valid a moment ago
             self._drive.gone = bool(contents.harm)
             self._numbers = {name: number for number, name in contents.sensors.items()}
             self._stated = (contents.map_frame, contents.base_frame, contents.parameters)
@@ -189,14 +189,14 @@ class Journal:
         if source is not None:
             self._drive = Drive(following(source))
         self._work_in_background()
-        # the file is to be there before the first reading is
+        # the file must exist before the first reading
         self._queue((), 0, 0)
         self._wait_for(lambda: self._drive.made)
         if source is not None:
             yield from self._carry_over(source)
 
     def _carry_over(self, source: Path) -> Iterator[Readings]:
-        """Yield the readings of a file that the journal cannot go on in, and write them to the one that it can."""
+        """Yield the readings of a file that cannot be continued, and write them to a new one."""
         contents = self.contents
         try:
             for found in read(source, contents):
@@ -230,12 +230,12 @@ class Journal:
             self._queue(rows, count, sum(len(values[-1]) for _, values in rows))
 
     def begin_drive(self) -> None:
-        """Go on in a new file; the old one is kept. Nothing happens if nothing was written yet."""
+        """Continue in a new file; the old one is kept. Nothing happens if nothing was written yet."""
         if any(self._stated) or self._next:
             self._begin()
 
     def renew(self, readings: Readings, frames: tuple[str, str], path: Iterable[tuple[float, float]]) -> None:
-        """Go on in a new file that begins with all that is in memory, since the present one is `gone`."""
+        """Continue in a new file, which begins with all readings in memory, since the current one is `gone`."""
         self._begin()
         head = self._head(readings, frames)
         points = list(path)
@@ -243,7 +243,7 @@ class Journal:
         self._queue(_Everything(head, readings, dict(self._numbers), points), len(readings), 0)
 
     def close(self, seconds: float = 2.0) -> None:
-        """Write what is left, as far as that goes in so many seconds, and let go of the folder."""
+        """Write the remaining rows if this takes at most so many seconds, and unlock the folder."""
         with self._wake:
             self._closing = True
             self._wake.notify_all()
@@ -251,16 +251,16 @@ class Journal:
         if thread is None or syncer is None:
             self._let_go()
             return
-        # it lets go of the folder, now or when the disk has done what it was asked for
+        # it unlocks the folder, now or when the disk has finished
         thread.join(seconds)
         if not thread.is_alive():
             syncer.close(seconds)
 
     def _begin(self) -> None:
-        """Begin a new drive, and its file."""
+        """Begin a new drive with its file."""
         with self._wake:
             if self._drive.gone:
-                # for a file that will not come back
+                # rows for a file that will not return
                 self._pending = deque(item for item in self._pending if item.drive is not self._drive)
                 self._bytes = sum(item.size for item in self._pending)
                 self._unwritten = sum(item.readings for item in self._pending)
@@ -270,7 +270,7 @@ class Journal:
         self._queue((), 0, 0)
 
     def _head(self, readings: Readings | None, frames: tuple[str, str]) -> list[Insert]:
-        """Return the rows that have to be there before those of the readings."""
+        """Return the rows that must precede those of the readings."""
         rows: list[Insert] = []
         stated = (*frames, self.parameters)
         if stated != self._stated:
@@ -293,26 +293,26 @@ class Journal:
 
     def _work_in_background(self) -> None:
         with self._wake:
-            # what was closed while it was read must not write into a folder that another may have by now
+            # a journal that was closed during `restore` must not write, since another one may use the folder by now
             if not self._closing:
                 syncer = self._syncer = Syncer(self._warn)
                 self._thread = threading.Thread(target=self._work, args=(syncer,), name='journal', daemon=True)
                 self._thread.start()
 
     def _wait_for(self, condition: Callable[[], bool]) -> None:
-        """Wait until the thread has come so far, unless it cannot."""
+        """Wait for a condition on the thread's progress, unless the thread has trouble."""
         with self._wake:
             self._wake.wait_for(lambda: condition() or self.trouble or self._closing, PATIENCE)
 
     def _let_go(self) -> None:
-        """Let another journal have the folder."""
+        """Unlock the folder."""
         self._writer.close()
         self._lock.release()
 
     def _work(self, syncer: Syncer) -> None:
         while True:
             with self._wake:
-                self._wake.wait_for(lambda: self._closing or self._due(), LOOK)
+                self._wake.wait_for(lambda: self._closing or self._due(), CHECK_PERIOD)
                 items = self._batch()
                 if not items and self._closing:
                     break
@@ -320,11 +320,11 @@ class Journal:
                 if items:
                     self._write(items)
                 else:
-                    self._writer.look()
+                    self._writer.check_file()
             except GoneError as error:
                 self._lose(error.drive, str(error))
             except Exception as error:
-                # of whatever kind: the thread must not end silently
+                # of any class: the thread must not end silently
                 if self._failed(error):
                     break
         self._let_go()
@@ -334,7 +334,7 @@ class Journal:
         return bool(self._pending) and not self._pending[0].drive.gone
 
     def _batch(self) -> list[_Item]:
-        """Return what is to be committed next: items of one drive, up to `BATCH` bytes or else one."""
+        """Return the items of the next commit: of one drive, up to `BATCH` bytes or else one item."""
         items: list[_Item] = []
         size = 0
         for item in self._pending if self._due() else ():
@@ -360,17 +360,17 @@ class Journal:
             self._wake.notify_all()
 
     def _lose(self, drive: Drive, why: str) -> None:
-        """Take note that the file of a drive is not what it was."""
+        """Handle a file that vanished or was damaged."""
         self._notice(f'journal {drive.path}: {why}; the readings in memory are written to a new file')
         with self._wake:
             if drive is self._drive:
                 drive.gone = True
             else:
-                # a drive that is over: what still waits for it is all there is
+                # an earlier drive: its remaining rows go to a new file
                 drive.path, drive.made, drive.next = following(drive.path), False, 0
 
     def _failed(self, error: Exception) -> bool:
-        """Report a write that failed, and wait before the next try; return whether to give up."""
+        """Report a failed write, and wait before the next attempt; return whether to give up."""
         trouble = _words(error)
         if trouble != self.trouble:
             self._warn(f'journal {self.path} cannot be written: {trouble}; mapping continues without it')

@@ -1,8 +1,8 @@
-"""The journal file that is being written: made whole, written in transactions, and looked after.
+"""Writes a journal file: created complete, written in transactions, and checked for changes by others.
 
-SQLite keeps the file locked, and its index of the log in its own memory instead of in a file that is mapped
-(`locking_mode=EXCLUSIVE`): nobody else can make it wait, or cut off a file under its feet. Whoever reads meanwhile
-takes a copy, see `journal_reader`.
+SQLite locks the file, and keeps the index of its log in its own memory instead of a mapped file
+(`locking_mode=EXCLUSIVE`): no other program can make it wait, or truncate a mapped file. Readers use a copy, see
+`journal_reader`.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from .journal_reader import check, connect, extent, log_of, one_line, readings, 
 DRIVE = re.compile(r'drive_(\d{4,})\.journal')
 
 PARTIAL = '.new.journal'
-"""Name of a file before it is whole; one that is left over is overwritten."""
+"""Name of a file before it is complete; an old one is overwritten."""
 
 INSERT = {
     'drive': 'INSERT OR REPLACE INTO drive VALUES (?, ?, ?, ?)',
@@ -34,10 +34,10 @@ INSERT = {
     'path': 'INSERT OR IGNORE INTO path VALUES (?, ?)',
     'readings': 'INSERT OR IGNORE INTO readings VALUES (?, ?)',
 }
-"""A row that is there already is not written again, so that a commit whose outcome is unknown may be repeated."""
+"""Existing rows are ignored, except that of the drive, so that a commit with unknown outcome can be repeated."""
 
 FULL = 'database or disk is full'
-"""What SQLite says of a full disk; a transaction that failed so may be tried again with the same connection."""
+"""SQLite's message for a full disk; the transaction may be repeated with the same connection."""
 
 Insert = tuple[str, tuple[Any, ...]]
 """A table, and the values of a row."""
@@ -50,13 +50,13 @@ class Drive:
     Attributes
     ----------
     path : Path
-        The file; until it is made, another number may be taken if this one is not free.
+        The file; until it is created, it gets another number if this one is used.
     made : bool
-        Whether the file was made, and therefore has to be there.
+        Whether the file was created.
     gone : bool
         Whether it vanished or was damaged since.
     next : int
-        Number of the reading that follows those which were committed.
+        Number of the first reading after the committed ones.
     """
 
     path: Path
@@ -66,7 +66,7 @@ class Drive:
 
 
 class GoneError(Exception):
-    """The file of a drive is not what was written to it; says why."""
+    """The file of a drive is not what was written to it; the message is the reason."""
 
     def __init__(self, drive: Drive, why: str) -> None:
         super().__init__(why)
@@ -80,15 +80,15 @@ def number_of(path: Path) -> int:
 
 
 def following(path: Path) -> Path:
-    """Return the name of the journal file that comes after `path`."""
+    """Return the name of the journal file after `path`."""
     return path.with_name(f'drive_{number_of(path) + 1:04d}.journal')
 
 
 class FolderLock:
-    """The lock by which one process at a time writes into a journal's folder."""
+    """The lock that allows one process at a time to write into a journal's folder."""
 
     def __init__(self, folder: Path) -> None:
-        """Take the lock.
+        """Acquire the lock.
 
         Raises
         ------
@@ -101,14 +101,14 @@ class FolderLock:
         self._file = self._take()
 
     def renew(self) -> None:
-        """Make the folder and take its lock again where they were removed.
+        """Create the folder and acquire its lock again if they were removed.
 
         Raises
         ------
         OutputError
-            If another process has taken it meanwhile.
+            If another process has acquired it meanwhile.
         OSError
-            If the folder cannot be made or written.
+            If the folder cannot be created or written.
         """
         self._folder.mkdir(parents=True, exist_ok=True)
         with suppress(FileNotFoundError):
@@ -119,7 +119,7 @@ class FolderLock:
         self._file = taken
 
     def release(self) -> None:
-        """Let another process have it."""
+        """Release the lock."""
         os.close(self._file)
 
     def _take(self) -> int:
@@ -137,12 +137,12 @@ class FolderLock:
 
 
 class DriveWriter:
-    """Writes rows into the file of a drive, and makes sure that the file stays what it is. One thread at a time.
+    """Writes rows into the file of a drive, and checks that the file is unchanged by others. For one thread at a time.
 
     Attributes
     ----------
     drive : Drive or None
-        The one whose file is open.
+        The drive whose file is open.
     """
 
     def __init__(self, lock: FolderLock) -> None:
@@ -154,7 +154,7 @@ class DriveWriter:
         self._forsaken: list[sqlite3.Connection] = []
 
     def resume(self, drive: Drive) -> bool:
-        """Open a file of an earlier run to go on in it; return whether it is sound throughout.
+        """Open a file of an earlier run to continue it; return whether all of it is valid.
 
         Raises
         ------
@@ -162,7 +162,7 @@ class DriveWriter:
             If another program has it open.
         """
         if drive.path.with_name(drive.path.name + '-journal').exists():
-            # SQLite would play it back, whoever wrote it
+            # SQLite would apply any log, also one of another program
             return False
         try:
             self._connect(drive)
@@ -177,36 +177,36 @@ class DriveWriter:
                 self.close()
                 raise OutputError(f'{drive.path} is open in another program; close that first') from error
         except (sqlite3.Error, MemoryError, OSError, BagError, GoneError):
-            # reading it anew shows what it is
+            # its fault is found when it is read again
             pass
         self.close()
         return False
 
     def readings(self, contents: Contents) -> Iterator[Readings]:
-        """Yield the readings of the file that is open; fills `contents` on the way."""
+        """Yield the readings of the open file, and fill `contents`."""
         assert self._database is not None and self.drive is not None
         yield from readings(self._database, self._size, contents)
 
     def write(self, drive: Drive, rows: Iterable[Insert], following: int) -> Path:
-        """Commit rows to the file of a drive, which is made if need be; return SQLite's log, which now holds them.
+        """Commit rows to the file of a drive, which is created if needed; return SQLite's log, which contains them.
 
         Parameters
         ----------
         drive : Drive
         rows : iterable of (table, values)
         following : int
-            Number of the reading that comes after them.
+            Number of the first reading after them.
 
         Raises
         ------
         GoneError
             If the file is not what was written to it.
         sqlite3.Error, OSError, OutputError
-            If nothing can be written at the moment; nothing was.
+            If nothing can be written at the moment; no row was written.
         """
         try:
             self._open(drive)
-            self._look()
+            self._check()
             assert self._database is not None
             self._database.execute('BEGIN IMMEDIATE')
             for table, values in rows:
@@ -216,7 +216,7 @@ class DriveWriter:
             self._remember()
         except sqlite3.Error as error:
             if FULL not in str(error) or not self._rolled_back():
-                # opened anew at the next try, and compared with what was committed
+                # opened again at the next attempt, and compared with the committed rows
                 self.close()
             if drive.made and (type(error) is sqlite3.DatabaseError or 'readonly' in str(error)):
                 raise GoneError(drive, one_line(error)) from error
@@ -226,24 +226,24 @@ class DriveWriter:
             raise
         return log_of(drive.path)
 
-    def look(self) -> None:
-        """Make sure that the open file and its log are there, and as long as they were.
+    def check_file(self) -> None:
+        """Check that the open file and its log exist, and are not shorter than they were.
 
         Raises
         ------
         GoneError
             If they are not.
         OSError
-            If that cannot be found out.
+            If this cannot be checked.
         """
         try:
-            self._look()
+            self._check()
         except GoneError:
             self.close()
             raise
 
     def close(self) -> None:
-        """Let go of the file; SQLite then moves its log into it."""
+        """Close the file; SQLite then moves its log into it."""
         database, files = self._database, self._files
         self.drive, self._database, self._files = None, None, {}
         if database is None:
@@ -251,7 +251,7 @@ class DriveWriter:
         for path, before in files.items():
             with suppress(OSError):
                 if not os.path.samestat(before, path.stat()):
-                    # SQLite would delete the log by its name, whoever's it is now
+                    # SQLite would delete the log by its name, even if it now belongs to another file
                     self._forsaken.append(database)
                     return
         with suppress(sqlite3.Error):
@@ -286,14 +286,14 @@ class DriveWriter:
         self._remember()
 
     def _next(self) -> int:
-        """Return the number of the reading that comes after those in the file."""
+        """Return the number of the first reading after those in the file."""
         assert self._database is not None
         query = 'SELECT number, length(rows) FROM readings ORDER BY number DESC LIMIT 1'
         number, size = self._database.execute(query).fetchone() or (0, 0)
         return int(number) + int(size or 0) // ROW.itemsize
 
     def _rolled_back(self) -> bool:
-        """Undo a transaction that failed; return whether the connection can go on."""
+        """Roll back a failed transaction; return whether the connection can still be used."""
         if self._database is None:
             return False
         with suppress(sqlite3.Error):
@@ -303,7 +303,7 @@ class DriveWriter:
         return False
 
     def _make(self, drive: Drive) -> None:
-        """Make the file of a drive under a hidden name, so that it is a journal from the moment that it has its own."""
+        """Create the file of a drive under a hidden name, so that a file with the final name is always complete."""
         self._lock.renew()
         partial = [drive.path.with_name(PARTIAL + suffix) for suffix in ('', '-wal', '-journal')]
         for path in partial:
@@ -315,7 +315,7 @@ class DriveWriter:
             database.execute(f'PRAGMA application_id={APPLICATION}')
             database.execute(f'PRAGMA user_version={VERSION}')
             database.execute('COMMIT')
-            # kept in the file; all who open it later use a log
+            # stored in the file, for all connections that open it later
             database.execute('PRAGMA journal_mode=WAL')
         if any(path.exists() for path in partial[1:]):
             raise OSError(errno.EIO, 'a new file could not be completed')
@@ -325,18 +325,18 @@ class DriveWriter:
         drive.made = True
 
     def _remember(self) -> None:
-        """Note what the open file and its log are, to know them again."""
+        """Note identity and size of the open file and its log."""
         assert self.drive is not None
         path = self.drive.path
         try:
             self._files = {path: path.stat()}
             with suppress(FileNotFoundError):
-                # there from the first transaction on
+                # it exists from the first transaction on
                 self._files[log_of(path)] = log_of(path).stat()
         except FileNotFoundError:
             raise GoneError(self.drive, f'{path.name} was deleted or moved') from None
 
-    def _look(self) -> None:
+    def _check(self) -> None:
         for path, before in self._files.items():
             assert self.drive is not None
             try:

@@ -1,4 +1,4 @@
-"""What a journal file holds: its tables, the layout of a reading, and the checks that everything read back must pass.
+"""Contents of a journal file: its tables, the layout of a reading, and checks for everything that is read.
 
 A journal file is an SQLite database in WAL mode:
 
@@ -7,8 +7,8 @@ A journal file is an SQLite database in WAL mode:
     path       points of the robot's path in the map frame: x, y (float64)
     readings   number of the first reading of a block, and the block: rows of `ROW`
 
-Readings are counted from the begin of the drive. The count is the key of the table, so that a block which is written
-again after a failure takes the place that it has.
+Readings are counted from the begin of the drive. The count is the key of the table, so that a block that is written
+again after a failure is not stored twice.
 """
 
 from __future__ import annotations
@@ -44,32 +44,32 @@ TABLES = {
     'path': 'CREATE TABLE path (number INTEGER PRIMARY KEY, points BLOB)',
     'readings': 'CREATE TABLE readings (number INTEGER PRIMARY KEY, rows BLOB)',
 }
-"""The whole schema. No table has an index of its own, so that `sqlite_master` has these rows and no others."""
+"""The whole schema. No table has its own index, so that `sqlite_master` has exactly these rows."""
 
 COLUMNS = ('x', 'y', 'yaw', 'z', 'z_max', 'half_angle', 'sigma')
 ROW = np.dtype([('stamp', '<i8'), *((name, '<f8') for name in COLUMNS), ('sensor', '<u4')])
 """A reading; 68 bytes."""
 
 BLOCK = 10_000
-"""Readings of a block at the most; 680 kB, so that no row of the database is longer than `LONGEST`."""
+"""Most readings of a block; 680 kB, so that no row of the database is longer than `LONGEST`."""
 
 CHUNK = 50_000
-"""Readings that are handed on at once when a journal is read; 3.4 MB."""
+"""Readings that are yielded at once when a journal is read; 3.4 MB."""
 
 LONGEST = 1 << 20
-"""Bytes of a value in the database. A longer one is damage, and is not even loaded."""
+"""Most bytes of a value in the database. A longer one is damage, and is not loaded."""
 
 MOST_SENSORS = 10_000
-"""Sensors of a drive; ten times what the node counts apart."""
+"""Most sensors of a drive; ten times as many as the node counts separately."""
 
 LONGEST_NAME = 1020
-"""Bytes of a frame's name: 255 characters of four bytes."""
+"""Most bytes of a frame's name: 255 characters of four bytes."""
 
 MOST_POINTS = 200_000
-"""Points of the path that are kept in memory while a journal is read; of more, every other one goes."""
+"""Most points of the path in memory while a journal is read; if there are more, every second one is dropped."""
 
 LATEST = (1 << 32) * NANOSECONDS
-"""Nanoseconds that a stamp may be away from 0: what seconds of 32 bits can say, so that differences fit 64 bits."""
+"""Largest absolute value of a stamp, nanoseconds: that of 32 bits of seconds, so that differences fit into 64 bits."""
 
 
 def rows_of(readings: Readings, numbers: Mapping[str, int]) -> NDArray[np.void]:
@@ -82,42 +82,42 @@ def rows_of(readings: Readings, numbers: Mapping[str, int]) -> NDArray[np.void]:
 
 
 def points_of(path: Iterable[tuple[float, float]]) -> NDArray[np.float64]:
-    """Return points of the path as they are stored, shape (P, 2)."""
+    """Return points of the path in the format of the table, shape (P, 2)."""
     return np.array(list(path), '<f8').reshape(-1, 2)
 
 
 def encoded(name: str) -> bytes:
-    """Return the bytes that stand for a frame's name, whatever characters it has."""
+    """Return a frame's name, with any characters, as bytes."""
     return name.encode('utf-8', 'surrogatepass')
 
 
 def stated(parameters: Parameters) -> dict[str, Any]:
-    """Return the parameters that decide about maps and are not the defaults, by name, as a journal has them."""
+    """Return the parameters that affect maps and are not the defaults, by name, in the format of a journal."""
     values = parameters.flat()
     return {row.name: values[row.name] for row in TABLE if row.group != 'node' and values[row.name] != row.default}
 
 
 @dataclass
 class Contents:
-    """What a journal file holds besides its readings, complete once they were read, and what is wrong with it.
+    """Contents of a journal file besides its readings, complete once these were read, and its faults.
 
     Attributes
     ----------
     map_frame, base_frame : str
     parameters : dict
-        Those of the node that wrote the file, where they are not the defaults.
+        Those of the node that wrote the file which are not the defaults.
     sensors : dict of int → str
         Names by number.
     path : list of (x, y)
         Metres, in the map frame.
     next, next_points : int
-        Numbers of the reading, and of the points of the path, that would come next.
+        Numbers of the next reading, and of the next points of the path.
     faults : list of str
-        What is wrong with the file as a whole.
+        Faults of the file as a whole.
     left_out : Counter of str
-        Readings that cannot be, by what is wrong with them; they are not handed on.
+        Number of invalid readings by fault; they are not yielded.
     note : str
-        What the user should know of a file that is sound; empty if nothing.
+        A note to the user on a valid file; '' if none.
     """
 
     map_frame: str = ''
@@ -133,7 +133,7 @@ class Contents:
 
     @property
     def harm(self) -> str:
-        """What is wrong with the file, in words; empty if nothing is."""
+        """The faults of the file, in words; '' if none."""
         counts = [
             f'{count} readings are left out, since {reason}'
             if count > 1
@@ -143,12 +143,12 @@ class Contents:
         return '; '.join(self.faults + counts)
 
     def fault(self, text: str) -> None:
-        """Note what is wrong with the file, each thing once."""
+        """Add a fault of the file, each only once."""
         if text not in self.faults:
             self.faults.append(text)
 
     def add_sensor(self, number: int, name: object) -> None:
-        """Take a sensor's name, if it is one."""
+        """Add a sensor's name, if it is valid."""
         text = _name(name)
         if text is None or not 0 <= number < 1 << 32:
             self.fault('the name of a sensor is damaged')
@@ -158,7 +158,7 @@ class Contents:
             self.sensors[number] = text
 
     def set_frames(self, map_frame: object, base_frame: object) -> None:
-        """Take the frames of the drive, if they are names."""
+        """Set the frames of the drive, if their names are valid."""
         names = _name(map_frame), _name(base_frame)
         if names[0] is None or names[1] is None:
             self.fault('the frames of the drive are damaged')
@@ -166,7 +166,7 @@ class Contents:
             self.map_frame, self.base_frame = names[0], names[1]
 
     def set_parameters(self, data: object) -> None:
-        """Take the parameters of the node. Another version may have others, so what is not admitted is passed over."""
+        """Set the parameters of the node. Those that this version does not accept are ignored."""
         try:
             values = json.loads(data) if isinstance(data, bytes) else None
         except (ValueError, RecursionError):
@@ -180,7 +180,7 @@ class Contents:
                     self.parameters[row.name] = row.check(values[row.name])
 
     def add_path(self, data: object) -> None:
-        """Take points of the path, those that are on Earth."""
+        """Add points of the path, if they are on Earth."""
         if not isinstance(data, bytes) or len(data) % 16:
             self.fault('points of the path are damaged')
             return
@@ -193,7 +193,7 @@ class Contents:
             del self.path[1::2]
 
     def sound(self, rows: NDArray[np.void]) -> NDArray[np.void]:
-        """Return the rows that can be readings; the others are counted by what is wrong with them."""
+        """Return the rows that are valid readings; the others are counted by fault."""
         good = np.ones(len(rows), bool)
         for reason, bad in _wrong(rows, self.sensors):
             count = int(np.count_nonzero(bad & good))
@@ -203,7 +203,7 @@ class Contents:
         return rows if good.all() else rows[good]
 
     def readings(self, rows: NDArray[np.void]) -> Readings:
-        """Return rows that are `sound` as readings."""
+        """Return `sound` rows as readings."""
         known, sensor = np.unique(rows['sensor'], return_inverse=True)
         names = tuple(self.sensors[int(number)] for number in known)
         return Readings.from_columns(names=names, sensor=sensor, **{name: rows[name] for name in ('stamp', *COLUMNS)})
@@ -219,9 +219,9 @@ def _name(data: object) -> str | None:
 
 
 def _wrong(rows: NDArray[np.void], sensors: Mapping[int, str]) -> Iterator[tuple[str, NDArray[np.bool_]]]:
-    """Yield what may be wrong with readings, and the mask of those with which it is.
+    """Yield possible faults of readings, and the mask of readings that have them.
 
-    Comparisons are written so that a NaN fails them.
+    Comparisons are written so that NaN fails them.
     """
     z, z_max = rows['z'], rows['z_max']
     on_earth = (np.abs(rows['x']) < FARTHEST) & (np.abs(rows['y']) < FARTHEST) & np.isfinite(rows['yaw'])
@@ -237,7 +237,7 @@ def _wrong(rows: NDArray[np.void], sensors: Mapping[int, str]) -> Iterator[tuple
 
 
 def in_chunks(blocks: Iterable[NDArray[np.void]], contents: Contents) -> Iterator[Readings]:
-    """Yield the sound readings of blocks of rows, some `CHUNK` at a time."""
+    """Yield the valid readings of blocks of rows, about `CHUNK` at a time."""
     waiting: list[NDArray[np.void]] = []
     count = 0
     for rows in blocks:

@@ -1,8 +1,8 @@
 """Reads journals of the previous format: blocks with a checksum, one after the other. This version only reads them.
 
 A file begins with `MAGIC`. A block is `SYNC`, its kind, the length of its payload, and the CRC-32 of kind, length and
-payload; little endian. A checksum says that a block is as it was written, not that what was written makes sense, so
-the content passes the same checks as that of the present format.
+payload; little endian. A correct checksum means that a block is unchanged, not that its contents are meaningful, so
+they pass the same checks as those of the present format.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ SYNC = b'\xf5FGM'
 HEAD = struct.Struct('<4sBxxxII')
 FRAMES, NAME, READINGS, PATH = 1, 2, 3, 4
 LONGEST = 1 << 26
-"""Bytes of a payload. A length beyond it is damage; after as many bytes read in vain, the rest is given up."""
+"""Most bytes of a payload. A larger length is damage; after as many bytes without a block, reading ends."""
 
 WINDOW = 4096
 """Bytes that are searched at once for the next block."""
@@ -34,7 +34,7 @@ NOTE = 'it has the format of the previous version, which the next version will n
 
 
 def read(path: Path, contents: Contents) -> Iterator[Readings]:
-    """Yield the readings of a journal file of the previous format, some ten thousand at a time; fills `contents`.
+    """Yield the readings of a journal file of the previous format, about ten thousand at a time; fills `contents`.
 
     Raises
     ------
@@ -53,7 +53,7 @@ def _rows(file: BinaryIO, contents: Contents) -> Iterator[NDArray[np.void]]:
             contents.next += len(rows)
             for number in np.unique(rows['sensor']).tolist():
                 if number not in contents.sensors:
-                    # its name was damaged
+                    # the block with its name was damaged
                     contents.add_sensor(number, encoded(f'sensor number {number}'))
             yield rows
         elif kind == NAME and len(payload) >= 4:
@@ -75,7 +75,7 @@ def _take_frames(payload: bytes, contents: Contents) -> None:
 
 
 def _blocks(file: BinaryIO, contents: Contents) -> Iterator[tuple[int, bytes]]:
-    """Yield kind and payload of every sound block; what lies between them is damage."""
+    """Yield kind and payload of every valid block; bytes between them are damage."""
     at = end = len(MAGIC)
     damaged = tried = 0
     while tried <= LONGEST:
@@ -92,7 +92,7 @@ def _blocks(file: BinaryIO, contents: Contents) -> Iterator[tuple[int, bytes]]:
             yield kind, payload
         else:
             found = _find(file, at + 1)
-            # heads that claim long payloads may stand close together
+            # headers with long payloads may be close together
             tried += max(found - at, WINDOW) + len(payload)
             at = found
     torn = file.seek(0, 2) - end
@@ -103,7 +103,7 @@ def _blocks(file: BinaryIO, contents: Contents) -> Iterator[tuple[int, bytes]]:
 
 
 def _find(file: BinaryIO, at: int) -> int:
-    """Return where the next `SYNC` is, or where to stop searching."""
+    """Return the position of the next `SYNC`, or of the end of the search."""
     stop = at + LONGEST
     while at < stop:
         file.seek(at)

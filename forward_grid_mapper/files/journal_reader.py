@@ -1,12 +1,12 @@
-"""Reads a journal file, whoever wrote it and whoever writes it at the moment.
+"""Reads a journal file of any origin, also while a node writes it.
 
-Nothing in the file is trusted: it must have the tables of a journal and no others, so that no view or trigger runs; the
-work and the length of each value are bounded by the size of the file; and what is read passes the checks of
-`journal_format`. What is damaged costs itself, or what comes after it.
+The file is not trusted: it must have the tables of a journal and no others, so that no view or trigger runs; the work
+and the length of each value are bounded by the size of the file; and all contents pass the checks of `journal_format`.
+Damage costs only the damaged part, or all that follows it.
 
-The node holds its file locked and keeps the latest readings in the log beside it (`-wal`). A reader therefore takes a
-copy of both, and reads that. It never writes into the journal's folder, and maps no file into memory, so that a file
-that is cut off meanwhile is an error and not a signal.
+The node locks its file, and keeps the latest readings in the log beside it (`-wal`). So a reader copies both, and reads
+the copies. It never writes into the journal's folder, and maps no file into memory, so that truncation of the file is
+an error and not a signal.
 """
 
 from __future__ import annotations
@@ -44,34 +44,34 @@ APPLICATION_AT = 68
 """Offset of the application id in the header of an SQLite database."""
 
 PAGES_AT = 28
-"""Offset of the count of pages in that header."""
+"""Offset of the number of pages in that header."""
 
 LOG_HEAD = 32
-"""Bytes of the header of the log. They change each time the log begins anew."""
+"""Bytes of the header of the log. They change each time the log begins again."""
 
 TRIES = 20
-"""Copies that are taken until one is whole; the log begins anew about once a minute."""
+"""Most attempts to get a consistent copy; the log begins again about once a minute."""
 
 MOST_ROWS = 1 << 40
-"""Numbers of rows: a reading a microsecond for twelve days."""
+"""Largest row number: a reading per microsecond for twelve days."""
 
 STEPS = 10_000
-"""Steps of SQLite's virtual machine between two looks at how many there were."""
+"""Steps of SQLite's virtual machine between two checks of their number."""
 
 LEAST_BYTES = 64 << 20
-"""Bytes of content that are granted to a file of any size."""
+"""Bytes of contents that are allowed for a file of any size."""
 
 MOST_PACKED = 64
-"""How many times more content than space on the disk a file may have: file systems compress, and files have holes."""
+"""Most bytes of contents for each byte on the disk: file systems compress, and files have holes."""
 
 LEAST_STEPS = 1_000_000
-"""Steps that are granted to a file of any size; a hundredth of a second."""
+"""Steps that are allowed for a file of any size; a hundredth of a second."""
 
 STEPS_A_BYTE = 4
-"""Steps that are granted for each byte of the file: a row takes some 15, and has 10 bytes or more."""
+"""Steps that are allowed for each byte of the file: a row needs about 15, and has 10 bytes or more."""
 
 MOST_MEMORY = 256 << 20
-"""Bytes that SQLite may use where Python (3.10) cannot bound the length of a value; a hundred times what it needs."""
+"""Most memory of SQLite, bytes, for Python 3.10, which cannot bound the length of a value; a hundred times its need."""
 
 
 def is_journal(path: Path) -> bool:
@@ -80,7 +80,7 @@ def is_journal(path: Path) -> bool:
     Raises
     ------
     OSError
-        If it cannot be read, or is no regular file.
+        If it cannot be read, or is not a regular file.
     """
     head = _head(path, APPLICATION_AT + 4)
     ours = head.startswith(SQLITE) and head[APPLICATION_AT:] == APPLICATION.to_bytes(4, 'big')
@@ -88,17 +88,17 @@ def is_journal(path: Path) -> bool:
 
 
 def log_of(path: Path) -> Path:
-    """Return the log beside a journal file, where SQLite keeps what was written last."""
+    """Return the log beside a journal file, where SQLite keeps the latest rows."""
     return path.with_name(path.name + '-wal')
 
 
 def read(path: Path, contents: Contents) -> Iterator[Readings]:
-    """Yield the readings of a journal file, some ten thousand at a time; fills `contents` on the way.
+    """Yield the readings of a journal file, about ten thousand at a time, and fill `contents`.
 
     Raises
     ------
     BagError
-        If the file cannot be read, or is no journal.
+        If the file cannot be read, or is not a journal.
     """
     try:
         if _head(path, len(journal_previous.MAGIC)) == journal_previous.MAGIC:
@@ -114,12 +114,12 @@ def read(path: Path, contents: Contents) -> Iterator[Readings]:
 
 
 def extent(path: Path) -> int:
-    """Return how many bytes a journal and its log may hold.
+    """Return how many bytes of contents a journal and its log may have.
 
     Raises
     ------
     OSError
-        If there is no such file, or one of them is no regular file: SQLite would wait for a pipe.
+        If the file does not exist, or one of the two is not a regular file: SQLite would wait for a pipe.
     """
     found = [path.stat()]
     with suppress(FileNotFoundError):
@@ -130,8 +130,8 @@ def extent(path: Path) -> int:
 
 
 def connect(path: Path, options: str, size: int) -> sqlite3.Connection:
-    """Open a database that may hold anything; `size` bytes bound the work until `unbounded` is called."""
-    # a path of any bytes, which SQLite unquotes
+    """Open a database with unknown contents; `size` bytes bound the work until `unbounded` is called."""
+    # a path of any bytes; SQLite unquotes it
     name = f'file:{quote(os.fsencode(path.absolute()))}?{options}'
     database = sqlite3.connect(name, uri=True, timeout=0.0, isolation_level=None, check_same_thread=False)
     left = [LEAST_STEPS + STEPS_A_BYTE * size]
@@ -146,7 +146,7 @@ def connect(path: Path, options: str, size: int) -> sqlite3.Connection:
             database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, LONGEST)
         else:
             database.execute(f'PRAGMA hard_heap_limit={MOST_MEMORY}')
-        # exclusive: without memory that is shared with others, who could cut it off
+        # exclusive: without shared memory, which others could truncate
         for pragma in (
             *('mmap_size=0', 'trusted_schema=OFF', 'cell_size_check=ON', 'temp_store=MEMORY'),
             'locking_mode=EXCLUSIVE',
@@ -159,19 +159,19 @@ def connect(path: Path, options: str, size: int) -> sqlite3.Connection:
 
 
 def unbounded(database: sqlite3.Connection) -> None:
-    """Let a connection work without a bound, now that its file is known to be a journal."""
+    """Remove the bound of a connection, since its file is known to be a journal."""
     database.set_progress_handler(None, 0)
 
 
 def check(database: sqlite3.Connection, path: Path) -> None:
-    """Make sure that a database has the tables of a journal, and nothing else.
+    """Check that a database has the tables of a journal, and nothing else.
 
     Raises
     ------
     BagError
-        If it is no journal, or one of another version.
+        If it is not a journal, or has another version.
     sqlite3.Error
-        If it is damaged, or another program holds it.
+        If it is damaged, or locked by another program.
     """
     application = database.execute('PRAGMA application_id').fetchone()[0]
     version = database.execute('PRAGMA user_version').fetchone()[0]
@@ -186,9 +186,9 @@ def check(database: sqlite3.Connection, path: Path) -> None:
 
 
 def readings(database: sqlite3.Connection, size: int, contents: Contents) -> Iterator[Readings]:
-    """Yield the readings of a database that passed `check`; fills `contents` on the way.
+    """Yield the readings of a database that passed `check`, and fill `contents`.
 
-    What cannot be read is noted in `contents`, and nothing after it is read.
+    A part that cannot be read is noted in `contents`, and nothing after it is read.
     """
     table = _Table(database, size)
     try:
@@ -222,30 +222,30 @@ def _blocks(table: _Table, contents: Contents) -> Iterator[NDArray[np.void]]:
 
 
 class _DamagedError(Exception):
-    """What is in the database cannot have been written by a node."""
+    """A node cannot have written the contents of the database."""
 
 
 class _Table:
-    """Reads tables of a database row by row, and no more bytes than the file has: damaged rows may overlap."""
+    """Reads tables of a database row by row, up to as many bytes as the file has: damaged rows may overlap."""
 
     def __init__(self, database: sqlite3.Connection, size: int) -> None:
         self._database = database
         self._left = size
 
     def rows(self, table: str, *columns: str) -> Iterator[tuple[Any, ...]]:
-        """Yield the key of each row in ascending order, and its values; what is no value of a journal is None.
+        """Yield the key of each row in ascending order, and its values; None for values that a journal cannot have.
 
         Raises
         ------
         sqlite3.Error, _DamagedError
             If the table is damaged.
         """
-        # typeof and length look at the head of a row only, so that a value of gigabytes is never loaded
+        # typeof and length read only the header of a row, so that a value of gigabytes is never loaded
         values = ', '.join(f"CASE WHEN typeof({c})='blob' AND length({c})<={LONGEST} THEN {c} END" for c in columns)
         last = -1
         with closing(self._database.execute(f'SELECT number, {values} FROM {table} ORDER BY number')) as cursor:
             for row in cursor:
-                # a tree whose branches have leaves in common would never end
+                # if branches of a damaged tree share leaves, reading would never end
                 if not last < row[0] < MOST_ROWS:
                     raise _DamagedError('its rows are out of order')
                 last = row[0]
@@ -256,14 +256,14 @@ class _Table:
 
 
 def one_line(error: BaseException) -> str:
-    """Return what SQLite says, in words."""
+    """Return the message of SQLite in one line."""
     text = ' '.join(str(error).split()) or type(error).__name__
     return 'it is damaged: reading it takes more steps than it has bytes' if text == 'interrupted' else text
 
 
 @contextmanager
 def _for_reading(path: Path) -> Iterator[tuple[sqlite3.Connection, int]]:
-    """Open a journal without writing beside it; gives the connection and the bytes that the file has."""
+    """Open a journal without writing beside it; yields the connection and the number of bytes."""
     log = log_of(path)
     with tempfile.TemporaryDirectory(prefix='journal_') as folder:
         for _ in range(TRIES):
@@ -281,11 +281,11 @@ def _for_reading(path: Path) -> Iterator[tuple[sqlite3.Connection, int]]:
             size = _copy(path, copy) + (_copy(log, log_of(copy)) if head else 0)
             if cut:
                 with copy.open('r+b') as file:
-                    # without a count, SQLite counts by itself
+                    # SQLite then counts the pages by itself
                     file.seek(PAGES_AT)
                     file.write(bytes(4))
-            # What SQLite moved from the log into the file meanwhile is in the copy of the log as well, unless the log
-            # began anew.
+            # Rows that SQLite moved from the log into the file meanwhile are also in the copy of the log, unless the
+            # log began again.
             if head == _log_head(log) == _log_head(log_of(copy)):
                 with closing(connect(copy, 'mode=rw', size)) as database:
                     yield database, size
@@ -294,16 +294,16 @@ def _for_reading(path: Path) -> Iterator[tuple[sqlite3.Connection, int]]:
 
 
 def _pages_cut_off(path: Path) -> bool:
-    """Return whether a database is shorter than its header says, which SQLite refuses to read."""
+    """Return whether a database is shorter than its header states; SQLite refuses to read such a file."""
     head = _head(path, PAGES_AT + 4).ljust(PAGES_AT + 4, b'\0')
     size, pages = int.from_bytes(head[16:18], 'big'), int.from_bytes(head[PAGES_AT:], 'big')
-    # 1 stands for what 16 bits cannot hold
+    # 1 means 65536, which does not fit into 16 bits
     return path.stat().st_size < pages * (size if size > 1 else 1 << 16)
 
 
 @contextmanager
 def opened(path: Path) -> Iterator[int]:
-    """Open a regular file for reading and give its descriptor; a pipe is an error rather than waited for.
+    """Open a regular file for reading and yield its descriptor; a pipe is an error instead of a wait.
 
     Raises
     ------
@@ -331,7 +331,7 @@ def _log_head(log: Path) -> bytes:
 
 
 def _copy(source: Path, target: Path) -> int:
-    """Copy a file without its holes; return how many bytes that took.
+    """Copy a file without its holes; return the number of bytes copied.
 
     Raises
     ------
@@ -351,12 +351,12 @@ def _copy(source: Path, target: Path) -> int:
                 while at < hole:
                     sent = os.sendfile(out.fileno(), file, at, hole - at)
                     if not sent:
-                        # it was cut off meanwhile
+                        # it was truncated meanwhile
                         return copied
                     at, copied = at + sent, copied + sent
     except OSError as error:
         if error.errno == errno.ENXIO:
-            # nothing but a hole is left
+            # only a hole remains
             return copied
         if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
             raise BagError(

@@ -1,4 +1,4 @@
-"""What learning found, as a page of text and as a parameter file."""
+"""The result of learning, as text and as a parameter file."""
 
 from __future__ import annotations
 
@@ -110,17 +110,17 @@ def _rounds(learned: Learned) -> Iterator[str]:
 def parameter_file_text(
     learned: Learned, extrinsics: Mapping[str, Pose2], ros: Mapping[str, Any], source: str = ''
 ) -> str:
-    """Return a ROS 2 parameter file with the learned values, and the sensor poses that were given.
+    """Return a ROS 2 parameter file with the learned values and the given sensor poses.
 
     Parameters
     ----------
     learned : Learned
     extrinsics : mapping of str to Pose2
-        Poses of sensors, for the file to hold them as well.
+        Poses of sensors, to be written into the file.
     ros : mapping
-        Parameters that ROS itself gives every node.
+        Parameters that ROS itself declares for every node.
     source : str
-        What they were learned from, for a comment.
+        The recordings that were used, for a comment.
     """
     where = f' from {" ".join(source.split())}' if source else ''
     if learned.accepted:
@@ -136,16 +136,16 @@ def parameter_file_text(
     text = '\n'.join(lines) + '\n' + dump_parameters(learned.parameters)
     extra = {f'sensors.{frame}.pose': [float(v) for v in pose] for frame, pose in extrinsics.items()} | dict(ros)
     for key, value in extra.items():
-        # a list on one line, as the rest of the file has it
+        # lists on one line, as elsewhere in the file
         flow = None if isinstance(value, list) else False
-        # yaml puts what follows a long name on a line of its own
+        # yaml would put the value of a long name on its own line
         made = yaml.safe_dump({key: value}, default_flow_style=flow, width=1000).strip().splitlines()
         text += ''.join(f'    {line}\n' for line in made)
     return text
 
 
 def write_new_file(path: Path, text: str) -> None:
-    """Write a file that must not exist yet; nothing is left if that fails.
+    """Write a file that must not exist yet; if this fails, no file remains.
 
     Raises
     ------
@@ -161,6 +161,6 @@ def write_new_file(path: Path, text: str) -> None:
             with file:
                 file.write(text)
         except BaseException:
-            # Ctrl-C as well as a full disk
+            # after Ctrl-C as well as on a full disk
             path.unlink(missing_ok=True)
             raise

@@ -1,4 +1,4 @@
-"""`maps.npz`: the three maps with everything needed to work on them in numpy."""
+"""`maps.npz`: the three maps with all data needed to process them in numpy."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from .output_folder import output_errors
 
 
 class MapArchive(NamedTuple):
-    """What `maps.npz` holds; the names are those of `MapSet`."""
+    """Contents of `maps.npz`; the names are those of `MapSet`."""
 
     grid: Grid
     live: NDArray[np.float32]
@@ -33,9 +33,9 @@ def write_npz(path: Path | str, maps: MapSet) -> None:
     """Write the maps as compressed arrays, none of them pickled.
 
     `live_map`, `ml_map` and `uncertainty_map` are float32 probabilities, NaN where unknown, row 0 with the smallest y;
-    `dynamic` (float32) counts echoes in free space that come from nothing on the map: of people, say. `origin` (2,) is
-    the corner of cell (0, 0) and `resolution` the edge of a cell, metres; `log_likelihood` and `objective` are in nats;
-    `parameters` is a JSON text.
+    `dynamic` (float32) counts echoes in free space that no object of the map explains, such as those of people.
+    `origin` (2,) is the corner of cell (0, 0) and `resolution` the edge of a cell, metres; `log_likelihood` and
+    `objective` are in nats; `parameters` is a JSON text.
 
     Raises
     ------
@@ -43,7 +43,7 @@ def write_npz(path: Path | str, maps: MapSet) -> None:
         If the file cannot be written.
     """
     path = Path(path)
-    # in memory first: a ZipFile whose writing fails complains once more when it is collected
+    # in memory first: after a failed write, a ZipFile raises again when it is collected
     packed = io.BytesIO()
     np.savez_compressed(
         packed,
@@ -62,16 +62,16 @@ def write_npz(path: Path | str, maps: MapSet) -> None:
 
 
 def read_npz(path: Path | str) -> MapArchive:
-    """Read what `write_npz` wrote.
+    """Read a file of `write_npz`.
 
     Raises
     ------
     InputError
-        If the file is missing, damaged or something else.
+        If the file is missing, damaged or of another kind.
     """
     path = Path(path)
     if path.exists() and not path.is_file():
-        # a pipe would be waited for
+        # reading a pipe would wait
         raise InputError(f'{path} is not a file')
     try:
         with path.open('rb') as file, np.load(file, allow_pickle=False) as data:

@@ -1,4 +1,4 @@
-"""Maps as map_server and Nav2 read them (YAML beside PGM), and as values of an OccupancyGrid."""
+"""Maps in the format of map_server and Nav2 (YAML and PGM), and as values of an OccupancyGrid."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from .small_text import read_text
 FREE_PIXEL, OCCUPIED_PIXEL, UNKNOWN_PIXEL = 254, 0, 205
 RAW_UNKNOWN_PIXEL = 255
 OCCUPIED_THRESHOLD = 0.65
-# map_server's own value: the unknown pixel's (255 - 205) / 255 = 0.19608 is just not below it.
+# map_server's own value: that of the unknown pixel, (255 - 205) / 255 = 0.19608, is just above it.
 FREE_THRESHOLD = 0.196
 
 
 def occupancy_values(values: NDArray[Any]) -> NDArray[np.int8]:
-    """Return a map as `nav_msgs/OccupancyGrid` wants it: 0 … 100, −1 where unknown.
+    """Return a map as values of `nav_msgs/OccupancyGrid`: 0 … 100, −1 where unknown.
 
     Parameters
     ----------
@@ -36,10 +36,10 @@ def occupancy_values(values: NDArray[Any]) -> NDArray[np.int8]:
     """
     made: NDArray[np.int8]
     if np.issubdtype(values.dtype, np.integer):
-        # sums of bytes: choosing numbers of eight bytes takes ten times as long, and holds up the executor of the node
+        # sums of bytes: selection with numbers of eight bytes takes ten times as long, and delays the node's executor
         made = (values > 0).view(np.int8) * np.int8(100) - (values < 0).view(np.int8)
     else:
-        # the larger one of a number and NaN is the number
+        # fmax of a number and NaN is the number
         made = np.fmax(np.clip(np.rint(values * 100.0), 0, 100), -1).astype(np.int8)
     return made
 
@@ -114,7 +114,7 @@ def read_map(path: Path | str) -> tuple[Grid, NDArray[np.float32]]:
     Raises
     ------
     InputError
-        If the map is missing or damaged, is turned, or does not lie on the lattice of its resolution.
+        If the map is missing or damaged, is rotated, or is not aligned to the lattice of its resolution.
     """
     path = Path(path)
     try:
@@ -162,7 +162,7 @@ def _write(stem: Path, grid: Grid, pixels: NDArray[np.uint8], mode: str) -> Path
         raise ValueError(f'a map of shape {pixels.shape} does not fit a grid of shape {grid.shape}')
     if not grid.size:
         raise OutputError(f'{stem}: the map has no cells; there is nothing to write')
-    # Not with_suffix: a stem may hold dots.
+    # Not with_suffix: a stem may contain dots.
     image, meta = (stem.with_name(stem.name + suffix) for suffix in ('.pgm', '.yaml'))
     write_pgm(image, pixels[::-1])
     fields = {

@@ -1,4 +1,4 @@
-"""Folders and files that appear whole or not at all, and errors that say what to do."""
+"""Folders and files that appear complete or not at all, and errors with a remedy."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ from ..core.common.errors import OutputError
 
 _STAGING = re.compile(r'\.(?P<name>.+)\.[0-9a-f]{8}\.partial')
 _FULL = {errno.ENOSPC, errno.EDQUOT}
-# Errors that only writing can cause, so that they may be blamed on the output whoever meets them.
+# Errors that only writing can cause, so that they are always errors of the output.
 _WRITE_ONLY = _FULL | {errno.EFBIG, errno.EROFS}
 
 
 def readable(path: Path | str) -> str:
-    """Return a path as text that can be drawn and written as UTF-8, whatever its bytes are."""
+    """Return a path of any bytes as text that can be drawn and written as UTF-8."""
     try:
         return os.fsencode(path).decode('utf-8', 'backslashreplace')
     except UnicodeEncodeError:
-        # it is such text already, with letters that the names of files do not have in this locale
+        # already such text, with characters that file names of this locale cannot have
         return str(path).encode('utf-8', 'backslashreplace').decode('utf-8')
 
 
-def told_apart(paths: Sequence[str]) -> list[str]:
-    """Return the end of each path that tells it from the others, as short as can be: two `bag` get their folders."""
+def distinguished(paths: Sequence[str]) -> list[str]:
+    """Return the shortest end of each path that distinguishes it from the others: two `bag` get their folders."""
     parts = [Path(path).parts or (path,) for path in paths]
     names = []
     for mine in parts:
@@ -41,7 +41,7 @@ def told_apart(paths: Sequence[str]) -> list[str]:
 
 
 def expanded(path: Path | str) -> Path:
-    """Return a path with a `~` at its beginning replaced by the home that it stands for.
+    """Return a path with a `~` at its beginning replaced by the home folder.
 
     Raises
     ------
@@ -55,12 +55,12 @@ def expanded(path: Path | str) -> Path:
 
 
 def unwritable(folder: Path | str) -> str:
-    """Return why nothing can be written in a folder, which need not exist yet; empty if it seems possible."""
+    """Return the reason why a folder, which need not exist yet, cannot be written; '' if it seems possible."""
     try:
         path = expanded(folder).absolute()
     except OutputError as error:
         return str(error)
-    # Path.exists raises where a parent may not be searched
+    # Path.exists raises if a parent cannot be searched
     there = next(parent for parent in (path, *path.parents) if os.access(parent, os.F_OK))
     if not there.is_dir():
         return f'{readable(there)} is not a folder'
@@ -74,7 +74,7 @@ def output_errors(path: Path) -> Iterator[None]:
     Raises
     ------
     OutputError
-        In place of every `OSError` of the block.
+        Instead of every `OSError` of the block.
     """
     try:
         yield
@@ -84,16 +84,16 @@ def output_errors(path: Path) -> Iterator[None]:
 
 @contextmanager
 def output_folder(path: Path | str) -> Iterator[Path]:
-    """Give a temporary folder to write into, which takes the name `path` when the block succeeds.
+    """Yield a temporary folder to write into, which is renamed to `path` when the block succeeds.
 
-    Nothing appears under the final name before, and the temporary folder is removed if the block fails. Missing
+    Before that, nothing exists under the final name, and the temporary folder is removed if the block fails. Missing
     parents are made. An empty folder that exists already is filled, not replaced: it may be a mount point or the
     shell's working directory.
 
     Parameters
     ----------
     path : Path or str
-        The folder to make; it must not exist or be empty.
+        The folder to make; it must not exist, or must be empty.
 
     Yields
     ------
@@ -103,9 +103,9 @@ def output_folder(path: Path | str) -> Iterator[Path]:
     Raises
     ------
     OutputError
-        If the folder has something in it, cannot be made, or the disk is full.
+        If the folder is not empty, cannot be made, or the disk is full.
     """
-    final = Path(os.path.abspath(path))  # noqa: PTH100 (a link must stay a link, so no resolve)
+    final = Path(os.path.abspath(path))  # noqa: PTH100 (links are kept, so no resolve)
     with output_errors(final):
         exists = _is_empty_folder(final)
         made = [] if exists else _make_parents(final.parent)
@@ -127,7 +127,7 @@ def output_folder(path: Path | str) -> Iterator[Path]:
                 staging.rename(final)
         done = True
     except OutputError as error:
-        # the temporary name means nothing to anybody
+        # users do not know the temporary name
         raise OutputError(str(error).replace(str(staging), str(final))) from error
     except OSError as error:
         if error.errno in _WRITE_ONLY:
@@ -155,7 +155,7 @@ def free_name(parent: Path | str, stem: str) -> Path:
 
 
 def _is_empty_folder(path: Path) -> bool:
-    """Return True for an empty folder, False for a free name; refuse everything else."""
+    """Return True for an empty folder, False for an unused name; raise otherwise."""
     if not os.path.lexists(path):
         return False
     if not path.is_dir():
@@ -191,7 +191,7 @@ def _output_error(path: Path, error: OSError) -> OutputError:
     if error.errno == errno.ENOTDIR:
         return OutputError(f'{path}: a part of this path is a file, not a folder; choose another folder')
     if error.errno in (errno.ENOTEMPTY, errno.EEXIST):
-        # another run took the name while this one worked
+        # another run used the name meanwhile
         return OutputError(f'{path} has been created meanwhile, perhaps by another run; choose another folder')
     if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
         return OutputError(f'{path}: no permission to write there; choose another folder')
@@ -199,11 +199,11 @@ def _output_error(path: Path, error: OSError) -> OutputError:
 
 
 def _as_asked_for(path: Path) -> Path:
-    """Return a path with the temporary folders of `output_folder` replaced by what they stand for."""
+    """Return a path with temporary folders of `output_folder` replaced by their final names."""
     parts: list[str] = []
     for part in path.parts:
         if match := _STAGING.fullmatch(part):
-            # a nested one stands for the folder that it lies in
+            # a nested one has the same final name as its parent
             if not (parts and parts[-1] == match['name']) and not _STAGING.fullmatch(match['name']):
                 parts.append(match['name'])
         else:

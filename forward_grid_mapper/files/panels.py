@@ -1,4 +1,4 @@
-"""What is drawn: panels of a picture, and tiles of a figure."""
+"""Contents of pictures and figures: panels and tiles."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ Box = tuple[float, float, float, float]
 
 UNKNOWN_COLOUR, PATH = '#cfd9e4', '#0072b2'
 DRIVES = (PATH, '#009e73', '#e69f00', '#7b3294', '#56b4e9', '#8c510a', '#666666', '#1b5e20')
-"""Colours of the paths of several drives, the first one that of a single drive; those of chart.js."""
+"""Colours of the paths of several drives; the first is that of a single drive; the same as in chart.js."""
 
 
 class Tile(NamedTuple):
-    """One map of the table: `values` are probabilities, or cells 0 and 1, with NaN or -1 where unknown.
+    """One map of a table: `values` are probabilities, or cells 0 and 1, with NaN or -1 where unknown.
 
     The cones of `readings` are drawn over it, and the cells that are True in `marked` in the colour of dots. `path_xy`
-    and `odometry_xy` are ways of a robot, float64 of shape (P, 2) in metres: a line, and a dashed one.
+    and `odometry_xy` are paths of a robot, float64 of shape (P, 2) in metres: a line, and a dashed one.
     """
 
     title: str
@@ -43,9 +43,9 @@ class Curve(NamedTuple):
 
 
 def coarse(values: NDArray[Any], step: int) -> NDArray[np.float32]:
-    """Return a map in blocks of `step` cells, each with the largest of its values; NaN where all of them are.
+    """Return a map in blocks of `step` cells, each with the largest of its values; NaN if all are NaN.
 
-    Walls one cell thick stay, and do not fall between the pixels of a picture. Rows and columns are filled up with NaN.
+    So walls one cell thick are not lost between the pixels of a picture. Rows and columns are padded with NaN.
     """
     pad = [(0, -n % step) for n in values.shape]
     part = np.pad(np.asarray(values, np.float32), pad, constant_values=np.nan)
@@ -62,10 +62,10 @@ class Panel(NamedTuple):
 
 
 class Picture(NamedTuple):
-    """What is drawn. `view` is the box shown; points are in metres; `overlay` is the panel that bears them.
+    """Contents of a picture. `view` is the box shown; points are in metres, and are drawn on the panel `overlay`.
 
-    `path_xy` is separated by rows of NaN where there are several drives, whose names are `drives`. `odometry_xy` is the
-    path that odometry gives, where it is another one than `path_xy`.
+    `path_xy` of several drives, whose names are `drives`, is separated by rows of NaN. `odometry_xy` is the path of
+    odometry, if it differs from `path_xy`.
     """
 
     title: str
@@ -80,6 +80,6 @@ class Picture(NamedTuple):
 
 
 def paths_of(xy: NDArray[np.float64]) -> list[NDArray[np.float64]]:
-    """Return the paths that rows of NaN part, one for each drive; one may be empty."""
+    """Return the paths that are separated by rows of NaN, one for each drive; paths may be empty."""
     parts = np.split(xy, np.flatnonzero(~np.isfinite(xy).all(axis=1)))
     return [part[np.isfinite(part).all(axis=1)] for part in parts]

@@ -1,4 +1,4 @@
-"""Reading parameters: a ROS 2 parameter file, a flat YAML, or `name=value` on a command line."""
+"""Reads parameters: a ROS 2 parameter file, a flat YAML, or `name=value` on a command line."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from .small_text import read_text
 NODE_NAME = 'forward_grid_mapper'
 
 LIKE = 0.85
-"""Likeness (`difflib`) from which on the name of a section is taken for a misspelt `NODE_NAME`."""
+"""Similarity (`difflib`) from which the name of a section is regarded as a misspelt `NODE_NAME`."""
 
 # Parameters that ROS itself declares on every node.
 _ROS_OWN = re.compile(r'use_sim_time|start_type_description_service|qos_overrides\..+')
@@ -30,7 +30,7 @@ _MOUNT = re.compile(r'sensors\.(?P<frame>.+)\.pose')
 
 
 class ParameterFile(NamedTuple):
-    """What a parameter file holds.
+    """Contents of a parameter file.
 
     Attributes
     ----------
@@ -39,7 +39,7 @@ class ParameterFile(NamedTuple):
     extrinsics : dict
         Pose of each sensor in the robot's base frame, by `frame_id`.
     node : dict
-        Values of the parameters that ROS itself gives every node, unchecked.
+        Values of the parameters that ROS itself declares for every node, unchecked.
     """
 
     values: dict[str, Any]
@@ -50,15 +50,15 @@ class ParameterFile(NamedTuple):
 def load_parameters(path: Path | str) -> ParameterFile:
     """Read a ROS 2 parameter YAML, or a flat mapping of names to values.
 
-    Names may be nested or dotted. In a ROS file the sections `/**` and `forward_grid_mapper` (in one namespace) count,
-    the latter first; a section of another name counts if it is the only one, as for a node that was renamed, with a
-    warning in the log; one whose name looks misspelt does not.
+    Names may be nested or dotted. In a ROS file the sections `/**` and `forward_grid_mapper` (in one namespace) are
+    used, and the latter takes precedence; a section of another name is used, with a warning in the log, if it is the
+    only one, as for a renamed node, unless its name looks misspelt.
 
     Raises
     ------
     ParameterError
-        Naming the file, if it cannot be read, or holds an unknown or repeated name or a bad value, values outside of
-        its sections, or sections of `forward_grid_mapper` in several namespaces.
+        Naming the file, if it cannot be read, or contains an unknown or repeated name, an invalid value, values outside
+        of its sections, or sections of `forward_grid_mapper` in several namespaces.
     """
     path = Path(path)
     try:
@@ -77,7 +77,7 @@ def load_parameters(path: Path | str) -> ParameterFile:
         raise ParameterError(f'{path}: {error}') from error
     except RecursionError as error:
         raise ParameterError(f'{path} is not valid YAML: it is nested too deeply') from error
-    except Exception as error:  # besides its own, yaml lets errors of int(), date() and others through
+    except Exception as error:  # besides its own, yaml raises errors of int(), date() and others
         raise ParameterError(f'{path} is not valid YAML: {error}') from error
 
 
@@ -89,7 +89,7 @@ def parse_setting(text: str) -> tuple[str, Any]:
     Raises
     ------
     ParameterError
-        If the text has another form, the name is unknown or the value not admitted.
+        If the text has another form, the name is unknown or the value is not valid.
     """
     name, equals, value = (part.strip() for part in text.partition('='))
     if not equals or not name:
@@ -106,7 +106,7 @@ def parse_sensor(text: str) -> tuple[str, Pose2]:
     Raises
     ------
     ParameterError
-        If the text has another form or a number is not finite, or can only be of another unit.
+        If the text has another form, a number is not finite, or a value can only have another unit.
     """
     frame, _, numbers = (part.strip() for part in text.rpartition('='))
     parts = numbers.split(',')
@@ -129,7 +129,7 @@ def parse_sensor(text: str) -> tuple[str, Pose2]:
 class _Loader(yaml.SafeLoader):
     """A safe loader that refuses repeated keys and reads `1e-4` as a number, as ROS does.
 
-    It refuses aliases too, as ROS does: a few lines of them can stand for more values than memory holds.
+    It refuses aliases too, as ROS does: a few lines of them can expand to more values than fit into memory.
     """
 
     def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
@@ -195,7 +195,7 @@ def _ros_sections(document: dict[Any, Any], prefix: str) -> Iterator[tuple[str, 
 
 
 def _outside(document: dict[Any, Any], prefix: str = '') -> Iterator[str]:
-    """Yield the names of values that are in no section of a ROS file."""
+    """Yield the names of values outside of all sections of a ROS file."""
     for key, value in document.items():
         name = f'{prefix}{key}'
         if not isinstance(value, dict):
@@ -222,7 +222,7 @@ def _flatten(section: Any, prefix: str = '') -> Iterator[tuple[str, Any]]:
 
 
 def _merge(flat: dict[str, Any], section: dict[str, Any]) -> None:
-    """Add what a section has, which wins; a slash before a frame makes no other sensor of it."""
+    """Add a section, which takes precedence; frames with and without a leading slash are the same."""
     frames: dict[str, str] = {}
     for name in section:
         if (mount := _MOUNT.fullmatch(name)) and (twin := frames.setdefault(_frame_of(mount), name)) != name:
@@ -256,7 +256,7 @@ def _sort_out(flat: dict[str, Any]) -> ParameterFile:
 
 
 def _typed(row: Parameter, text: str) -> Any:
-    """Return `text` as the row's type, or as it is where that fails, for the row's own check to refuse."""
+    """Return `text` as the row's type, or unchanged if this fails, so that the row's own check refuses it."""
     if row.type is bool:
         return {'true': True, 'false': False}.get(text.lower(), text)
     if row.type is tuple:

@@ -1,4 +1,4 @@
-"""Writing parameters: the commented YAML that ROS 2 loads, and the reference page."""
+"""Writes parameters: the commented YAML that ROS 2 loads, and the reference page."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _WIDTH = 100
 _INDENT = '    '
 
 BOUNDS_RANGE = 5.0
-"""Metres: the largest range for which the reference page states what one reading can say, that of a usual sonar."""
+"""Range for which the reference page states the bounds of a reading, metres: the largest of a usual sonar."""
 
 
 def dump_parameters(parameters: Parameters) -> str:
@@ -71,7 +71,7 @@ def _constants_markdown() -> list[str]:
 
 
 def _bounds_markdown(parameters: Parameters) -> list[str]:
-    """Return what one reading can say at most, as the model has it."""
+    """Return the bounds of the evidence of one reading in the model."""
     resolution = parameters.grid.resolution
     bounds = reading_bounds(parameters.model, resolution, BOUNDS_RANGE)
     return [

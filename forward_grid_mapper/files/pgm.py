@@ -27,7 +27,7 @@ def write_pgm(path: Path, pixels: NDArray[np.uint8]) -> None:
     Raises
     ------
     OutputError
-        If it cannot be written.
+        If the file cannot be written.
     """
     height, width = pixels.shape
     with output_errors(path), path.open('wb') as file:

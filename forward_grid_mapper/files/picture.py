@@ -16,7 +16,7 @@ from ..core.maps.map_set import MapSet
 from .output_folder import output_errors
 from .panels import Box, Panel, Picture, coarse
 
-# More cells than that along a side cannot be distinguished in the picture.
+# More cells along a side cannot be distinguished in the picture.
 _MAX_SIDE = 2400
 _MARGIN = 0.03
 
@@ -32,28 +32,28 @@ def write_picture(
     odometry_xy: NDArray[np.float64] = NOWHERE,
     drives: Sequence[str] = (),
 ) -> None:
-    """Draw the maps into an image file (`.png`, or what else matplotlib knows).
+    """Draw the maps into an image file (`.png`, or another format of matplotlib).
 
     Parameters
     ----------
     path : Path or str
     maps : MapSet
     path_xy : float64, shape (P, 2)
-        Where the robot was, in order, metres; may be empty. A row of NaN parts two drives.
+        Path of the robot, in order, metres; may be empty. Drives are separated by rows of NaN.
     title : str
     reference : (Grid, int8 array), optional
-        The true map, −1 unknown, 0 free, 1 occupied, drawn as one more panel.
+        The true map, −1 unknown, 0 free, 1 occupied, drawn as a further panel.
     odometry_xy : float64, shape (Q, 2)
-        The path that odometry gives, metres, where the robot was elsewhere.
+        Path of odometry, metres, if it differs.
     drives : sequence of str
-        What the drives are called, where there are several.
+        Names of the drives, if there are several.
 
     Raises
     ------
     OutputError
         If matplotlib is not installed, or the file cannot be written.
     """
-    # what the picture shows costs little beside drawing it
+    # compared with drawing, the choice of the contents takes little time
     path_xy = np.asarray(path_xy, np.float64).reshape(-1, 2)
     _draw(Path(path), compose(maps, path_xy, title, reference, odometry_xy, drives))
 
@@ -68,7 +68,7 @@ def write_overview(
     log_likelihood: float,
     drives: Sequence[str] = (),
 ) -> None:
-    """Draw maps that are too large for their cells to be seen, or whose readings nobody holds.
+    """Draw maps whose cells are too small to be seen, or whose readings are not in memory.
 
     Parameters
     ----------
@@ -80,7 +80,7 @@ def write_overview(
     path_xy, title
         As in `write_picture`.
     readings : int
-        How many the maps were made from.
+        Number of readings of the maps.
     log_likelihood : float
     drives : sequence of str
         As in `write_picture`.
@@ -119,7 +119,7 @@ def compose(
     odometry_xy: NDArray[np.float64] = NOWHERE,
     drives: Sequence[str] = (),
 ) -> Picture:
-    """Choose what the picture shows; the parameters are those of `write_picture`."""
+    """Choose the contents of the picture; the parameters are those of `write_picture`."""
     alpha = maps.parameters.search.alpha
     named: list[tuple[str, Grid, NDArray[Any]]] = [
         ('Standard map', maps.grid, maps.live),
@@ -128,7 +128,7 @@ def compose(
     ]
     if reference is not None:
         named.append(('Reference', reference[0], _probability(reference[1])))
-    # odometry may lead far away from the map, which would be drawn small
+    # the path of odometry may leave the map far behind, which would then be small
     view = view_of(maps, path_xy)
     panels = [Panel(name, *_crop(grid, values, view)) for name, grid, values in named]
     odd = _unexplained_ends(maps)
@@ -140,12 +140,12 @@ def _probability(cells: NDArray[np.int8]) -> NDArray[np.float32]:
 
 
 def figures_of(maps: MapSet) -> str:
-    """Return the line of figures below the title."""
+    """Return the line of numbers below the title."""
     return figures_text(len(maps.readings), maps.grid.resolution, maps.log_likelihood)
 
 
 def figures_text(readings: int, resolution: float, log_likelihood: float) -> str:
-    """Return the line of figures below the title."""
+    """Return the line of numbers below the title."""
     parts = [counted(readings, 'reading', ','), f'{100 * resolution:g} cm cells']
     if np.isfinite(log_likelihood):
         total, mean = (f'{v:,.2f}'.replace('-', '−') for v in (log_likelihood, log_likelihood / max(1, readings)))
@@ -171,7 +171,7 @@ def view_of(maps: MapSet, path_xy: NDArray[np.float64]) -> Box:
 
 
 def _crop(grid: Grid, values: NDArray[Any], view: Box) -> tuple[NDArray[np.float32], Box]:
-    """Return the part of a map that is in view, coarse enough to be drawn, and its extent."""
+    """Return the part of a map in the view, reduced to a size that can be drawn, and its extent."""
     left, right, bottom, top = (np.array(v) for v in view)
     (row0, row1), (column0, column1) = grid.cells_of(np.stack([left, right]), np.stack([bottom, top]))
     row0, row1 = np.clip((row0, row1 + 1), 0, grid.height)
@@ -186,6 +186,6 @@ def _crop(grid: Grid, values: NDArray[Any], view: Box) -> tuple[NDArray[np.float
 
 
 def _unexplained_ends(maps: MapSet) -> NDArray[np.float64]:
-    """Return where the axes of the readings that the maximum likelihood map leaves unexplained end, shape (U, 2)."""
+    """Return the ends of the axes of the readings that the maximum likelihood map does not explain, shape (U, 2)."""
     odd = maps.readings.select(maps.unexplained)
     return np.stack([odd.x + odd.z * np.cos(odd.yaw), odd.y + odd.z * np.sin(odd.yaw)], axis=1)

@@ -1,6 +1,6 @@
 """Probability maps for image viewers (PNG): white where free, black where occupied, a cool tint where not observed.
 
-The PGM of a map in mode raw has occupancy in percent, of 255 steps, so that viewers show it nearly black.
+The PGM of a map in mode raw contains occupancy in percent, of 255 levels, so that viewers show it nearly black.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ STEPS, UNKNOWN_INDEX = 254, 255
 
 
 def write_png(path: Path, probability: NDArray[np.float32]) -> None:
-    """Write a map as an image of one pixel a cell, with a palette.
+    """Write a map as an image with one pixel for each cell, with a palette.
 
     Parameters
     ----------
@@ -30,7 +30,7 @@ def write_png(path: Path, probability: NDArray[np.float32]) -> None:
     Raises
     ------
     OutputError
-        If it cannot be written.
+        If the file cannot be written.
     """
     height, width = probability.shape
     steps = np.rint(np.nan_to_num(probability) * STEPS)

@@ -28,17 +28,17 @@ NAMES = {
     'qz': (('qz', 'q_z', 'orientation_z'), 1.0),
     'qw': (('qw', 'q_w', 'orientation_w'), 1.0),
 }
-"""What columns may be called, whatever the case, and by what they are multiplied."""
+"""Accepted names of columns, in any case, and the factor of their values."""
 
 QUATERNION = ('qx', 'qy', 'qz', 'qw')
 MOST_YAW = 100.0
-"""Radians; more is not the yaw of a robot that turned a dozen times, but degrees."""
+"""Largest yaw, radians; a larger one must be in degrees, since no robot turns that often."""
 
 _TUM_COLUMNS = 8
 
 
 def poses_from_tum(path: Path | str) -> Poses:
-    """Read a trajectory in the format of the TUM benchmark, as evo and most SLAM tools write it.
+    """Read a trajectory in the format of the TUM benchmark, which evo and most SLAM tools write.
 
     Returns
     -------
@@ -50,7 +50,7 @@ def poses_from_tum(path: Path | str) -> Poses:
     Raises
     ------
     InputError
-        If a line has not the eight numbers `stamp x y z qx qy qz qw`, or no orientation of a robot on a floor.
+        If a line does not have the eight numbers `stamp x y z qx qy qz qw`, or the orientation of a robot on a floor.
     """
     stamps, poses = [], []
     for number, line in enumerate(_lines(path), 1):
@@ -68,8 +68,8 @@ def poses_from_tum(path: Path | str) -> Poses:
 def poses_from_csv(path: Path | str) -> Poses:
     """Read poses from a CSV file whose first line names its columns, separated by commas or semicolons.
 
-    Wanted are a stamp in seconds (`stamp`, or `stamp_ns` in nanoseconds), `x`, `y`, and `yaw` in radians (`yaw_deg` in
-    degrees) or `qx`, `qy`, `qz`, `qw`; `NAMES` has what else they may be called. Other columns are left alone.
+    Required are a stamp in seconds (`stamp`, or `stamp_ns` in nanoseconds), `x`, `y`, and `yaw` in radians (`yaw_deg`
+    in degrees) or `qx`, `qy`, `qz`, `qw`; `NAMES` contains further accepted names. Other columns are ignored.
 
     Returns
     -------
@@ -81,8 +81,7 @@ def poses_from_csv(path: Path | str) -> Poses:
     Raises
     ------
     InputError
-        If it is no CSV, a column is missing, or a line has something else than finite numbers in the columns that are
-        wanted.
+        If it is not CSV, a column is missing, or a required column has something else than finite numbers.
     """
     lines = _lines(path)
     start = next((k for k, line in enumerate(lines) if line.strip()), None)
@@ -116,7 +115,7 @@ def poses_from_csv(path: Path | str) -> Poses:
 
 
 def _columns(path: Path | str, header: Sequence[str]) -> dict[str, int]:
-    """Return which column has what."""
+    """Return the index of each required column."""
     found = {}
     for name, (words, _) in NAMES.items():
         which = [k for k, word in enumerate(header) if word in words]
@@ -144,7 +143,7 @@ def _lines(path: Path | str) -> list[str]:
 
 
 def _numbers(words: Sequence[str]) -> list[float]:
-    """Return words as numbers; none at all if one is no number."""
+    """Return words as numbers; an empty list if one is not a number."""
     try:
         return [float(word) for word in words]
     except ValueError:

@@ -1,4 +1,4 @@
-"""What users are warned of: input that is wrong without an error, and readings that do not fit the map."""
+"""Warnings to users: input that is wrong without an error, and readings that do not fit the map."""
 
 from __future__ import annotations
 
@@ -17,53 +17,53 @@ from ..core.maps.map_set import MapSet
 from ..core.messages.message_types import Pose2
 
 TOO_MANY = 0.5
-"""Fraction of unexplained readings above which a warning is due."""
+"""Fraction of unexplained readings above which there is a warning."""
 
 NOT_CONVERGED = 'the search ended at max_iterations before it converged; raise max_iterations'
 
 ENOUGH = 20
-"""Readings below which nothing can be said."""
+"""Fewest readings for a judgement."""
 
 
 def data_warnings(maps: MapSet, source: Mapping[str, Any]) -> list[str]:
-    """Return all that is wrong with the readings of a map, each with its remedy.
+    """Return all faults of the readings of a map, each with its remedy.
 
     Parameters
     ----------
     maps : MapSet
     source : mapping
-        Of which `extrinsics` counts, the poses of the sensors that are fixed to the robot by `frame_id`, and of several
-        drives `drives`, a list of such mappings with `bag`, the name of the drive.
+        Of which `extrinsics` is used, the poses of the sensors that are fixed to the robot by `frame_id`, and for
+        several drives `drives`, a list of such mappings with `bag`, the name of the drive.
     """
     names = [str(drive['bag']) for drive in source.get('drives') or ()]
     return [
         *reading_warnings(maps.readings, source, maps.parameters),
-        # a drive that fits nowhere contradicts the others everywhere
+        # a drive that does not fit contradicts the others everywhere
         *(fit_warnings(maps, names) or change_warnings(maps, names)),
         *filter(None, [quality_warning(maps)]),
     ]
 
 
 def reading_warnings(readings: Readings, source: Mapping[str, Any], parameters: Parameters) -> list[str]:
-    """Return what is wrong with readings whatever their map; `source` is as in `data_warnings`."""
+    """Return faults of readings that do not depend on their map; `source` is as in `data_warnings`."""
     drives = source.get('drives')
     if not drives:
         return list(_of_one(readings, source.get('extrinsics') or {}, parameters))
-    told = []
+    warnings = []
     for mine in drives_of(readings):
         drive = drives[int(mine.drive[0])]
-        told += [f'{drive["bag"]}: {text}' for text in _of_one(mine, drive.get('extrinsics') or {}, parameters)]
-    return told
+        warnings += [f'{drive["bag"]}: {text}' for text in _of_one(mine, drive.get('extrinsics') or {}, parameters)]
+    return warnings
 
 
 def _of_one(readings: Readings, extrinsics: Mapping[str, Pose2], parameters: Parameters) -> Iterator[str]:
-    yield from deaf(readings)
+    yield from without_echoes(readings)
     yield from input_warnings(readings)
     yield from consistency_warnings(readings, extrinsics, parameters)
 
 
-def deaf(readings: Readings) -> Iterator[str]:
-    """Yield a warning where no sensor hears anything; where only one does not, its health tells."""
+def without_echoes(readings: Readings) -> Iterator[str]:
+    """Yield a warning if no sensor measures echoes; if only some do not, their health shows it."""
     if len(readings) >= ENOUGH and not readings.echo.any():
         yield (
             f'none of {len(readings)} readings has an echo: do the sensors work, is max_range that of their data '
@@ -72,7 +72,7 @@ def deaf(readings: Readings) -> Iterator[str]:
 
 
 def quality_warning(maps: MapSet) -> str:
-    """Return why the maps should not be trusted; empty if nothing speaks against them."""
+    """Return the reason why the maps should not be trusted; '' if there is none."""
     count, unexplained = len(maps.readings), int(np.count_nonzero(maps.unexplained))
     if count < ENOUGH or unexplained <= TOO_MANY * count:
         return ''
@@ -83,7 +83,7 @@ def quality_warning(maps: MapSet) -> str:
 
 
 def thinned(used: int, accepted: int) -> str:
-    """Return a note where `max_readings` let EM have only `used` of the readings; empty otherwise."""
+    """Return a note if EM used only `used` of the readings because of `max_readings`; otherwise ''."""
     if used >= accepted:
         return ''
     return (

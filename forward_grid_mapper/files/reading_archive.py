@@ -1,4 +1,4 @@
-"""`readings.npz`: the readings that maps were made from, so that a map can be asked for its reasons."""
+"""`readings.npz`: the readings of the maps, so that `explain` can show the evidence for a cell."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ COLUMNS = tuple(field.name for field in fields(Readings) if field.name != 'senso
 
 
 class ReadingArchive(NamedTuple):
-    """What `readings.npz` holds."""
+    """Contents of `readings.npz`."""
 
     readings: Readings
     normals: SurfaceNormals
@@ -29,8 +29,9 @@ class ReadingArchive(NamedTuple):
 def write_readings(path: Path | str, maps: MapSet) -> None:
     """Write the readings and the surface normals of a map as compressed arrays, none of them pickled.
 
-    The names are those of `Readings`: metres, radians, nanoseconds, in the map frame; `sensor_names` is what `sensor`
-    counts. `normals` is float32, shape (2, height, width): unit vectors along the normals, 0 where none is known.
+    The names are those of `Readings`: metres, radians, nanoseconds, in the map frame; `sensor` is an index into
+    `sensor_names`. `normals` is float32, shape (2, height, width): unit vectors along the normals, 0 where none is
+    known.
 
     Raises
     ------
@@ -53,16 +54,16 @@ def write_readings(path: Path | str, maps: MapSet) -> None:
 
 
 def read_readings(path: Path | str, maps: MapArchive) -> ReadingArchive:
-    """Read what `write_readings` wrote beside these maps.
+    """Read a file of `write_readings` that belongs to these maps.
 
     Raises
     ------
     InputError
-        If the file is missing, damaged, something else or of other maps.
+        If the file is missing, damaged, of another kind or belongs to other maps.
     """
     path = Path(path)
     if path.exists() and not path.is_file():
-        # a pipe would be waited for
+        # reading a pipe would wait
         raise InputError(f'{path} is not a file')
     try:
         with path.open('rb') as file, np.load(file, allow_pickle=False) as data:

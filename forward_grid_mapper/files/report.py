@@ -1,4 +1,4 @@
-"""The report of a mapping run: what was read and rejected, what came out, and how long it took."""
+"""The report of a mapping run: readings used and rejected, results, and durations."""
 
 from __future__ import annotations
 
@@ -24,22 +24,22 @@ __all__ = ['json_text', 'report_data', 'report_text', 'write_report']
 
 
 def report_data(maps: MapSet, source: Mapping[str, Any]) -> dict[str, Any]:
-    """Return everything worth knowing about a run, ready for JSON.
+    """Return all data of the report of a run, for JSON.
 
     Parameters
     ----------
     maps : MapSet
     source : mapping
-        Where the readings came from. All keys are optional: `bag`, `range_topics`, `odom_topic`, `odom_frame`,
-        `map_frame`, `mounts_from`, `extrinsics` (poses of the sensors on the robot, by frame), `stamps` (first and
-        last, nanoseconds), `duration_s`, `path_m`, `counts` (`received`, `accepted`, `rejected` by reason), `sensors`
-        (by frame: `accepted`, `no_echo`, `unexplained`), `warnings`; of several drives `drives`, a list of such
-        mappings. Others are kept as they are under `input`.
+        Origin of the readings. All keys are optional: `bag`, `range_topics`, `odom_topic`, `odom_frame`, `map_frame`,
+        `mounts_from`, `extrinsics` (poses of the sensors on the robot, by frame), `stamps` (first and last,
+        nanoseconds), `duration_s`, `path_m`, `counts` (`received`, `accepted`, `rejected` by reason), `sensors` (by
+        frame: `accepted`, `no_echo`, `unexplained`), `warnings`; for several drives `drives`, a list of such mappings.
+        Other keys are copied to `input`.
 
     Returns
     -------
     dict
-        Of plain Python values; a number that is not finite is None.
+        Of plain Python values; numbers that are not finite are None.
     """
     rest = dict(source)
     counts = dict(rest.pop('counts', None) or {})
@@ -96,7 +96,7 @@ def write_report(folder: Path | str, data: dict[str, Any]) -> None:
 
 
 def _sensors(maps: MapSet, which: NDArray[np.bool_] | None = None) -> dict[str, dict[str, Any]]:
-    """Return the counts of each sensor, of all readings or of those that `which` marks."""
+    """Return the counts of each sensor, of all readings or of those that `which` selects."""
     readings, size = maps.readings, len(maps.readings.sensor_names)
     marked = np.ones(len(readings), np.bool_) if which is None else which
     masks = {'accepted': marked, 'no_echo': marked & ~readings.echo, 'unexplained': marked & maps.unexplained}
@@ -105,7 +105,7 @@ def _sensors(maps: MapSet, which: NDArray[np.bool_] | None = None) -> dict[str, 
 
 
 def _drives(maps: MapSet, drives: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Return what is known of each drive, with the counts of its sensors."""
+    """Return the data of each drive, with the counts of its sensors."""
     rows = []
     for number, drive in enumerate(drives):
         sensors = _sensors(maps, maps.readings.drive == number)
@@ -128,7 +128,7 @@ def _map(maps: MapSet) -> dict[str, Any]:
 
 
 def json_text(data: Mapping[str, Any], ascii: bool = False) -> str:
-    """Return data as lines of JSON, whatever numpy types are in it; a number that is not finite is null.
+    """Return data, which may contain numpy types, as lines of JSON; numbers that are not finite are null.
 
     With `ascii` all other characters are escaped.
     """
@@ -136,7 +136,7 @@ def json_text(data: Mapping[str, Any], ascii: bool = False) -> str:
 
 
 def plain(value: Any) -> Any:
-    """Return `value` of Python's own types, as JSON knows them."""
+    """Return `value` converted to Python's own types, for JSON."""
     if isinstance(value, Mapping):
         return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, (np.ndarray, np.generic)):

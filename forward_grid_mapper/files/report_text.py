@@ -1,4 +1,4 @@
-"""The report as a page of text that says at a glance whether the run was good."""
+"""The report as text, which shows at a glance whether the run was good."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from ..core.common.words import counted
 _LABEL = 14
 _WIDTH = 100
 _SHOWN = 6
-# the part of random readings beyond what recordings with good poses have
+# fraction of random readings that recordings with good poses do not have
 _MANY = 0.2
 
 
 def report_text(data: dict[str, Any]) -> str:
-    """Return the text of a report made by `report_data`; what is absent is left out."""
+    """Return the text of a report from `report_data`; absent values are left out."""
     sections = (_warnings, _input, _trajectory, _counts, _drives, _sensors, _map, _result, _seconds, _parameters)
     title = f'Sonar maps by forward_grid_mapper {data.get("version") or ""}'.rstrip()
     parts = [f'{title}\n{"=" * len(title)}']
@@ -69,13 +69,13 @@ def _trajectory(data: dict[str, Any]) -> Iterator[str]:
     found = (data.get('input') or {}).get('trajectory')
     if not found:
         return
-    yield from _line('Trajectory', _became(found))
+    yield from _line('Trajectory', _description(found))
     if words := _wheels(found):
         yield from _line('Wheels', words)
 
 
-def _became(found: dict[str, Any]) -> str:
-    """Return what became of a trajectory."""
+def _description(found: dict[str, Any]) -> str:
+    """Return a description of a trajectory."""
     calibrated = f', with the calibration of {found["calibrated"]}' if found.get('calibrated') else ''
     if not found.get('refined'):
         reason = f', not refined: {found.get("reason")}' if found.get('reason') else ''
@@ -116,7 +116,7 @@ def _counts(data: dict[str, Any]) -> Iterator[str]:
 
 
 def _frames(counts: dict[str, int]) -> str:
-    """Return the frames with most readings, and how many each has; sensors that fail alike are many."""
+    """Return the frames with most readings, and their numbers; sensors with the same fault may be many."""
     if not counts:
         return ''
     order = sorted(counts, key=lambda name: (-counts[name], name))
@@ -136,19 +136,19 @@ def _drives(data: dict[str, Any]) -> Iterator[str]:
         cells = f'{_number(counts.get("received")):>12}{_number(counts.get("accepted")):>12}{used:>12,}'
         length, duration = drive.get('path_m') or 0.0, drive.get('duration_s') or 0.0
         yield f'{"":<12}{cells}{_share(drive.get("unexplained"), used):>9}{length:>8.1f} m{duration:>8.1f} s'
-        told = [_each(sensors)]
+        lines = [_each(sensors)]
         if found := drive.get('trajectory'):
             file = found.get('file')
-            told.append(f'trajectory {_became(found)}' + (f' ({file})' if file else ''))
-            told += [f'wheels: {words}' for words in [_wheels(found)] if words]
-        for text in told:
+            lines.append(f'trajectory {_description(found)}' + (f' ({file})' if file else ''))
+            lines += [f'wheels: {words}' for words in [_wheels(found)] if words]
+        for text in lines:
             yield from textwrap.wrap(
                 text, _WIDTH, initial_indent='    ', subsequent_indent='    ', break_on_hyphens=False
             )
 
 
 def _each(sensors: dict[str, Any]) -> str:
-    """Return how many readings of each sensor are used."""
+    """Return the number of readings used of each sensor."""
     counts = {name: row['accepted'] for name, row in sorted(sensors.items())}
     least, most = min(counts.values(), default=0), max(counts.values(), default=0)
     if least == most and len(counts) > 1:
@@ -166,7 +166,7 @@ def _sensors(data: dict[str, Any]) -> Iterator[str]:
     for name, row in sorted(sensors.items()):
         total, health = row.get('accepted'), row.get('health') or {}
         shares = [_share(row.get(key), total) for key in ('no_echo', 'unexplained')]
-        # a sensor without readings has no fraction of them
+        # without readings there is no fraction
         shares.append(_share(health.get('short'), 1))
         cells = ''.join(f'{cell:>10}' for cell in (_number(total), *shares))
         yield f'  {name:<{width - 2}}{cells}  {health.get("verdict", "")}'.rstrip()
@@ -257,7 +257,7 @@ def _share(part: Any, whole: Any) -> str:
 
 
 def _date(stamps: Any) -> str:
-    """Return the first stamp as a date; nothing for simulated time, which starts at zero."""
+    """Return the first stamp as a date; '' for simulated time, which starts at zero."""
     first = stamps[0] if isinstance(stamps, list) and stamps else stamps
     if not isinstance(first, int) or first < 10**17:
         return ''

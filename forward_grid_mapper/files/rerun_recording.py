@@ -1,6 +1,6 @@
-"""`drive.rrd`: the drive for the viewer Rerun, which plays it: the standard map as it grows, the cones, the readings.
+"""`drive.rrd`: the drive for the viewer Rerun: the standard map as it grows, the cones, and the readings.
 
-Rerun opens it without a network, an account or ROS. The package rerun-sdk is imported only here, and only where such a
+Rerun opens it without a network, an account or ROS. The package rerun-sdk is imported only here, and only if such a
 file is wanted.
 """
 
@@ -27,55 +27,55 @@ from .picture import NOWHERE, view_of
 NAME = 'drive.rrd'
 
 MOST_MOMENTS = 40
-"""Standard maps in a file."""
+"""Most standard maps in a file."""
 
 MOST_CELLS = 40_000_000
-"""Cells of all standard maps together, a byte each before they are compressed; larger maps have fewer moments."""
+"""Most cells of all standard maps together, a byte each before compression; for larger maps there are fewer maps."""
 
 MOST_READINGS = 100_000
-"""Readings in a file, evenly taken from more: each takes some 100 bytes."""
+"""Most readings in a file, evenly selected from more: each needs about 100 bytes."""
 
 STEPS = 200
-"""Parts of the drive's readings whose dots appear together."""
+"""Number of parts into which the readings are divided; the dots of a part appear together."""
 
 DATES_FROM = 10**17
-"""Nanoseconds: stamps below are simulated time, which starts at zero."""
+"""Nanoseconds: smaller stamps are simulated time, which starts at zero."""
 
 TIME = 'time'
 ARC_POINTS = 6
 WIDE = 2.8
-"""Width of a view by its height where two stand one over the other, more or less."""
+"""Approximate ratio of width to height of a view if two are stacked."""
 
 ABOVE = 0.01
-"""Metres over the map at which lines and dots are drawn."""
+"""Height of lines and dots over the map, metres."""
 
 COLOURS = {'hit': (0, 158, 115), 'random': (213, 94, 0), 'lost': (204, 121, 167), 'no_echo': (86, 180, 233)}
-"""As in `report.html`."""
+"""The same as in `report.html`."""
 
 DOTS = {'hit': -1.2}
-"""Radii of dots in pixels, negative as Rerun has them; echoes of walls must not hide them."""
+"""Radii of dots in pixels, which Rerun expects as negative numbers; echoes of walls must not hide the walls."""
 
 ODOMETRY, CONE = '#cc79a7', (0, 158, 115)
 
 FAR = 10_000.0
-"""Metres from the origin from where on a recording has a corner of the map as its own: Rerun's numbers are of single
-precision, which is half a metre in UTM coordinates."""
+"""Metres from the origin beyond which coordinates of the recording are relative to a corner of the map: Rerun uses
+single precision, with errors of half a metre in UTM coordinates."""
 
 Points = NDArray[np.float32]
 
 
 def check_rerun() -> None:
-    """Make sure that a recording can be written, before the work.
+    """Check that a recording can be written, before the work.
 
     Raises
     ------
     MapperError
-        If rerun-sdk is not installed, or is of another kind; names the extra.
+        If rerun-sdk is not installed, or is another version; names the extra.
     """
     try:
         import rerun
 
-        rerun.GridMap  # noqa: B018 (older ones have none)
+        rerun.GridMap  # noqa: B018 (missing in older versions)
     except (ImportError, AttributeError) as error:
         raise MapperError(
             f'--rerun needs rerun-sdk ({error}): pip install "forward_grid_mapper[rerun]", or .[rerun] in a checkout, '
@@ -96,13 +96,13 @@ def write_rerun(
     Parameters
     ----------
     path : Path
-        Ending in `.rrd`.
+        With the suffix `.rrd`.
     maps : MapSet
     report : str
         The report as text.
     title : str
     path_xy, odometry_xy : float64, shape (P, 2)
-        As `write_page` takes them.
+        As in `write_page`.
 
     Raises
     ------
@@ -114,7 +114,7 @@ def write_rerun(
     check_rerun()
     import rerun as rr
 
-    # nothing is written before all is there, so that a full disk is told as everywhere else
+    # written only when complete, so that a full disk is reported as for other files
     recording = rr.RecordingStream('forward_grid_mapper')
     stream = recording.binary_stream()
     recording.send_recording_name(title)
@@ -136,13 +136,13 @@ def write_rerun(
 
 
 def _origin(grid: Grid) -> tuple[float, float]:
-    """Return what coordinates are relative to, in whole metres: (0, 0), if the map is not `FAR` from there."""
+    """Return the origin of coordinates, in whole metres: (0, 0) unless the map is `FAR` from there."""
     x, y = grid.origin
     return (float(round(x)), float(round(y))) if max(abs(x), abs(y)) > FAR else (0.0, 0.0)
 
 
 def _bounded(maps: MapSet) -> tuple[Readings, NDArray[np.uint8]]:
-    """Return at most `MOST_READINGS` readings in order of time, and what the map takes them for."""
+    """Return at most `MOST_READINGS` readings in order of time, and their causes on the map."""
     readings = maps.readings
     if not len(readings):
         return readings, np.zeros(0, np.uint8)
@@ -153,7 +153,7 @@ def _bounded(maps: MapSet) -> tuple[Readings, NDArray[np.uint8]]:
 
 def _log_maps(recording: Any, maps: MapSet) -> None:
     if len(maps.readings):
-        # from the beginning on there is a map, of which nothing is known
+        # from the beginning there is a map, with all cells unknown
         _set_time(recording, int(maps.readings.stamp.min()) - 1)
         recording.log('map/standard', _grid_map(maps.grid, np.full(maps.grid.shape, UNKNOWN, np.int8)))
     count = min(MOST_MOMENTS, max(MOST_CELLS // max(maps.grid.size, 1), 1))
@@ -165,7 +165,7 @@ def _log_maps(recording: Any, maps: MapSet) -> None:
 
 
 def _grid_map(grid: Grid, values: NDArray[Any]) -> Any:
-    """Return a map as Rerun has it: occupancy in percent, -1 unknown, the row with the largest y first."""
+    """Return a map in the format of Rerun: occupancy in percent, -1 unknown, the row with the largest y first."""
     import rerun as rr
 
     return rr.GridMap(
@@ -191,7 +191,7 @@ def _log_paths(recording: Any, path_xy: NDArray[np.float64], odometry_xy: NDArra
 
 
 def _log_readings(recording: Any, readings: Readings, causes: NDArray[np.uint8]) -> list[str]:
-    """Log cones, ranges and dots of each sensor; return the entities whose dots stay once they appeared."""
+    """Log cones, ranges and dots of each sensor; return the entities whose dots remain once they have appeared."""
     import rerun as rr
 
     entities = []
@@ -217,7 +217,7 @@ def _log_readings(recording: Any, readings: Readings, causes: NDArray[np.uint8])
 
 
 def _send_dots(recording: Any, entity: str, stamps: NDArray[np.int64], ends: NDArray[np.float64]) -> None:
-    """Send dots, in order of time, in some parts that appear at once: a view of thousands of rows would be slow."""
+    """Send dots, in order of time, in parts that appear at once: a view of thousands of rows would be slow."""
     import rerun as rr
 
     parts = np.array_split(np.arange(len(stamps)), min(len(stamps), STEPS))
@@ -256,7 +256,7 @@ def _times(stamps: NDArray[np.int64]) -> Any:
 
 
 def _blueprint(view: Box, entities: list[str]) -> Any:
-    """Return what the viewer shows at first: two maps from above, the ranges over time, and the report."""
+    """Return the initial views: two maps from above, the ranges over time, and the report."""
     import rerun.blueprint as rrb
 
     left, right, bottom, top = view
@@ -269,7 +269,7 @@ def _blueprint(view: Box, entities: list[str]) -> Any:
         look_target=[x, y, 0.0],
         eye_up=[0.0, 1.0, 0.0],
     )
-    # dots stay, of cones the last is shown
+    # all dots so far are shown, but only the last cone
     begin, now = rrb.TimeRangeBoundary.infinite(), rrb.TimeRangeBoundary.cursor_relative(seconds=0.0)
     until_now = rrb.VisibleTimeRanges([rrb.VisibleTimeRange(TIME, start=begin, end=now)])
     hidden = ('/readings/lost', '/readings/no_echo')

@@ -1,4 +1,4 @@
-"""Everything that a run leaves behind, written in one place for the node and the offline tool."""
+"""Writes all results of a run, for the node and the offline tool."""
 
 from __future__ import annotations
 
@@ -34,27 +34,27 @@ def write_results(
     odometry_xy: NDArray[np.float64] = NOWHERE,
     judged: Sequence[str] | None = None,
 ) -> dict[str, Any]:
-    """Write maps, archive, picture, page and report into a new folder; nothing is left if any of them fails.
+    """Write maps, archive, picture, page and report into a new folder; if any of them fails, no folder remains.
 
     Parameters
     ----------
     path : Path or str
-        The folder, which must not hold anything yet.
+        The folder, which must not exist, or must be empty.
     maps : MapSet
     source : mapping
-        What `report_data` asks for.
+        As in `report_data`.
     path_xy : float64, shape (P, 2)
-        Where the robot drove, metres; a row of NaN parts two drives.
+        Path of the robot, metres; drives are separated by rows of NaN.
     title : str
         Of the picture.
     reference : (Grid, int8 array), optional
         The true map, for the picture.
     extras : mapping of str to str, optional
-        More text files, by name.
+        Further text files, by name.
     odometry_xy : float64, shape (Q, 2)
-        The path that odometry gives, metres, where the robot was elsewhere.
+        Path of odometry, metres, if it differs.
     judged : sequence of str, optional
-        What `data_warnings` says of the maps, if that is known.
+        Result of `data_warnings` for the maps, if known.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""Reading text files that people write: never more than such a file can have, whatever the path leads to."""
+"""Reads text files that people write: at most as many bytes as such a file can have, for any path."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 from ..core.common.errors import MapperError
 
 MOST = 1_000_000
-"""Bytes of a parameter file or the YAML of a map; ours have 12 000, and YAML takes a second for the bound."""
+"""Most bytes of a parameter file or the YAML of a map; ours have 12 000, and YAML takes a second for the bound."""
 
 
 def read_text(path: Path, error: type[MapperError]) -> str:
@@ -16,11 +16,11 @@ def read_text(path: Path, error: type[MapperError]) -> str:
     Raises
     ------
     error
-        Naming the file, if it is larger.
+        Naming the file, if it is larger than `MOST`.
     OSError
         If it cannot be read.
     UnicodeDecodeError
-        If it is no UTF-8.
+        If it is not UTF-8.
     """
     with path.open('rb') as file:
         content = file.read(MOST + 1)

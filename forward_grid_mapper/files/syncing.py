@@ -1,4 +1,4 @@
-"""Asks the disk now and then to keep what was written, in a thread of its own: a slow one takes seconds for it."""
+"""Syncs written data to the disk periodically, in a thread of its own, since a slow disk takes seconds."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from collections.abc import Callable
 from pathlib import Path
 
 PERIOD = 1.0
-"""Seconds between two requests: what a power cut may take, beside what a kill takes."""
+"""Seconds between two syncs: what a power cut may lose in addition to a kill."""
 
 
 class Syncer:
-    """Calls fdatasync on the file that changed; whoever writes never waits for it."""
+    """Calls fdatasync on the file that changed; the writing thread never waits for it."""
 
     def __init__(self, warn: Callable[[str], object]) -> None:
         self._warn = warn
@@ -24,12 +24,12 @@ class Syncer:
         self._thread.start()
 
     def changed(self, path: Path) -> None:
-        """Note that something was written to a file."""
+        """Note that a file was written."""
         with self._lock:
             self._changed = path
 
     def close(self, seconds: float) -> None:
-        """Ask once more, and give it so many seconds."""
+        """Sync once more, and wait at most so many seconds."""
         self._stop.set()
         self._thread.join(seconds)
 
@@ -44,7 +44,7 @@ class Syncer:
         if path is None:
             return
         try:
-            # a descriptor of its own, since the writer may close its own at any moment
+            # its own descriptor, since the writing thread may close its own at any time
             file = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
             try:
                 os.fdatasync(file)
@@ -52,7 +52,7 @@ class Syncer:
                 os.close(file)
             self._trouble = ''
         except FileNotFoundError:
-            # closed in order, and synced then
+            # closed by the writing thread, which synced it
             pass
         except OSError as error:
             if error.strerror != self._trouble:

@@ -1,4 +1,4 @@
-"""A trajectory as text: poses in the TUM format, and what was found out about the odometry in the words of an owner."""
+"""A trajectory as text: poses in the TUM format, and the errors of odometry in everyday words."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from ..core.trajectory.outcome import Refinement
 from ..core.trajectory.windows import Odometry
 
 LEAST_SCALE, LEAST_ANGLE = 0.003, math.radians(0.1)
-"""Parts, and radians or radians a metre, from which on a figure of the calibration is worth a word."""
+"""Smallest values of the calibration that are mentioned: fractions, and radians or radians a metre."""
 
 
 def tum_text(trajectory: Odometry) -> str:
-    """Return a line for each pose, `stamp x y z qx qy qz qw` in seconds and metres, as evo reads them."""
+    """Return a line for each pose, `stamp x y z qx qy qz qw` in seconds and metres, the format that evo reads."""
     lines = []
     for stamp, (x, y, yaw) in zip(trajectory.stamp.tolist(), trajectory.pose.tolist(), strict=True):
-        # a stamp before 0 counts backwards
+        # for a stamp before 0 the sign comes first
         sign, (seconds, rest) = '-' if stamp < 0 else '', divmod(abs(stamp), 10**9)
         lines.append(
             f'{sign}{seconds}.{rest:09d} {x:.6f} {y:.6f} 0 0 0 {math.sin(yaw / 2):.9f} {math.cos(yaw / 2):.9f}'
@@ -28,14 +28,14 @@ def tum_text(trajectory: Odometry) -> str:
 
 
 def trajectory_files(outcome: Refinement, odometry: Odometry, number: int | None = None) -> dict[str, str]:
-    """Return the texts of trajectory and odometry by the names of their files; none where odometry stays.
+    """Return the texts of trajectory and odometry by file name; empty if odometry is used as the trajectory.
 
     Parameters
     ----------
     outcome : Refinement
     odometry : Odometry
     number : int, optional
-        Of the drive, from 1 on, where there are several.
+        Number of the drive, from 1 on, if there are several.
     """
     if not outcome.accepted:
         return {}
@@ -48,12 +48,12 @@ def _tum_name(kind: str, number: int | None) -> str:
 
 
 def trajectory_data(
-    outcome: Refinement, number: int | None = None, fitted: str = '', told: Mapping[str, Estimate] | None = None
+    outcome: Refinement, number: int | None = None, fitted: str = '', estimates: Mapping[str, Estimate] | None = None
 ) -> dict[str, Any]:
-    """Return what became of the trajectory, for the report: metres, degrees, nats, parts and radians.
+    """Return the trajectory's data for the report: metres, degrees, nats, fractions and radians.
 
-    `number` is as in `trajectory_files`; `fitted` says how it was moved to fit other drives, `told` what the drive
-    tells of its odometry with certainty, if that was asked.
+    `number` is as in `trajectory_files`; `fitted` describes how it was moved to fit other drives, `estimates` are the
+    values of the calibration that the drive determines, if they were computed.
     """
     data: dict[str, Any] = {
         'refined': outcome.accepted,
@@ -67,22 +67,22 @@ def trajectory_data(
         'calibration': dict(outcome.calibration),
         'odometry': calibration_words(outcome.calibration) if outcome.accepted else '',
     }
-    if told is not None and outcome.accepted:
-        data['told'] = {name: {'value': value, 'sigma': sigma} for name, (value, sigma) in told.items()}
-        data['odometry'] = told_words(told)
+    if estimates is not None and outcome.accepted:
+        data['told'] = {name: {'value': value, 'sigma': sigma} for name, (value, sigma) in estimates.items()}
+        data['odometry'] = estimate_words(estimates)
     return data
 
 
-def told_words(told: Mapping[str, Estimate]) -> str:
-    """Return what the wheels do as far as the drive tells it, each figure with its standard deviation."""
+def estimate_words(estimates: Mapping[str, Estimate]) -> str:
+    """Return the errors of odometry that the drive determines, each with its standard deviation, in words."""
     words = []
-    for name, (value, sigma) in told.items():
+    for name, (value, sigma) in estimates.items():
         said = calibration_words({name: value}) if abs(value) > sigma else ''
         if not said:
             said = f'{_EXACT[name]} within the accuracy'
         error = math.degrees(sigma) if name in ('bias', 'heading') else 100 * sigma
         words.append(f'{said} (± {error:.1f}{"°" if name in ("bias", "heading") else " %"})')
-    if unknown := [_ASKED[name] for name in CALIBRATION if name not in told]:
+    if unknown := [_ASKED[name] for name in CALIBRATION if name not in estimates]:
         words.append(f'the drive does not show {" or ".join(unknown)}')
     return '; '.join(words)
 
@@ -102,9 +102,9 @@ _ASKED = {
 
 
 def calibration_words(calibration: Mapping[str, float]) -> str:
-    """Return what the wheels do, for the robot's owner; empty if they do nothing worth a word."""
+    """Return the errors of odometry in words for the robot's owner; '' if they are too small."""
     words = []
-    # the calibration makes right what is measured, so the measurement errs the other way
+    # the calibration corrects the measurement, so the measurement has the opposite error
     scale, turn_scale = -calibration.get('scale', 0.0), -calibration.get('turn_scale', 0.0)
     bias, heading = -calibration.get('bias', 0.0), calibration.get('heading', 0.0)
     if abs(scale) >= LEAST_SCALE:

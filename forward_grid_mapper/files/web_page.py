@@ -1,9 +1,9 @@
 """`report.html`: the maps, the readings and the report as one page, which needs neither a server nor a network.
 
 The page is a canvas with a few hundred lines of script (folder `web`). bokeh would add 1.6 MB of script to every
-report, plotly 4.8 MB, and neither knows what a reading says of a cell: that part would be the same. Cones, densities,
-causes and priors are computed here, by the functions of the core; the page only walks a cone and sums, as `explain`
-does.
+report, plotly 4.8 MB, and neither can compute the evidence of a reading for a cell: this part would be the same. Cones,
+densities, causes and priors are computed here, by the functions of the core; the page only adds them up along a cone,
+as `explain` does.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from ..core.maps.reading_causes import likeliest_causes
 from ..core.maps.traversed import traversed_cells
 from ..core.messages.message_types import NANOSECONDS
 from ..core.sensor.density import CUT, causes_of
-from .output_folder import output_errors, told_apart
+from .output_folder import distinguished, output_errors
 from .picture import NOWHERE, figures_of, view_of
 from .report_text import report_text
 
@@ -38,29 +38,29 @@ WEB = Path(__file__).with_name('web')
 SCRIPTS = ('evidence.js', 'chart.js', 'page.js')
 
 MOST_CELLS = 6_000_000
-"""More cells than that make a page that browsers labour with."""
+"""Most cells; browsers are slow with more."""
 
 MOST_READINGS = 100_000
-"""Readings that a page holds; they take some 60 bytes each. Beyond, it shows the maps, and `explain` tells the rest."""
+"""Most readings of a page; each needs about 60 bytes. With more, it shows only the maps; `explain` shows evidence."""
 
 MOMENTS = 10
-"""Parts of the drive after each of which the page has the standard map as it was."""
+"""Number of parts of the drive after each of which the page has the standard map at that time."""
 
 MOST_CELLS_OF_MOMENTS = 8_000_000
-"""Cells of all these maps together; larger maps have fewer of them, or none."""
+"""Most cells of all these maps together; for larger maps there are fewer of them, or none."""
 
 MOST_POINTS = 4000
-"""Points of a path: more cannot be told apart."""
+"""Most points of a path: more cannot be distinguished."""
 
 UNKNOWN_SHARE = 65535
 STEPS = 10_000
-"""Steps of probabilities on the page."""
+"""Levels of probabilities on the page."""
 
 UNKNOWN_THEN, STEPS_THEN = 255, 250
-"""The same of the standard map during the drive."""
+"""The value of unknown cells, and the levels, of the standard map during the drive."""
 
 MOST_DRIVES = 8
-"""Drives whose names a page shows."""
+"""Most drives whose names a page shows."""
 
 _CONE = ('x', 'y', 'axis_x', 'axis_y', 'sine', 'cosine', 'z', 'z_max', 'sigma', 'reach')
 
@@ -81,19 +81,19 @@ def write_page(
     path : Path
     maps : MapSet
     report : mapping
-        What `report_data` returned.
+        The result of `report_data`.
     title : str
     path_xy : float64, shape (P, 2)
-        Where the robot was, in order, metres; may be empty. Rows of NaN part several drives.
+        Path of the robot, in order, metres; may be empty. Several drives are separated by rows of NaN.
     odometry_xy : float64, shape (Q, 2)
-        The path that odometry gives, metres, where the robot was elsewhere.
+        Path of odometry, metres, if it differs.
     reference : (Grid, int8 array), optional
         The true map.
 
     Raises
     ------
     OutputError
-        If the map has more cells than `MOST_CELLS`, or the file cannot be written; then there is none.
+        If the map has more cells than `MOST_CELLS`, or the file cannot be written; then no file remains.
     """
     if maps.grid.size > MOST_CELLS:
         raise OutputError(f'a page shows at most {MOST_CELLS:,} cells, the map has {maps.grid.size:,}')
@@ -111,10 +111,10 @@ def write_page(
         'report': html.escape(report_text(dict(report))),
         'style': (WEB / 'page.css').read_text(encoding='utf-8'),
         'script': '\n'.join((WEB / name).read_text(encoding='utf-8') for name in SCRIPTS),
-        # what a bag names may hold the end of a script
+        # names from a bag may contain the end of a script
         'data': json.dumps(page, allow_nan=False).replace('<', '\\u003c'),
     }
-    # in one pass, since a title may hold the name of another part
+    # in one pass, since a title may contain the name of another part
     pieces = (WEB / 'page.html').read_text(encoding='utf-8').split('{{')
     text = pieces[0] + ''.join(parts[piece.partition('}}')[0]] + piece.partition('}}')[2] for piece in pieces[1:])
     try:
@@ -133,7 +133,7 @@ def page_data(
     odometry_xy: NDArray[np.float64],
     reference: tuple[Grid, NDArray[np.int8]] | None,
 ) -> dict[str, Any]:
-    """Return the numbers of the page, ready for JSON; the parameters are those of `write_page`."""
+    """Return the numbers of the page, for JSON; the parameters are those of `write_page`."""
     arrays: dict[str, NDArray[Any]] = {
         'ml_map': np.where(maps.ml == UNKNOWN, 255, maps.ml).astype(np.uint8),
         'live_map': _shares(maps.live),
@@ -169,7 +169,7 @@ def page_data(
             'cos2_limit': maps.normals.cos2_limit if len(maps.normals.known) else 0.0,
         },
         'moments': then,
-        'drives': told_apart([str(drive.get('bag')) for drive in report.get('drives') or ()])[:MOST_DRIVES],
+        'drives': distinguished([str(drive.get('bag')) for drive in report.get('drives') or ()])[:MOST_DRIVES],
         'start': float(stamps.min() / NANOSECONDS) if len(stamps) else 0.0,
         'sensors': [_sensor(name, report) for name in maps.readings.sensor_names or ('',)],
         'arrays': {name: _packed(values) for name, values in arrays.items()},
@@ -177,7 +177,7 @@ def page_data(
 
 
 def _readings(maps: MapSet) -> dict[str, NDArray[Any]]:
-    """Return the columns from which the page computes what each reading says of a cell."""
+    """Return the columns from which the page computes the evidence of a reading for a cell."""
     forward, readings = maps.forward_model(), maps.readings
     causes = causes_of(readings, forward.cones['sigma'] * maps.grid.resolution, forward.model, maps.grid.resolution)
     columns: dict[str, NDArray[Any]] = {name: forward.cones[name] for name in _CONE}
@@ -190,9 +190,9 @@ def _readings(maps: MapSet) -> dict[str, NDArray[Any]]:
 
 
 def _moments(maps: MapSet) -> tuple[list[float], NDArray[np.uint8]]:
-    """Return until when each standard map during the drive is, seconds, and the maps, each as what it adds to the last.
+    """Return the standard maps during the drive: the end of the time of each, seconds, and its difference to the last.
 
-    Sums are modulo 256; what has not changed is 0, which takes next to no room. The last map, `live_map`, is left out.
+    Differences are modulo 256; unchanged cells are 0, which compresses well. The last map, `live_map`, is left out.
     """
     count = min(MOMENTS, MOST_CELLS_OF_MOMENTS // max(maps.grid.size, 1))
     then: list[float] = []
@@ -215,7 +215,7 @@ def _shares(probability: NDArray[np.float32]) -> NDArray[np.uint16]:
 
 
 def _thinned(xy: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return a path of some `MOST_POINTS` points, the last one among them; rows of NaN, which part drives, stay."""
+    """Return a path of about `MOST_POINTS` points, with the last one and all rows of NaN, which separate drives."""
     which = np.linspace(0, len(xy) - 1, min(len(xy), MOST_POINTS)).astype(np.int64)
     parted = np.flatnonzero(~np.isfinite(xy).all(axis=1))
     ends = np.concatenate([parted - 1, parted, parted + 1])
@@ -237,7 +237,7 @@ def _sensor(name: str, report: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _packed(values: NDArray[Any]) -> dict[str, str]:
-    """Return an array as a browser unpacks it: little-endian, deflated, in base64."""
+    """Return an array in the format of the page: little-endian, deflated, in base64."""
     little = np.ascontiguousarray(values, values.dtype.newbyteorder('<'))
     data = base64.b64encode(zlib.compress(little.tobytes(), 6)).decode('ascii')
     return {'type': f'{little.dtype.kind}{little.dtype.itemsize}', 'data': data}

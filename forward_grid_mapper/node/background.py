@@ -1,4 +1,4 @@
-"""Work in the background: threads that live on whatever their work raises, and results that come back in order."""
+"""Work in the background: threads that survive failures, and results in order for the executor."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from ..core.common.errors import MapperError
 T = TypeVar('T')
 
 NICE = 10
-"""What workers give way by (nice), so that the executor gets a core at once when a message comes."""
+"""Niceness of workers, so that the executor gets a core at once when a message arrives."""
 
 AT_ONCE = 20
-"""Results that the executor takes in one turn; the others wait for the next."""
+"""Most results that the executor handles in one turn."""
 
 
 class _Task(NamedTuple):
@@ -26,31 +26,31 @@ class _Task(NamedTuple):
     failed: Callable[[str], object]
 
 
-def _nobody(why: str) -> None:
-    """Be whom a failure does not concern."""
+def _ignore(why: str) -> None:
+    """Ignore a failure."""
 
 
 def reason(error: BaseException) -> str:
-    """Return what went wrong, in words."""
+    """Return the reason of a failure in words."""
     if isinstance(error, MapperError):
         return str(error)
     return 'there is not enough memory' if isinstance(error, MemoryError) else repr(error)
 
 
 class Worker:
-    """A thread that does one piece of work after the other; it starts with the first.
+    """A thread that runs tasks one after the other; it starts with the first.
 
-    Whatever a piece raises, or if the thread cannot start, `failed` of that piece is told, the log and `trouble` say
-    so, and the next piece is done.
+    If a task raises, or the thread cannot start, its callback `failed` is called, the reason is logged and kept in
+    `trouble`, and the next task runs.
 
     Attributes
     ----------
     trouble : str
-        What failed last; empty once something succeeded after it, unless failures are `lasting`: then until `forgive`.
+        Reason of the last failure. A later success clears it, unless failures are `lasting`: then only `forgive` does.
     """
 
     def __init__(self, name: str, log: Callable[[str], object], lasting: bool = False, nice: int = NICE) -> None:
-        """Prepare; `nice` is by what the thread gives way to the executor."""
+        """Prepare; `nice` is the niceness of the thread."""
         self.name, self.trouble = name, ''
         self._nice = nice
         self._log, self._lasting = log, lasting
@@ -61,13 +61,13 @@ class Worker:
 
     @property
     def waiting(self) -> int:
-        """Number of pieces that are not done, the one that is being done included."""
+        """Number of tasks that are not done, including the running one."""
         return len(self._tasks) + self._busy
 
-    def put(self, work: Callable[[], None], failed: Callable[[str], object] = _nobody) -> None:
-        """Have `work` done after all that was put before; `failed` is called with the reason if it raises.
+    def put(self, work: Callable[[], None], failed: Callable[[str], object] = _ignore) -> None:
+        """Have `work` called after all earlier tasks; `failed` is called with the reason if it raises.
 
-        Either is called in the worker's thread, `failed` in the caller's if there can be no thread.
+        Both are called in the worker's thread, `failed` in the caller's if no thread can start.
         """
         with self._wake:
             if self._closed:
@@ -81,7 +81,7 @@ class Worker:
             self._start()
 
     def ask(self, work: Callable[[], T]) -> T:
-        """Have `work` done and wait for what it returns.
+        """Have `work` called, and wait for its result.
 
         Raises
         ------
@@ -111,11 +111,11 @@ class Worker:
         return found[0]
 
     def forgive(self) -> None:
-        """Forget what failed."""
+        """Clear `trouble`."""
         self.trouble = ''
 
     def close(self, seconds: float) -> None:
-        """Leave what was not begun undone, and wait so long for what was."""
+        """Drop the tasks that have not begun, and wait at most so many seconds for the running one."""
         with self._wake:
             self._closed = True
             self._tasks.clear()
@@ -125,7 +125,7 @@ class Worker:
             thread.join(seconds)
 
     def finish(self) -> None:
-        """End once the piece that is being done is done; may be called by that piece."""
+        """End after the running task; may be called by that task."""
         with self._wake:
             self._closed = True
             self._wake.notify()
@@ -153,7 +153,7 @@ class Worker:
                     self._wake.wait()
                 if self._closed:
                     return
-                # in this order, so that nobody who looks meanwhile finds that all is done
+                # in this order, so that no other thread finds all tasks done meanwhile
                 self._busy = True
                 task = self._tasks.popleft()
             try:
@@ -162,7 +162,7 @@ class Worker:
                     self.trouble = ''
             except BaseException as error:
                 self._fail(task, error)
-            # what the work refers to is not kept until the next piece comes
+            # objects that the task refers to are released before the next task arrives
             del task
             self._busy = False
 
@@ -180,7 +180,7 @@ class Worker:
 
 
 class Inbox:
-    """What other threads want done in the executor's thread: in order, and a few at a time.
+    """Calls from other threads that run in the executor's thread: in order, a few at a time.
 
     That thread owns the state of the node, which therefore needs no locks.
     """
@@ -190,12 +190,12 @@ class Inbox:
         self._guard = node.create_guard_condition(self.work)
 
     def put(self, work: Callable[[], None]) -> None:
-        """Have `work` called by the executor soon; any thread."""
+        """Have `work` called by the executor soon; may be called from any thread."""
         self._work.append(work)
         self._wake()
 
     def work(self) -> None:
-        """Do what waits; called by the executor."""
+        """Run waiting calls; called by the executor."""
         try:
             for _ in range(min(len(self._work), AT_ONCE)):
                 self._work.popleft()()
@@ -207,5 +207,5 @@ class Inbox:
         try:
             self._guard.trigger()
         except Exception:
-            # the node has been destroyed: nobody is there to do it
+            # the node was destroyed, and its executor does not run
             self._work.clear()

@@ -1,4 +1,4 @@
-"""What stamps say of clocks: odometry's that jump, and those of sensors that are apart from odometry's."""
+"""Faults of clocks: jumps in the stamps of odometry, and sensors whose stamps differ from those of odometry."""
 
 from __future__ import annotations
 
@@ -14,23 +14,23 @@ from ..core.messages.pose_association import PoseAssociator
 from ..core.messages.rep117 import LONGEST_NAME
 
 LASTING = 10.0
-"""Seconds for which a jump counts, and between two lines in the log."""
+"""Seconds for which a jump counts, and between two warnings in the log."""
 
 AGAIN = 3
-"""Jumps within `LASTING` from which on they are a fault, and not a bag that begins anew."""
+"""Jumps within `LASTING` that are a fault; fewer may be a bag that is played again."""
 
 WINDOW = 5 * NANOSECONDS
-"""Nanoseconds of odometry's stamps for which a sensor is behind or ahead before it is told of."""
+"""Nanoseconds of odometry, by stamps, for which a sensor must be behind or ahead before a warning."""
 
 FEWEST = 5
-"""Readings that this takes at least."""
+"""Fewest readings within `WINDOW`."""
 
 APART = NANOSECONDS
-"""Nanoseconds by which even the least late of them is behind, or the latest ahead."""
+"""Nanoseconds by which all readings within `WINDOW` must be behind, or all ahead."""
 
 
 class OdometryClock:
-    """Tells of jumps in the stamps of odometry: in the log now and then, and as a fault where they come again."""
+    """Warns of jumps in the stamps of odometry: in the log, and as a fault if they repeat."""
 
     def __init__(self, associator: PoseAssociator, warn: Callable[[str], object]) -> None:
         self._associator, self._warn = associator, warn
@@ -38,11 +38,11 @@ class OdometryClock:
         self._jumps: deque[float] = deque(maxlen=AGAIN)
         self._next = 0.0
 
-    def look(self) -> None:
-        """Look what became of a message that the associator has taken."""
+    def check(self) -> None:
+        """Check for a jump after each message that the associator processed."""
         seen, self._seen = self._seen, self._counts()
         back, ahead = (now - before for now, before in zip(self._seen, seen, strict=True))
-        # a reset begins to count anew
+        # a reset sets the counters to 0
         if back <= 0 and ahead <= 0:
             return
         now = time.monotonic()
@@ -62,11 +62,11 @@ class OdometryClock:
             )
 
     def forget(self) -> None:
-        """Forget what jumped."""
+        """Forget the jumps."""
         self._jumps.clear()
 
     def faults(self) -> list[str]:
-        """Return what to warn of, in words."""
+        """Return the faults, in words."""
         if len(self._jumps) < AGAIN or time.monotonic() - self._jumps[0] > LASTING:
             return []
         return ['the stamps of odometry jump again and again: do two nodes publish odometry, or is a clock set?']
@@ -77,9 +77,9 @@ class OdometryClock:
 
 @dataclass(slots=True)
 class _Window:
-    """The readings of a sensor since odometry's stamp `begin`, and by how much those before were all behind.
+    """The readings of a sensor since the stamp `begin` of odometry.
 
-    Nanoseconds; a negative lag is of a sensor that is ahead.
+    Nanoseconds; `lag` is that of the window before: the smallest if all were behind, negative if all ahead, else 0.
     """
 
     begin: int
@@ -91,20 +91,20 @@ class _Window:
 
 
 class SensorClocks:
-    """Finds sensors whose stamps stay apart from odometry's; a queue that is worked off is not behind for so long."""
+    """Finds sensors whose stamps differ from those of odometry for longer than it takes to work off a queue."""
 
     def __init__(self, warn: Callable[[str], object]) -> None:
         self._warn = warn
         self._windows: dict[str, _Window] = {}
-        self._told: set[str] = set()
+        self._logged: set[str] = set()
 
     def clear(self) -> None:
         """Forget all sensors."""
         self._windows.clear()
 
     def note(self, frame: str, stamp: int, odometry: int | None) -> None:
-        """Note a reading, and the newest stamp of odometry as it came."""
-        # a stamp that nobody filled in is told of as such
+        """Note the stamp of a reading, and the newest stamp of odometry at its arrival."""
+        # unset stamps have their own warning
         if odometry is None or not stamp:
             return
         lag, window = odometry - stamp, self._windows.get(frame)
@@ -116,12 +116,12 @@ class SensorClocks:
         window.last, window.count = odometry, window.count + 1
         window.least, window.most = min(lag, window.least), max(lag, window.most)
         if odometry - window.begin >= WINDOW and window.count >= FEWEST:
-            # the lag that all of them have at least
+            # the smallest lag if all are behind, the smallest lead if all are ahead
             common = max(window.least, 0) + min(window.most, 0)
             self._windows[frame] = _Window(odometry, odometry, lag, lag, lag=common)
 
     def faults(self, odometry: int | None) -> list[str]:
-        """Return what to warn of, in words; the log is told once of each sensor."""
+        """Return the faults, in words; each sensor is logged once."""
         found = {
             frame: window.lag
             for frame, window in self._windows.items()
@@ -140,7 +140,7 @@ class SensorClocks:
                 f'the stamps of {most}{others} are {lags[most] / NANOSECONDS:.1f} s {side} those of odometry: if a '
                 f'clock is wrong, its readings are mapped with wrong poses; synchronise the clocks (NTP, PTP){busy}'
             )
-            if lags.keys() - self._told:
-                self._told |= lags.keys()
+            if lags.keys() - self._logged:
+                self._logged |= lags.keys()
                 self._warn(texts[-1])
         return texts

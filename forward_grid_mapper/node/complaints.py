@@ -1,4 +1,4 @@
-"""What is wrong with the command line of the node, or with what ROS was given, in words."""
+"""Explanations, in words, of errors on the command line of the node or in what ROS was given."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ ROS_OPTIONS = (
 )
 TOPICS = ('sonar', 'odom')
 HIGHEST_DOMAIN = 232
-"""DDS has ports for no more."""
+"""DDS has no ports for higher ones."""
 
-# a whole number and one with a point
+# a list with both an integer and a number with a decimal point
 _MIXED = re.compile(r':=\s*\[(?=(?:.*,)?\s*[-+]?\d+\s*[],])[^]]*\.[^]]*\]\s*$')
 _SOURCE = re.compile(r', at /\S+:\d+')
 _INIT = re.compile(r'^failed to initialize rcl: ')
@@ -36,7 +36,7 @@ def _nearest(word: str, known: Sequence[str]) -> str:
 
 
 def of_arguments(left: Sequence[str]) -> str:
-    """Return what to do about arguments that are none of ROS's."""
+    """Return a remedy for arguments that are not ROS's."""
     parameters = [row.name for row in TABLE]
     for word in left:
         name, given, _value = word.partition(':=')
@@ -54,7 +54,7 @@ def of_arguments(left: Sequence[str]) -> str:
 
 
 def of_ros_arguments(text: str) -> str:
-    """Return what to do about arguments after --ros-args that ROS does not know; rclpy gives them as a list in text."""
+    """Return a remedy for unknown arguments after --ros-args; rclpy gives them as the text of a list."""
     unknown = re.findall(r"'([^']*)'", text) or [text]
     word = unknown[0]
     if ':=' in word:
@@ -71,7 +71,7 @@ def of_domain(environment: Mapping[str, str]) -> str:
 
 
 def _of_file(path: str, why: str) -> str:
-    """Return what is wrong with a parameter file: in our words where our own reader refuses it as well."""
+    """Return the fault of a parameter file: from our own reader if it refuses the file as well."""
     if Path(path).is_file():
         try:
             load_parameters(path)
@@ -84,7 +84,7 @@ def _of_file(path: str, why: str) -> str:
 
 
 def of_ros(error: BaseException) -> str:
-    """Return what rclpy says of a failure, without the lines of its sources, and with a remedy where there is one."""
+    """Return the message of an rclpy error, without the lines of its sources, and with a remedy if one is known."""
     lines = _SOURCE.sub('', str(error)).splitlines()
     text = _INIT.sub('', ' '.join(filter(None, (line.strip() for line in lines))))
     if found := _RULE.search(text):

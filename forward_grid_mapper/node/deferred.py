@@ -1,4 +1,4 @@
-"""Services that answer later, from any thread, while the executor goes on with other work."""
+"""Services that are answered later, from any thread, while the executor does other work."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from rclpy.service import Service
 from .background import reason
 
 CALLS = QoSProfile(depth=5000, reliability=ReliabilityPolicy.RELIABLE)
-"""Calls and answers that may wait at once; of more than ROS's own 10 some would never be answered."""
+"""Most calls and answers that may wait; with ROS's default of 10, some of more calls would never be answered."""
 
 
 class Reply:
-    """The answer that a client waits for."""
+    """The answer of a service call."""
 
     def __init__(self, service: DeferredService, request: Any) -> None:
         self.request = request
@@ -28,7 +28,7 @@ class Reply:
         self._response: Any = None
 
     def send(self, *arguments: Any, **fields: Any) -> None:
-        """Answer with the fields of the response, in order or by name, once; a client that has gone is no error."""
+        """Answer once, with the fields of the response in order or by name; a client that has gone is no error."""
         kind = self._service.kind.Response
         names = kind.get_fields_and_field_types()
         response = kind(**dict(zip(names, arguments, strict=False)), **fields)
@@ -41,12 +41,12 @@ class Reply:
             self._service.transmit(response, header)
 
     def fail(self, why: str) -> None:
-        """Answer that the call failed, in words where the response has room for them."""
+        """Answer that the call failed; the reason is in `message`, if the response has one."""
         names = self._service.kind.Response.get_fields_and_field_types()
         self.send(**{name: value for name, value in (('success', False), ('message', why)) if name in names})
 
     def arrived(self, header: Any) -> None:
-        """Learn whom to answer, which the executor knows only after the handler returned."""
+        """Note the client's header, which the executor only has after the handler returned."""
         with self._lock:
             self._header, response = header, self._response
         if response is not None:
@@ -54,7 +54,7 @@ class Reply:
 
 
 def answered(handler: Callable[[Reply], None], reply: Reply, log: Callable[[str], object]) -> None:
-    """Call a handler; if it fails, the client is told, who would wait for ever, and so is the log."""
+    """Call a handler; if it fails, log the error and answer, since the client would wait for ever."""
     try:
         handler(reply)
     except Exception as error:
@@ -64,15 +64,14 @@ def answered(handler: Callable[[Reply], None], reply: Reply, log: Callable[[str]
 
 
 class DeferredService:
-    """A service whose handler is given a `Reply` to answer with, now or later.
+    """A service whose handler receives a `Reply`, to answer now or later.
 
-    An `async` handler would do the same with rclpy's own means, but its executor then spins at full load until the
-    answer is there.
+    An `async` handler could do the same, but then rclpy's executor spins at full load until it answers.
 
     Attributes
     ----------
     open : set of Reply
-        Those that nobody has answered yet.
+        Calls without an answer so far.
     """
 
     def __init__(self, node: Node, kind: Any, name: str, handler: Callable[[Reply], None]) -> None:
@@ -94,10 +93,10 @@ class DeferredService:
         reply.arrived(header)
 
     def end(self, why: str) -> None:
-        """Tell those who still wait that there will be no answer, and why."""
+        """Answer all open calls with a failure and its reason."""
         for reply in list(self.open):
             reply.fail(why)
 
     def transmit(self, response: Any, header: Any) -> None:
-        """Send a response to the client; any thread."""
+        """Send a response to the client; may be called from any thread."""
         self._transmit(response, header)

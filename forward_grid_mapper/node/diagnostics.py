@@ -1,4 +1,4 @@
-"""What the node says of itself once a second."""
+"""The diagnostics of the node, published once a second."""
 
 from __future__ import annotations
 
@@ -17,33 +17,33 @@ from .em import Run
 from .intake import Intake
 
 SILENCE = 3.0
-"""Seconds without odometry, or without ranges, that are worth a warning."""
+"""Seconds without odometry or Range before a warning."""
 
 RECENT = 10.0
-"""Seconds for which a sensor that measures rarely is judged by the readings that it has sent, so that the status does
-not change with each of them."""
+"""Longest time, seconds, over which rejected readings are counted if a sensor measures rarely, so that the status
+does not change with each reading."""
 
 ENOUGH = 10
-"""Readings by which the last second alone is judged."""
+"""Readings after which the last second alone is enough."""
 
 NEARLY = 0.9
-"""Fraction of `max_readings` from which on a warning says that readings will go."""
+"""Fraction of `max_readings` from which a warning says that readings will be removed."""
 
 SHOWN = 20
-"""Names of frames that a message lists."""
+"""Most names of frames in a message."""
 
 STREAMS = ('odometry', 'stamp of odometry', 'range')
-"""What goes on as long as the robot is there."""
+"""Inputs that keep changing while the robot sends."""
 
 NO_POSE = 'no pose on the robot for '
-"""How a verdict begins that names frames without a pose."""
+"""Begin of the message that names frames without a pose."""
 
 MAPPING = 'mapping'
-"""The verdict where readings come, are accepted, and nothing is wrong."""
+"""The message if readings arrive, are accepted, and nothing is wrong."""
 
 
 class Health:
-    """Watches what arrives and turns it into diagnostics."""
+    """Watches the input and makes the diagnostics."""
 
     def __init__(self) -> None:
         self._begin = time.monotonic()
@@ -53,8 +53,8 @@ class Health:
         self._slowest = 0
 
     def taken(self, sent: int) -> None:
-        """Note that a reading was taken which was published at `sent`, nanoseconds of the system's clock."""
-        # not every middleware says when
+        """Note the delay of a reading that was published at `sent`, nanoseconds of the system's clock."""
+        # not every middleware gives the time of publishing
         if sent:
             self._slowest = max(self._slowest, time.time_ns() - sent)
 
@@ -72,8 +72,8 @@ class Health:
     ) -> list[DiagnosticStatus]:
         """Return the statuses of input and of EM.
 
-        `map_frame` says what is wrong with its transform, and `absent` why no message of a kind comes, 'Range' or
-        'Odometry'.
+        `map_frame` is the fault of the transform to the map frame, '' if none; `absent` returns the reason why no
+        message of a kind arrives, 'Range' or 'Odometry'.
         """
         level, message = self._judge(associator, intake, map_frame, absent)
         bound = associator.parameters.max_readings
@@ -106,19 +106,19 @@ class Health:
         self, associator: PoseAssociator, intake: Intake, map_frame: str, absent: Callable[[str], str]
     ) -> tuple[bytes, str]:
         received = intake.received
-        # looked at each time: a reset begins to count anew
-        new, by_reason, time_span = self._recent.look(received, associator.rejected)
+        # called each time, since a reset sets the counters to 0
+        new, by_reason, time_span = self._recent.update(received, associator.rejected)
         new_rejected = sum(by_reason.values())
         nowhere = self._silence('frames without a pose', associator.rejected['unknown_extrinsics'])
         refused = sum(associator.odometry_rejected.values())
-        # what the associator has not seen yet has come all the same
+        # also messages that the associator has not processed yet
         silent_odometry = self._silence('odometry', intake.odometry_came - refused)
         refused_now, self._refused = refused - self._refused, refused
         stamp = associator.odometry_stamp or 0
         stuck = self._silence('stamp of odometry', stamp)
         silent_ranges = self._silence('range', received)
         if not intake.listening:
-            # nothing is missed that nobody asked for
+            # an inactive node misses nothing
             now = time.monotonic()
             self._last |= {stream: (self._last[stream][0], now) for stream in STREAMS}
             return DiagnosticStatus.OK, 'inactive: nothing is received'
@@ -142,12 +142,12 @@ class Health:
             missing.append(f'no Range for {silent_ranges:.0f} s{absent("Range")}')
         without_pose = f'{NO_POSE}{listed(associator.unknown_frames)}' if associator.unknown_frames else ''
         if missing:
-            # stays wrong when messages end
+            # this must stay the message when no readings arrive
             return DiagnosticStatus.WARN, '; '.join([*missing, *filter(None, [without_pose])])
         if without_pose and nowhere < RECENT:
             return DiagnosticStatus.WARN, without_pose
         if new and new_rejected > 0.2 * new:
-            # some of them may have waited since before
+            # readings that arrived earlier may have been rejected now
             new = max(new, new_rejected)
             return DiagnosticStatus.WARN, (
                 f'{new_rejected} of {new} readings were rejected in the last {time_span}{_main_reason(by_reason)}'
@@ -169,7 +169,7 @@ class Health:
         return DiagnosticStatus.OK, MAPPING
 
     def _silence(self, stream: str, count: int) -> float:
-        """Return for how many seconds a number has not changed."""
+        """Return the seconds since a count changed."""
         now = time.monotonic()
         last, since = self._last.get(stream, (0, self._begin))
         if count != last:
@@ -179,14 +179,14 @@ class Health:
 
 
 class _Recent:
-    """The readings of the last second, or of as many seconds as it takes to have `ENOUGH` of them."""
+    """The readings of the last second, or of enough seconds to have `ENOUGH` of them."""
 
     def __init__(self) -> None:
-        self._looks: deque[tuple[float, int, Counter[str]]] = deque([(time.monotonic(), 0, Counter())])
+        self._counts: deque[tuple[float, int, Counter[str]]] = deque([(time.monotonic(), 0, Counter())])
 
-    def look(self, received: int, rejected: Counter[str]) -> tuple[int, Counter[str], str]:
-        """Take the counts of now; return how many came, those that were rejected by reason, and the time in words."""
-        now, looks = time.monotonic(), self._looks
+    def update(self, received: int, rejected: Counter[str]) -> tuple[int, Counter[str], str]:
+        """Add the counts; return the number received, rejected readings by reason, and the time span in words."""
+        now, looks = time.monotonic(), self._counts
         if received < looks[-1][1]:
             # a reset
             last = looks[-1][0]
@@ -199,12 +199,12 @@ class _Recent:
         return received - before, rejected - counts, 'second' if len(looks) == 2 else f'{now - begin:.0f} s'
 
     def begin_anew(self) -> None:
-        """Leave out of account what came so far."""
-        self._looks = deque([self._looks[-1]])
+        """Ignore all readings so far."""
+        self._counts = deque([self._counts[-1]])
 
 
 def add_faults(made: DiagnosticStatus, faults: list[str]) -> None:
-    """Turn a status into a warning if something around the node is wrong."""
+    """Add faults to the message of a status, and make it a warning."""
     if faults:
         well = made.level == DiagnosticStatus.OK
         made.level = max(made.level, DiagnosticStatus.WARN)
@@ -212,19 +212,19 @@ def add_faults(made: DiagnosticStatus, faults: list[str]) -> None:
 
 
 def _main_reason(counts: Counter[str]) -> str:
-    """Say what most readings were rejected for."""
+    """Return the most frequent reason of rejection, in words."""
     reason = max(counts, key=lambda key: counts[key], default='')
     return f', most of them as {reason}: {REASONS[reason]}' if reason else ''
 
 
 def listed(frames: Collection[str]) -> str:
-    """Return names in words, `SHOWN` of them at the most."""
+    """Return at most `SHOWN` names, in words."""
     more = f' and {len(frames) - SHOWN} more' if len(frames) > SHOWN else ''
     return ', '.join(sorted(frames)[:SHOWN]) + more
 
 
 def array(statuses: list[DiagnosticStatus], stamp: Any) -> DiagnosticArray:
-    """Return the message that `/diagnostics` carries."""
+    """Return the message for `/diagnostics`."""
     message = DiagnosticArray(status=statuses)
     message.header.stamp = stamp
     return message

@@ -1,4 +1,4 @@
-"""EM in the background: one run at a time, in a thread whose kernels leave the GIL to the node."""
+"""EM in the background: one run at a time, in a thread whose kernels release the GIL."""
 
 from __future__ import annotations
 
@@ -22,17 +22,17 @@ from ..core.maps.map_set import MapSet
 from ..core.runtime.memory import shortage
 from ..core.runtime.threads import cores
 from ..core.search.search import Progress
-from ..files.quality_warning import deaf, quality_warning
+from ..files.quality_warning import quality_warning, without_echoes
 from .background import Worker, reason
 from .refining import RefiningMapper
 
 
 @dataclass
 class Outcome:
-    """How a run ended: `maps`, or None and the reason in `message`.
+    """The result of a run: `maps`, or None with the reason in `message`.
 
-    `warnings` say what is wrong with the readings, `health` how each sensor does, `trajectory` what became of it,
-    `waited` the seconds that went by until kernels were compiled.
+    `warnings` are faults of the readings, `health` is that of each sensor, `trajectory` describes the trajectory,
+    `waited` is the time until kernels were compiled, seconds.
     """
 
     maps: MapSet | None
@@ -45,12 +45,12 @@ class Outcome:
 
 @dataclass
 class Run:
-    """One run of EM on what `readings` returns, from map `start` or from the empty one.
+    """One run of EM on the readings that `readings` returns, from the map `start` or from the empty one.
 
-    `stage` and `progress` say where it stands. `found` is called with the maps as soon as they are there, in the
-    thread. `shown` says whether the map so far was published, `asked` whether somebody asked for its end alone.
-    `by_itself` says whether nobody has asked for it so far, `fresh` whether it looks at all that there is by now. In
-    `then` is who waits for the run after it.
+    `stage` and `progress` are updated during the run. `found` is called with the maps once they are found, in the
+    thread. `shown` is true once an intermediate map was published, `end_requested` if cancel_em was called.
+    `by_itself` is true if the node began the run and no call waits for it; `fresh` returns whether the run uses all
+    readings so far. `then` are those who wait for the run after it.
     """
 
     mapper: Mapper | RefiningMapper
@@ -64,7 +64,7 @@ class Run:
     progress: Progress | None = None
     cancelled: bool = False
     shown: bool = False
-    asked: bool = False
+    end_requested: bool = False
     by_itself: bool = False
     fresh: Callable[[], bool] = lambda: True
     then: list[Callable[[Outcome], object]] = field(default_factory=list)
@@ -84,12 +84,12 @@ class Run:
 
 
 class EmWorker:
-    """Runs EM on snapshots of the readings, one at a time; all methods return at once, and are called by one thread.
+    """Runs EM on snapshots of the readings, one at a time; all methods return at once, and one thread calls them.
 
     Attributes
     ----------
     current : Run or None
-        The run that goes on; there is no other until its thread has done everything for it.
+        The current run, until its thread has finished all work for it.
     """
 
     def __init__(
@@ -104,13 +104,13 @@ class EmWorker:
         Parameters
         ----------
         watch : callable
-            Takes the run at every stage and iteration, in the run's thread.
+            Receives the run at every stage and iteration, in its thread.
         log : callable
-            Takes errors no user caused.
+            Receives errors that no user caused.
         conclude : callable
-            Takes a function and has the thread that calls the methods call it.
+            Receives a function, and has it called in the thread that calls the methods.
         prepare : callable
-            Called in the thread before the first run, and given what says whether to stop.
+            Called in the thread before each run, with a function that returns whether to stop.
         """
         self.worker = Worker('EM', log)
         self._log = log
@@ -118,7 +118,7 @@ class EmWorker:
         self._watch, self._conclude, self._prepare = watch, conclude, prepare
 
     def start(self, run: Run, done: Callable[[Outcome], object]) -> bool:
-        """Begin a run; `done` is called when it has ended. Return whether it began: it does not while one goes on."""
+        """Begin a run, and return True; False if there is a current one. `done` is called at its end."""
         if self.current is not None:
             return False
         run.waiting.append(done)
@@ -127,19 +127,19 @@ class EmWorker:
         return True
 
     def cancel(self) -> None:
-        """Cancel the run that goes on, if any."""
+        """Cancel the current run, if any."""
         run = self.current
         if run is not None:
             run.cancelled = True
             run.mapper.cancel()
 
     def close(self, seconds: float) -> None:
-        """Cancel the run that goes on, and wait so long for its end."""
+        """Cancel the current run, and wait at most so many seconds for its end."""
         self.cancel()
         self.worker.close(seconds)
 
     def _work(self, run: Run) -> None:
-        """Do all that a run does; whatever is raised here and not expected, the worker reports."""
+        """Do all work of a run; the worker reports unexpected exceptions."""
         outcome = self._outcome(run)
         if outcome.maps is not None:
             run.found(outcome.maps)
@@ -148,10 +148,10 @@ class EmWorker:
         self._end(run, outcome)
 
     def _judge(self, run: Run, outcome: Outcome, maps: MapSet) -> None:
-        """Add what the maps say of sensors and readings; the maps are good without it."""
+        """Add the health of sensors and warnings; the maps are valid without them."""
         try:
             outcome.health = sensor_health(maps)
-            outcome.warnings = [*deaf(maps.readings), *input_warnings(maps.readings)]
+            outcome.warnings = [*without_echoes(maps.readings), *input_warnings(maps.readings)]
         except Exception as error:
             outcome.warnings = [f'sensors could not be judged: {error!r}']
 
@@ -188,7 +188,7 @@ class EmWorker:
                 try:
                     done(outcome)
                 except Exception as error:
-                    # one that fails must not keep the others waiting, nor wait itself
+                    # if one callback fails, the others are still called, and its own caller is answered
                     self._log(f'EM has ended, but not every caller could be informed: {error!r}')
                     with suppress(Exception):
                         done(Outcome(None, f'EM has ended, but the work after it failed: {reason(error)}'))
@@ -197,7 +197,7 @@ class EmWorker:
 
 
 def summary(maps: MapSet, seconds: float) -> str:
-    """Return a run's result in one line."""
+    """Return the result of a run in one line."""
     s = maps.statistics
     return (
         f'{len(maps.readings)} readings, {s["occupied"]} occupied cells, {seconds:.2f} seconds '

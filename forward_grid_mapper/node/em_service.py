@@ -1,4 +1,4 @@
-"""EM as the node's callers see it: the service run_em, and the maps of the latest run."""
+"""The service run_em, and the maps of the latest run."""
 
 from __future__ import annotations
 
@@ -31,21 +31,21 @@ from .refining import Drive, Found, RefiningMapper
 from .sensor_status import SensorWatch
 from .trajectory import Trajectory
 
-ITS_OWN = 2
-"""Those who wait for the end of a run on its own account, before all others."""
+OWN_CALLBACKS = 2
+"""Number of callbacks of a run itself, which precede those of callers in `Run.waiting`."""
 
-TELLING = 10.0
-"""Seconds between two lines in the log while a trajectory is looked for."""
+LOG_PERIOD = 10.0
+"""Seconds between two lines of progress in the log while the trajectory is estimated."""
 
 LONG_WAIT = 0.5
-"""Seconds of waiting for kernels that a caller is told of."""
+"""Seconds of waiting for kernels from which the answer mentions them."""
 
-Taken = tuple[int, Readings, Any]
-"""Number of readings accepted, those that are held, and stamps and poses of odometry."""
+RunInput = tuple[int, Readings, Any]
+"""Number of readings accepted; those that are held; stamps and poses of odometry."""
 
 
-def _waited_for(taken: queue.SimpleQueue[Taken | Exception], run: Run) -> Taken:
-    """Return what the executor takes for a run, or raise what it met, unless this is cancelled."""
+def _waited_for(taken: queue.SimpleQueue[RunInput | Exception], run: Run) -> RunInput:
+    """Return the input of a run from the executor, or raise its exception; stop waiting if the run is cancelled."""
     while True:
         if run.cancelled:
             raise Cancelled('cancelled before it began')
@@ -56,40 +56,40 @@ def _waited_for(taken: queue.SimpleQueue[Taken | Exception], run: Run) -> Taken:
             return found
 
 
-def _tell_all(waiting: list[Callable[[Outcome], object]], why: str) -> None:
-    """Tell those who wait for a run that it does not begin."""
-    told = list(waiting)
+def _fail_all(waiting: list[Callable[[Outcome], object]], why: str) -> None:
+    """Tell all who wait for a run that it does not begin."""
+    callbacks = list(waiting)
     waiting.clear()
-    for done in told:
+    for done in callbacks:
         done(Outcome(None, why))
 
 
 class EmService:
-    """Runs EM on what was accepted so far, and publishes and keeps what it finds. The executor owns it.
+    """Runs EM on the accepted readings, publishes the maps and keeps them. The executor owns it.
 
     Attributes
     ----------
     maps : MapSet or None
         Of the latest run since the last reset.
     found : Found or None
-        What became of their trajectory; None where none was looked for.
+        Trajectory of the maps; None if none was estimated.
     explained : int
-        Readings that had been accepted when it began.
+        Number of readings that had been accepted when the run began.
     last_run : str
         How the last run ended.
     wrong_input : list of str
-        What is wrong with its readings.
+        Faults of the readings of the latest run.
     sensors : SensorWatch
     online : OnlineWorker or None
-        Gives the map to start from, and takes what was found.
+        Gives the map to start from, and receives the result.
     range_topics : sequence of str
-        Full names, for what is said where nothing has come, as `odom_topic`.
+        Full names, for messages, as is `odom_topic`.
     no_map_frame : callable
-        Returns what keeps odometry out of the map frame, in words, or ''.
+        Returns the fault that keeps odometry out of the map frame, in words, or ''.
     extrinsics : callable
         Returns the poses of the sensors that are fixed to the robot, by frame.
     mounts : callable
-        The same, with those of sensors that were not heard of yet.
+        The same, including sensors that have not sent yet.
     """
 
     def __init__(
@@ -117,13 +117,13 @@ class EmService:
         self._parameters, self._associator, self._publishers = parameters, associator, publishers
         self._trajectory = trajectory
         self._inbox, self._kernels, self._logger = inbox, kernels, logger
-        self._watched = self._told = 0.0
+        self._watched = self._logged = 0.0
         self._generation = 0
         self.worker = EmWorker(self._watch, logger.error, inbox.put, self._wait_for_kernels)
 
     @property
     def current(self) -> Run | None:
-        """The run that goes on, or None."""
+        """The current run, or None."""
         return self.worker.current
 
     def run_em(self, reply: Reply) -> None:
@@ -147,46 +147,46 @@ class EmService:
         if run is None:
             self._start(done)
         elif run.by_itself and run.fresh() and not run.cancelled:
-            # from here on it is one that was asked for
+            # it now has a caller
             run.by_itself = False
             run.waiting.append(done)
         elif run.by_itself:
-            self._give_way(run, done)
+            self._replace(run, done)
         else:
             reply.send(False, f'EM is already running ({run}); call run_em again when it has ended')
 
     def run_by_itself(self) -> bool:
-        """Begin a run that nobody asked for; return whether it began: not while one goes on, nor without readings."""
+        """Begin a run without a caller; return False if there is a current run, or if there are no readings."""
         if self.current is not None or not len(self._associator.buffer):
             return False
-        run = self._start(lambda outcome: self._go_on(run))
+        run = self._start(lambda outcome: self._begin_replacement(run))
         run.by_itself = True
         return True
 
-    def _give_way(self, run: Run, done: Callable[[Outcome], object]) -> None:
-        """End a run that nobody asked for, and have another one begin then."""
+    def _replace(self, run: Run, done: Callable[[Outcome], object]) -> None:
+        """Cancel a run without a caller, and begin another one after it."""
         run.by_itself = False
         if not run.cancelled:
-            # who waited for it, as save_maps does, waits for the other one
-            run.then += run.waiting[ITS_OWN:]
-            del run.waiting[ITS_OWN:]
+            # callers that wait for it, such as save_maps, wait for the other one
+            run.then += run.waiting[OWN_CALLBACKS:]
+            del run.waiting[OWN_CALLBACKS:]
         run.then.append(done)
         self.worker.cancel()
 
-    def _go_on(self, run: Run) -> None:
-        """Begin the run that one which has ended gave way to, if it did."""
+    def _begin_replacement(self, run: Run) -> None:
+        """After a cancelled run, begin the run that replaces it, if any."""
         if not run.then:
             return
         first, *others = run.then
         try:
             self._start(first).waiting.extend(others)
         except Exception as error:
-            _tell_all(run.then, f'EM cannot begin: {reason(error)}')
+            _fail_all(run.then, f'EM cannot begin: {reason(error)}')
             raise
         run.then.clear()
 
     def cancel(self, reply: Reply) -> None:
-        """Cancel the run that goes on, forget nothing, and answer when it has ended."""
+        """Cancel the current run, keep readings and maps, and answer after its end."""
         run = self.current
         if run is None:
             reply.send(False, 'EM is not running: there is nothing to cancel')
@@ -198,13 +198,13 @@ class EmService:
             else:
                 reply.send(True, f'{outcome.message} (after {run.seconds:.1f} s); readings and earlier maps are kept')
 
-        run.asked = True
+        run.end_requested = True
         run.waiting.append(ended)
-        _tell_all(run.then, 'EM was cancelled by cancel_em')
+        _fail_all(run.then, 'EM was cancelled by cancel_em')
         self.worker.cancel()
 
     def when_there_are_maps(self, done: Callable[[Outcome], object]) -> None:
-        """Have `done` called with the latest maps: at once, when the run that goes on has ended, or after a new one."""
+        """Have `done` called with the latest maps: at once, after the current run, or after a new run."""
         run = self.current
         if self.maps is not None:
             done(Outcome(self.maps, ''))
@@ -218,37 +218,37 @@ class EmService:
             self._start(done)
 
     def reset(self) -> None:
-        """Forget the maps, and cancel the run that goes on."""
+        """Forget the maps, and cancel the current run."""
         self.worker.cancel()
         if self.current is not None:
-            _tell_all(self.current.then, 'EM was cancelled by reset')
+            _fail_all(self.current.then, 'EM was cancelled by reset')
         self._generation = self._publishers.generation
         self.maps, self.found, self.wrong_input, self.last_run = None, None, [], 'none since the reset'
         self.sensors.clear()
 
     def close(self, seconds: float) -> None:
-        """Cancel the run that goes on, and wait so long for its end."""
+        """Cancel the current run, and wait at most so many seconds for its end."""
         self.worker.close(seconds)
 
     def _start(self, done: Callable[[Outcome], object]) -> Run:
-        """Begin a run; `done` is called with how it ended, before others who come to wait for it."""
+        """Begin a run; `done` is called with its outcome, before callbacks that are added later."""
         generation, bound = self._publishers.generation, self._associator.buffer.bound
-        # what comes while kernels are compiled is mapped as well
+        # readings that arrive while kernels are compiled are mapped as well
         early = not all(map(self._kernels.has, self._needed()))
         taken, begun = [self._take()], threading.Event()
 
-        def take_now() -> Taken:
-            asked = queue.SimpleQueue[Taken | Exception]()
+        def take_now() -> RunInput:
+            answer = queue.SimpleQueue[RunInput | Exception]()
 
             def take() -> None:
                 try:
-                    asked.put(self._take())
+                    answer.put(self._take())
                 except Exception as error:
-                    # the run would wait for ever
-                    asked.put(error)
+                    # otherwise the run would wait for ever
+                    answer.put(error)
 
             self._inbox.put(take)
-            return _waited_for(asked, run)
+            return _waited_for(answer, run)
 
         def readings() -> Readings:
             begun.set()
@@ -258,16 +258,16 @@ class EmService:
 
         def found(maps: MapSet) -> None:
             if isinstance(mapper, RefiningMapper) or moved:
-                # the transform to the map changes together with the maps
+                # the transform from the map frame changes together with the maps
                 self._inbox.put(lambda: self._show_moved(maps, mapper, taken[0][0], generation))
             else:
                 self._show(maps, generation)
 
         def finish(outcome: Outcome) -> None:
-            # whoever waits is told the same
+            # all callers get the same outcome
             if generation != self._publishers.generation:
                 outcome.maps, outcome.message = None, 'EM was cancelled by reset'
-            elif outcome.maps is None and run.asked:
+            elif outcome.maps is None and run.end_requested:
                 outcome.message = 'EM was cancelled by cancel_em'
             elif outcome.maps is None and not len(taken[0][1]):
                 lack = self.no_map_frame()
@@ -287,7 +287,7 @@ class EmService:
 
         def drive() -> Drive:
             _, held, odometry = taken[0]
-            # after a restart the journal's readings are all there is of the odometry before
+            # after a restart, readings of the journal are the only record of the odometry before it
             return Drive(recovered(Odometry.of(*odometry), held, mounts), held)
 
         def now() -> Drive:
@@ -296,7 +296,7 @@ class EmService:
 
         mapper, moved = self._trajectory.mapper(parameters, drive, now), self._trajectory.on
         start = self.online.so_far() if self.online and self._trajectory.correction is None else None
-        # it comes back if the run ends without a map, since the map so far is shown meanwhile
+        # intermediate maps are shown meanwhile; if the run ends without a map, this one is published again
         before = self._publishers.ml_map
         run = Run(mapper, parameters, readings, found, start, fresh=fresh)
         self._generation = generation
@@ -304,23 +304,23 @@ class EmService:
         run.waiting.append(done)
         return run
 
-    def _take(self) -> Taken:
+    def _take(self) -> RunInput:
         buffer = self._associator.buffer
         return len(buffer), buffer.snapshot(), self._associator.odometry
 
     def _show(self, maps: MapSet, generation: int) -> None:
-        """Publish the maps of a run; any thread."""
+        """Publish the maps of a run; may be called from any thread."""
         self._publishers.publish('ml_map', generation, maps.grid, maps.ml)
         self._publishers.publish('uncertainty_map', generation, maps.grid, maps.uncertainty)
 
     def _show_moved(self, maps: MapSet, mapper: Any, count: int, generation: int) -> None:
-        """Go on with the trajectory of a run, and publish its maps."""
+        """Use the trajectory of a run, and publish its maps."""
         if generation == self._publishers.generation:
             self._trajectory.adopt(mapper.found if isinstance(mapper, RefiningMapper) else None, count)
             self._show(maps, generation)
 
     def _needed(self) -> tuple[str, ...]:
-        """Return the steps of compilation that a run waits for."""
+        """Return the steps of compilation that a run needs."""
         return ('EM', 'trajectory') if self._parameters().node.refine_poses else ('EM',)
 
     def _wait_for_kernels(self, stop: Callable[[], bool]) -> None:
@@ -333,7 +333,7 @@ class EmService:
             self.last_run = outcome.message
             self._logger.warning(outcome.message if outcome.message.startswith('EM ') else f'EM: {outcome.message}')
             if self.online:
-                # what it showed while EM ran was not published
+                # maps that it made during EM were not published
                 self.online.show()
             return
         self.maps, self.found, self.explained = maps, self._trajectory.found, count
@@ -347,12 +347,12 @@ class EmService:
         said = filter(None, [summary(maps, sum(maps.statistics['seconds'].values())), outcome.trajectory])
         self.last_run = '; '.join(said)
         self._logger.info(f'EM: {self.last_run}')
-        # whoever called EM has his answer before this
+        # callers of EM are answered before this
         fixed, generation = dict(self.extrinsics()), self._publishers.generation
         self.worker.worker.put(lambda: self._check_consistency(maps, fixed, generation))
 
     def _check_consistency(self, maps: MapSet, fixed: Mapping[str, Pose2], generation: int) -> None:
-        """Look for poses and stamps that contradict the readings; in the worker's thread."""
+        """Look for sensor poses and clock offsets that contradict the readings; in the worker's thread."""
         found = consistency_warnings(maps.readings, fixed, maps.parameters)
 
         def take() -> None:
@@ -365,12 +365,12 @@ class EmService:
             self._inbox.put(take)
 
     def _watch(self, run: Run) -> None:
-        """Show the map found so far, and the progress, at most `publish_rate` times a second; in the run's thread."""
+        """Log progress and publish the map found so far, at most `publish_rate` times a second; in the run's thread."""
         now = time.monotonic()
         rate = self._parameters().node.publish_rate
         if run.progress is None:
-            if now - max(self._told, run.begin) > TELLING:
-                self._told = now
+            if now - max(self._logged, run.begin) > LOG_PERIOD:
+                self._logged = now
                 self._logger.info(f'EM: {run}')
             return
         if now - max(self._watched, run.begin) < 1.0 / rate:

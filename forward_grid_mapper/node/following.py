@@ -1,4 +1,4 @@
-"""Following in the background: the trajectory that a run found goes on with every window that the robot drives."""
+"""Following in the background: online SLAM that continues the trajectory of a run."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ from .background import Inbox, Worker
 
 
 class Following:
-    """Owned by the executor; its methods return at once.
+    """Runs a `Follower` in a thread. The executor owns it; its methods return at once.
 
     Attributes
     ----------
     follower : Follower or None
-        What follows; its thread changes it.
+        None if no trajectory is followed; the thread changes it.
     """
 
     def __init__(self, log: Any, inbox: Inbox, changed: Callable[[Correction], object]) -> None:
-        """Follow nothing yet; `changed` is called by the executor with each correction that is new."""
+        """Prepare; the executor calls `changed` with each new correction."""
         self.follower: Follower | None = None
         self.worker = Worker('following', log.error)
         self._log, self._inbox, self._changed = log, inbox, changed
@@ -36,11 +36,11 @@ class Following:
 
     @property
     def obstacle(self) -> str:
-        """Why nothing is followed any more, in words; empty while it is, or was never begun."""
+        """The reason why following ended, in words; '' while it continues, or if it never began."""
         return self.follower.obstacle if self.follower else ''
 
     def begin(self, follower: Follower | None) -> None:
-        """Go on with another follower; with none, end."""
+        """Replace the follower; None to end."""
         self.cancel()
         self.follower, self._busy, self._seen = follower, False, None
         self._say()
@@ -48,15 +48,15 @@ class Following:
     def offer(
         self, at: Pose2, drive: Callable[[], tuple[Readings, tuple[NDArray[np.int64], NDArray[np.float64]]]]
     ) -> None:
-        """Have what there is by now followed, unless the thread is busy, or the robot has not moved; called often.
+        """Follow the drive so far, unless the thread is busy or the robot has not moved; called often.
 
         Parameters
         ----------
         at : Pose2
             The newest pose of odometry.
         drive : callable
-            Called where there is something to follow; returns all readings that are held, as odometry placed them, and
-            odometry: stamps, int64, shape (M,), and poses, float64, shape (M, 3).
+            Called if it is followed; returns all readings that are held, as odometry placed them, and odometry: stamps,
+            int64, shape (M,), and poses, float64, shape (M, 3).
         """
         follower = self.follower
         if follower is None or self._busy or follower.obstacle or at == self._seen:
@@ -78,18 +78,18 @@ class Following:
         self.worker.put(work, failed)
 
     def cancel(self) -> None:
-        """Have what goes on end soon; nothing of it is taken."""
+        """Cancel the current work; its result is dropped."""
         if self.follower is not None:
             self.follower.cancel()
             self.follower = None
 
     def close(self, seconds: float) -> None:
-        """Cancel, and wait so long for the end of the thread."""
+        """Cancel, and wait at most so many seconds for the end of the thread."""
         self.cancel()
         self.worker.close(seconds)
 
     def values(self) -> dict[str, str]:
-        """Return what diagnostics say."""
+        """Return values for diagnostics."""
         follower = self.follower
         if follower is None:
             return {}

@@ -1,4 +1,4 @@
-"""Where sensors sit and what the map frame is: parameters first, then TF where tf2_ros is installed."""
+"""Poses of sensors and the map frame: from parameters first, then from TF if tf2_ros is installed."""
 
 from __future__ import annotations
 
@@ -16,36 +16,36 @@ from ..core.messages.stamp_order import GOES_ON, JUMP, JUMPED_BACK, StampOrder
 TF, TF_STATIC = '/tf', '/tf_static'
 
 PATIENCE = 0.2
-"""Seconds before a frame that TF did not know is asked for again, so that a missing one costs next to nothing."""
+"""Seconds before a frame that TF did not know is looked up again, so that a missing frame costs little."""
 
 
 MOST_HELD = 10_000
-"""Odometry messages that wait for a transform at the most."""
+"""Most odometry messages that wait for a transform."""
 
 LOOKUPS = 100
-"""Transforms that one odometry message asks for at the most, so that a transform that comes late holds up nobody."""
+"""Most lookups of transforms for each odometry message, so that late transforms do not block the executor."""
 
 TILTED = Later('bad_pose')
-"""What the transform to the map frame is where it gives no pose on a floor."""
+"""Result for a transform to the map frame that is not a pose on a floor."""
 
 STILL = 1e-3
-"""Metres, or radians, by which the pose of a sensor may change for it to be fixed to the robot."""
+"""Largest change, metres or radians, of the pose of a sensor that is fixed to the robot."""
 
 MOST_MISSING = 1000
-"""Frames whose absence, or pose, is remembered, so that names that strangers make up cost no memory."""
+"""Most frames that are remembered as missing, or with a pose, so that invented names do not fill the memory."""
 
 
 LASTING = 3.0
-"""Seconds without a transform to the map frame from which on there is a warning."""
+"""Seconds without a transform to the map frame before a warning."""
 
 
 class Transforms:
-    """Transforms at a stamp, from a tf2 buffer and without waiting for it; knows none without tf2_ros.
+    """Looks up transforms in a tf2 buffer, without waiting; finds none without tf2_ros.
 
     Attributes
     ----------
     topics : list of str
-        That transforms come from, as the node resolves their names.
+        Topics of the transforms, as the node resolves their names.
     """
 
     def __init__(self, buffer: Any = None, error: type[Exception] = Exception, topics: tuple[str, ...] = ()) -> None:
@@ -57,32 +57,32 @@ class Transforms:
 
     @classmethod
     def of(cls, node: Any) -> Transforms:
-        """Listen to TF on behalf of a node, if tf2_ros is installed."""
+        """Subscribe to TF for a node, if tf2_ros is installed."""
         try:
             import tf2_ros
         except ImportError:
             return cls()
         buffer = tf2_ros.Buffer()
-        # the listener lives as long as the buffer that it fills
+        # so that the listener lives as long as the buffer
         buffer.listener = tf2_ros.TransformListener(buffer, node, spin_thread=False)
         _listen_to_volatile(buffer, node)
         return cls(buffer, tf2_ros.TransformException, tuple(map(node.resolve_topic_name, (TF, TF_STATIC))))
 
     @property
     def available(self) -> bool:
-        """Whether there is any TF to ask."""
+        """Whether there is a TF buffer."""
         return self._buffer is not None
 
-    def heed(self, stamp: int) -> str:
-        """Take the stamp of a message in nanoseconds; where the clock jumped back, forget the transforms of before.
+    def check_stamp(self, stamp: int) -> str:
+        """Process the stamp of a message, nanoseconds; if the clock jumped back, forget all transforms before.
 
-        TF refuses transforms that are much older than those it has, and joins others with those of the time before the
-        jump. Static transforms stay: tf2 never forgets them.
+        TF refuses transforms that are much older than its newest ones, and interpolates others with those before the
+        jump. Static transforms remain: tf2 never forgets them.
 
         Returns
         -------
         str
-            What the stamp says of those before it (`stamp_order.order_of`).
+            Relation of the stamp to earlier ones (`stamp_order.order_of`).
         """
         order = self._order.take(stamp)
         if order == JUMPED_BACK:
@@ -92,9 +92,9 @@ class Transforms:
         return order
 
     def lookup(self, target: str, source: str, stamp: int) -> Any | Later:
-        """Return the `geometry_msgs/Transform` of `source` in `target` at `stamp` in nanoseconds, or a `Later`."""
+        """Return the `geometry_msgs/Transform` of `source` in `target` at `stamp`, nanoseconds, or a `Later`."""
         key = (target, source)
-        # rclpy's Time raises for what is before 1970, and TF has nothing then
+        # rclpy's Time raises for stamps before 1970, and TF has no transforms of that time
         if self._buffer is None or stamp < 0 or time.monotonic() < self._missing.get(key, 0.0):
             return LATER
         if len(self._missing) > MOST_MISSING:
@@ -113,7 +113,7 @@ class Transforms:
 
 
 class Extrinsics:
-    """Poses of the sensors on the robot: those given as parameters win over TF."""
+    """Poses of the sensors on the robot: parameters take precedence over TF."""
 
     def __init__(self, given: Mapping[str, Pose2], transforms: Transforms) -> None:
         self._given = {frame.lstrip('/'): pose for frame, pose in given.items()}
@@ -124,16 +124,16 @@ class Extrinsics:
 
     @property
     def fixed(self) -> dict[str, Pose2]:
-        """The poses of the sensors that were asked for and did not move on the robot, by frame."""
+        """Poses of the sensors that were looked up and did not move on the robot, by frame."""
         return {frame: pose for frame, pose in self._used.items() if frame not in self._moved}
 
     @property
     def known(self) -> dict[str, Pose2]:
-        """Those, and the ones that parameters give."""
+        """The poses in `fixed`, and those given as parameters."""
         return {**self._given, **{frame.lstrip('/'): pose for frame, pose in self.fixed.items()}}
 
     def __call__(self, base_frame: str, frame: str, stamp: int) -> Pose2 | Later | str | None:
-        """Return the pose of a sensor at a stamp, as `ExtrinsicsLookup` has it."""
+        """Return the pose of a sensor at a stamp, as defined by `ExtrinsicsLookup`."""
         pose = self._look_up(base_frame, frame, stamp)
         if isinstance(pose, Pose2) and (frame in self._used or len(self._used) < MOST_MISSING):
             first = self._used.setdefault(frame, pose)
@@ -161,12 +161,12 @@ class Extrinsics:
 
 
 class MapFrame:
-    """Gives odometry in another map frame, by the transform that TF has at its stamp; holds it back until TF does.
+    """Transforms odometry to another map frame, with TF at its stamp; messages wait until TF has the transform.
 
     Attributes
     ----------
     timeout : float
-        Seconds, by stamps, for which it is held back; it may change.
+        Longest wait, seconds by stamps; may be changed.
     dropped : int
         Messages for which TF had no transform in time.
     """
@@ -182,17 +182,17 @@ class MapFrame:
 
     @property
     def found(self) -> bool:
-        """Whether TF had the transform that was asked for last."""
+        """Whether TF had the transform of the last lookup."""
         return self._lack is None
 
     @property
     def newest_stamp(self) -> int | None:
-        """The stamp of the newest message that is held back, nanoseconds."""
+        """The stamp of the newest waiting message, nanoseconds."""
         return self._held[-1].stamp if self._held else None
 
     @property
     def lack(self) -> str:
-        """What kept the newest odometry out of the map frame, in words, or ''."""
+        """The fault that keeps the newest odometry out of the map frame, in words, or ''."""
         if self._lack is None:
             return ''
         way = f'from {self._map_frame} (map_frame) to {self._frame}'
@@ -204,26 +204,26 @@ class MapFrame:
         return f'TF has no transform {way}: {waiting}; is a localisation node running?'
 
     def fault(self) -> str:
-        """Return what keeps odometry that comes out of the map frame for `LASTING` seconds now, in words, or ''."""
+        """Return the fault that has kept arriving odometry out of the map frame for `LASTING` seconds, or ''."""
         now = time.monotonic()
         return '' if now - self._lacking < LASTING or now - self._newest > LASTING else self.lack
 
     def convert(self, message: OdometryMessage) -> list[OdometryMessage]:
-        """Take an odometry message; return those whose pose in the map frame is known now, `LOOKUPS` of them, in order.
+        """Add an odometry message; return those whose pose in the map frame is known now, in order, at most `LOOKUPS`.
 
-        Others wait for the next call.
+        The others wait for the next call.
         """
-        order = self._transforms.heed(message.stamp)
+        order = self._transforms.check_stamp(message.stamp)
         if not self._map_frame or message.frame_id.lstrip('/') == self._map_frame.lstrip('/'):
             return [message]
-        # the associator sorts in what only overtook; a stamp that was ahead would keep all others waiting
+        # the associator sorts messages that only overtook others; a stamp far ahead would block all others
         while order != GOES_ON and self._held and (order == JUMPED_BACK or self._held[-1].stamp > message.stamp + JUMP):
             self.dropped += 1
             self._held.pop()
         self._held.append(message)
         self._newest, self._frame = time.monotonic(), message.frame_id
         if len(self._held) > MOST_HELD:
-            # stamps that stand still never time out
+            # messages with equal stamps never time out
             self._held.popleft()
             self.dropped += 1
         ready = []
@@ -246,7 +246,7 @@ class MapFrame:
         return ready
 
     def _note(self, transform: Any | Later, planar: bool) -> None:
-        """Remember since when there is no transform, or none that a robot on a floor can have."""
+        """Note whether there is a planar transform, and since when there is none."""
         if isinstance(transform, Later) or not planar:
             if self._lack is None:
                 self._lacking = time.monotonic()
@@ -256,10 +256,10 @@ class MapFrame:
 
 
 def _listen_to_volatile(buffer: Any, node: Any) -> None:
-    """Take static transforms from publishers, too, that keep none for late subscribers.
+    """Subscribe to static transforms of volatile publishers as well.
 
-    tf2's own listener asks for those that do (transient local), and gets nothing from others, such as a bag recorded
-    without its quality of service. Whoever fits both is heard twice, which changes nothing.
+    tf2's own listener requests transient local durability, and is incompatible with other publishers, such as a bag
+    recorded without its quality of service. Messages of transient local publishers arrive twice, which is harmless.
     """
     from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
     from tf2_msgs.msg import TFMessage

@@ -1,4 +1,4 @@
-"""Which sensors have stopped sending while others go on."""
+"""Sensors that have stopped sending while others still send."""
 
 from __future__ import annotations
 
@@ -9,22 +9,22 @@ from ..core.messages.message_account import MOST_FRAMES
 from ..core.messages.rep117 import LONGEST_NAME
 
 TIME_OUT = 3.0
-"""Least seconds without a message after which a sensor is silent."""
+"""Shortest time without a message, seconds, after which a sensor is silent."""
 
 USUAL = 5.0
-"""Times its usual interval for which a sensor that sends rarely may be quiet."""
+"""Time without a message, in usual intervals, after which a sensor that sends rarely is silent."""
 
 
 def _patience(interval: float) -> float:
-    """Return the seconds after which a sensor that sends once in `interval` is silent."""
+    """Return the seconds after which a sensor with this usual interval is silent."""
     return max(TIME_OUT, USUAL * interval)
 
 
 class Heard:
-    """When each sensor sent last, and how long it usually takes until it sends again.
+    """The time of the last message of each sensor, and its usual interval.
 
-    A sensor is silent when others sent something long after it. So none is where nothing comes at all: a robot that is
-    switched off, or a bag that has ended.
+    A sensor is silent if others sent something long after it. So none is silent if no messages arrive at all, as when a
+    robot is switched off or a bag has ended.
     """
 
     def __init__(self) -> None:
@@ -42,7 +42,7 @@ class Heard:
         self._sensors.clear()
 
     def note(self, frame: str) -> None:
-        """Note that a message of a sensor came."""
+        """Note a message of a sensor."""
         now = self._newest = time.monotonic()
         before = self._sensors.get(frame)
         if before is not None:
@@ -58,10 +58,10 @@ class Heard:
 
     @property
     def patience(self) -> float:
-        """Seconds after which all are silent if nothing came."""
+        """Seconds without any message after which all sensors are silent."""
         return min((_patience(usual) for _, usual in self._sensors.values()), default=TIME_OUT)
 
     def silent(self) -> dict[str, float]:
-        """Return the sensors that are silent, and for how many seconds."""
+        """Return the silent sensors, and the seconds since their last message."""
         now, newest = time.monotonic(), self._newest
         return {f: now - last for f, (last, usual) in self._sensors.items() if newest - last > _patience(usual)}

@@ -1,4 +1,4 @@
-"""From subscriptions to the associator, in portions, and with an account of what was lost on the way."""
+"""From subscriptions to the associator, in portions, with counts of lost messages."""
 
 from __future__ import annotations
 
@@ -22,32 +22,32 @@ from .heard import Heard
 from .losses import LASTING, Losses
 
 QUEUE = 2000
-"""Messages that may wait for the node in the middleware, so that a pause of a second loses none."""
+"""Most messages that may wait for the node in the middleware, so that none is lost in a pause of a second."""
 
 AT_ONCE = 200
-"""Messages, or readings, after which the executor gets its turn: two milliseconds or so."""
+"""Messages, or readings, of one portion: about 2 ms of the executor's time."""
 
 
 class _InMapFrame(NamedTuple):
-    """Odometry that has its pose in the map frame."""
+    """Odometry whose pose is in the map frame."""
 
     message: OdometryMessage
 
 
 class Intake:
-    """Takes messages as they come, or holds them back while the associator is not ready.
+    """Receives messages, and holds them back while the associator is not ready.
 
     Attributes
     ----------
     paused : bool
     reliable : bool
-        Whether lost messages are a fault, or to be expected.
+        Whether QoS of ranges is reliable, so that lost messages are a fault.
     range_losses : list of Losses
         Of each Range topic.
     heard : Heard
-        When each sensor sent last.
+        The time of each sensor's last message.
     odometry_came : int
-        Odometry messages so far, also those that wait, and those of before a reset.
+        Odometry messages received, including waiting ones and those before a reset.
     """
 
     def __init__(
@@ -58,7 +58,7 @@ class Intake:
         map_frame: MapFrame,
         on_taken: Callable[[int], object],
     ) -> None:
-        """Prepare to `subscribe`; messages are held back until `begin`.
+        """Prepare for `subscribe`; messages are held back until `begin`.
 
         Parameters
         ----------
@@ -67,7 +67,7 @@ class Intake:
         associator : PoseAssociator
         map_frame : MapFrame
         on_taken : callable
-            Given the time at which each Range was published, nanoseconds of the system's clock.
+            Receives the time at which each Range was published, nanoseconds of the system's clock.
         """
         own = parameters.node
         self._node, self._associator, self._map_frame, self._on_taken = node, associator, map_frame, on_taken
@@ -77,12 +77,12 @@ class Intake:
         self._odometry_clock = OdometryClock(associator, node.get_logger().warning)
         self._sensor_clocks = SensorClocks(node.get_logger().warning)
         self._held: deque[tuple[RangeMessage | OdometryMessage | _InMapFrame, int, bool]] = deque()
-        self._ranges_held = self._refused = self._told_of = self.odometry_came = 0
+        self._ranges_held = self._refused = self._losses_logged = self.odometry_came = 0
         self._last_refused: RangeMessage | None = None
         self._next_warning = 0.0
         self._more = node.create_guard_condition(self.work)
         self._own = own
-        # a topic under two names is one
+        # two names may resolve to the same topic
         self._topics = list({node.resolve_topic_name(topic): topic for topic in own.range_topics}.values())
         self._subscribed: list[Any] = []
         self.subscriptions: dict[str, QoSProfile] = {}
@@ -91,23 +91,23 @@ class Intake:
 
     @property
     def listening(self) -> bool:
-        """Whether messages are taken."""
+        """Whether the node is subscribed."""
         return bool(self._subscribed)
 
     def subscribe(self) -> None:
-        """Take messages from here on; if a topic fails, from none."""
+        """Subscribe to all topics, or to none if one fails."""
         own = self._own
         try:
             for topic, losses in zip(self._topics, self.range_losses, strict=True):
                 self._subscribe(Range, topic, own.range_reliability, partial(self.on_range, losses), losses)
             self._subscribe(Odometry, own.odom_topic, own.odom_reliability, self.on_odometry, self._odometry_losses)
         except BaseException:
-            # or else the next call would have messages taken twice
+            # otherwise the next call would subscribe twice
             self.unsubscribe()
             raise
 
     def unsubscribe(self) -> None:
-        """Take no messages any more; what is missing when they are taken again was not lost."""
+        """Unsubscribe; messages until the next `subscribe` do not count as lost."""
         for subscription in self._subscribed:
             self._node.destroy_subscription(subscription)
         self._subscribed.clear()
@@ -126,16 +126,16 @@ class Intake:
 
     def _subscribe(self, kind: Any, topic: str, reliability: str, callback: Any, losses: Losses) -> None:
         quality = QoSProfile(depth=QUEUE, reliability=ReliabilityPolicy[reliability.upper()])
-        events = SubscriptionEventCallbacks(message_lost=losses.told)
+        events = SubscriptionEventCallbacks(message_lost=losses.reported)
         made = self._node.create_subscription(kind, topic, callback, quality, event_callbacks=events)
         self._subscribed.append(made)
         self.subscriptions[self._node.resolve_topic_name(topic)] = quality
 
-    # the account
+    # counts
 
     @property
     def received(self) -> int:
-        """Number of Range messages that came: accepted + waiting + rejected."""
+        """Number of Range messages received: accepted + waiting + rejected."""
         return self._associator.received + self._ranges_held + self._refused
 
     @property
@@ -154,7 +154,7 @@ class Intake:
         return self._odometry_losses.lost
 
     def faults(self) -> list[str]:
-        """Return what to warn of; the log is told as well, now and then."""
+        """Return the faults, in words; losses and clocks are logged as well, at most every few seconds."""
         clocks = [*self._odometry_clock.faults(), *self._sensor_clocks.faults(self._associator.odometry_stamp)]
         return [*self._loss_faults(), *clocks]
 
@@ -176,13 +176,13 @@ class Intake:
             f'{self.lost} Range and {self.odometry_lost} odometry messages so far were lost before this node received '
             f'them (estimated): {remedy}'
         )
-        if now > self._next_warning and self.lost + self.odometry_lost > self._told_of:
-            self._next_warning, self._told_of = now + LASTING, self.lost + self.odometry_lost
+        if now > self._next_warning and self.lost + self.odometry_lost > self._losses_logged:
+            self._next_warning, self._losses_logged = now + LASTING, self.lost + self.odometry_lost
             self._node.get_logger().warning(text)
         return [text]
 
     def loss_note(self) -> list[str]:
-        """Return what a report is to say of lost messages."""
+        """Return a warning about lost messages for the report, or none."""
         if not self.lost + self.odometry_lost:
             return []
         return [
@@ -193,7 +193,7 @@ class Intake:
     # messages
 
     def on_range(self, losses: Losses, message: Range, info: dict[str, Any]) -> None:
-        """Take a Range."""
+        """Receive a Range."""
         made, sent = range_message(message), info['source_timestamp']
         losses.taken(info, made.frame_id, made.stamp)
         self.heard.note(made.frame_id)
@@ -208,7 +208,7 @@ class Intake:
         self._wake()
 
     def on_odometry(self, message: Odometry, info: dict[str, Any]) -> None:
-        """Take an Odometry."""
+        """Receive an Odometry."""
         made, sent = odometry_message(message), info['source_timestamp']
         self.odometry_came += 1
         self._odometry_losses.taken(info, made.frame_id, made.stamp)
@@ -221,7 +221,7 @@ class Intake:
         self._wake()
 
     def begin(self) -> None:
-        """Give the associator what was held back, and what comes."""
+        """Give the associator the messages held back, and later ones as they arrive."""
         self._ready = True
         if self._last_refused is not None:
             self._associator.reject(self._last_refused, 'too_many_waiting', self._refused)
@@ -229,7 +229,7 @@ class Intake:
         self._wake()
 
     def work(self) -> None:
-        """Go on with what is left to do, a portion of it; called by the executor."""
+        """Process a portion of the remaining work; called by the executor."""
         if not self._ready:
             return
         done = self._associator.settled + AT_ONCE
@@ -245,17 +245,17 @@ class Intake:
         self._wake()
 
     def forget(self) -> None:
-        """Forget what was held back, with the account of all messages."""
+        """Forget the messages held back, and all counts."""
         self._held.clear()
         self._ranges_held = 0
         for losses in (*self.range_losses, self._odometry_losses):
             losses.clear()
-        self._told_of = 0
+        self._losses_logged = 0
         self._forget_senders()
 
     @property
     def busy(self) -> bool:
-        """Whether something is left to do before the next message is taken."""
+        """Whether work remains before the next message."""
         return bool(self._held) or self._associator.behind
 
     def _hold(self, message: RangeMessage | OdometryMessage, sent: int) -> None:
@@ -265,14 +265,14 @@ class Intake:
         if self._ready:
             self._associator.reject(message, 'too_many_waiting')
         else:
-            # the associator is another thread's for now
+            # another thread uses the associator
             self._last_refused = message
             self._refused += 1
 
     def _take(self, message: RangeMessage | OdometryMessage | _InMapFrame, sent: int, paused: bool) -> None:
         if isinstance(message, OdometryMessage):
             converted = self._map_frame.convert(message)
-            # the others take turns with what waits
+            # the others are processed in turn with the waiting messages
             self._held.extendleft((_InMapFrame(other), sent, False) for other in reversed(converted[1:]))
             if converted:
                 self._add_odometry(converted[0], sent)
@@ -285,13 +285,13 @@ class Intake:
             self._associator.add_range(message, sent)
 
     def _newest_odometry(self) -> int | None:
-        """Return the newest stamp of odometry as it came, also of what waits for TF; None before the first."""
+        """Return the newest stamp of odometry received, including messages that wait for TF; None before the first."""
         stamps = (self._associator.odometry_stamp, self._map_frame.newest_stamp)
         return max((stamp for stamp in stamps if stamp is not None), default=None)
 
     def _add_odometry(self, message: OdometryMessage, sent: int) -> None:
         self._associator.add_odometry(message, sent)
-        self._odometry_clock.look()
+        self._odometry_clock.check()
 
     def _wake(self) -> None:
         if self._ready and self.busy:

@@ -1,4 +1,4 @@
-"""What links the associator to its journal: readings go to disk as they come, and come back after a restart."""
+"""Connects the associator and its journal: readings are written as they arrive, and restored after a restart."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ from ..files.journal_format import stated
 from .diagnostics import status
 
 PERIOD = 0.1
-"""Seconds between two looks for new readings."""
+"""Seconds between two checks for new readings."""
 
 NOTICE = 60.0
-"""Seconds for which the status warns of what was found wrong and dealt with; a key keeps it for ever."""
+"""Seconds for which the status warns of a repaired fault; a value of the status keeps it for ever."""
 
 FULL = (errno.ENOSPC, errno.EDQUOT)
 
 
 class JournalKeeper:
-    """Keeps a node's journal; does nothing where the folder is empty text."""
+    """Keeps a node's journal; does nothing if the folder is ''."""
 
     def __init__(self, node: Node, folder: str, associator: PoseAssociator) -> None:
         """Open the journal; call `restore` before anything else.
@@ -42,7 +42,7 @@ class JournalKeeper:
         Raises
         ------
         OutputError
-            If the journal is another node's, or cannot be opened for another reason than a full disk.
+            If the journal belongs to another node, or cannot be opened for another reason than a full disk.
         """
         self._node = node
         self._associator = associator
@@ -66,7 +66,7 @@ class JournalKeeper:
             warn(f'no journal is kept: {error}')
 
     def restore(self) -> None:
-        """Give the journal's readings to the associator; any thread, as long as no other uses the associator.
+        """Give the journal's readings to the associator; from any thread, while no other one uses the associator.
 
         Raises
         ------
@@ -77,7 +77,7 @@ class JournalKeeper:
             self._restore(self._journal)
 
     def begin(self, clock: Any) -> None:
-        """Look for new readings by a timer, which has this clock, and before readings go."""
+        """Write new readings periodically, with a timer of this clock, and before readings are removed."""
         if self._journal is not None:
             self._associator.buffer.before_thinning.append(self.take)
             self._node.create_timer(PERIOD, self.take, clock=clock)
@@ -104,7 +104,7 @@ class JournalKeeper:
             )
 
     def take(self) -> None:
-        """Hand what is new to the journal, or all that is in memory where the journal has to begin anew."""
+        """Give new readings to the journal, or all readings in memory if the journal must be written again."""
         journal, associator = self._journal, self._associator
         if journal is None:
             return
@@ -128,7 +128,7 @@ class JournalKeeper:
             journal.parameters = stated(parameters)
 
     def reset(self) -> str:
-        """Begin a new drive, since readings were forgotten; return where the old ones are."""
+        """Begin a new drive after readings were forgotten; return the file of the old ones, in words."""
         self._restored = self._taken = 0
         self._last_point = None
         if self._journal is None:
@@ -138,14 +138,14 @@ class JournalKeeper:
         return f'; the journal keeps them in {old.name}' if old != self._journal.path else ''
 
     def close(self) -> None:
-        """Write what is left."""
+        """Write the remaining readings, and close the journal."""
         if self._journal is not None:
             if self._begun:
                 self.take()
             self._journal.close()
 
     def statuses(self, name: str) -> list[DiagnosticStatus]:
-        """Return the status of the journal, if there is to be one."""
+        """Return the status of the journal; none if no journal is wanted."""
         if not self._folder:
             return []
         journal = self._journal

@@ -1,4 +1,4 @@
-"""Compilation in the background while the node listens already: what is needed first, first."""
+"""Compilation of kernels in the background, in the order in which they are needed."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from .background import Worker
 
 
 class Kernels:
-    """Says of each step of `warm_up.STEPS` whether its kernels are there.
+    """Compiles the kernels of each step of `warm_up.STEPS`.
 
     Attributes
     ----------
     stage : str
-        What is being compiled; empty when all is there.
+        The step that is compiled; '' when all are done.
     at_work : set of Kernels
-        Those whose threads still compile or import, during which the interpreter must not be taken down.
+        Instances whose threads still compile or import; the interpreter must not shut down meanwhile.
     """
 
     at_work: ClassVar[set[Kernels]] = set()
@@ -32,9 +32,9 @@ class Kernels:
     def __init__(
         self, log: Callable[[str], object], error: Callable[[str], object], online: bool, refine: bool = False
     ) -> None:
-        """`log` takes notes, `error` what went wrong.
+        """`log` receives notes, `error` failures.
 
-        The kernels of the online map are left out without `online`, those that find a trajectory without `refine`.
+        Without `online`, the kernels of the online map are left out; without `refine`, those of the trajectory.
         """
         self._log = log
         self.worker = Worker('kernels', error, lasting=True)
@@ -45,17 +45,17 @@ class Kernels:
         self.stage = next(iter(self._steps))
 
     def begin(self, ready: Callable[[], None]) -> None:
-        """Begin to compile; `ready` is called, in another thread, when the live map has its kernels."""
+        """Begin to compile; `ready` is called, in another thread, when the kernels of the live map are compiled."""
         self.at_work.add(self)
         self._log('preparing kernels; the first start compiles them, which takes half a minute or more')
         begin = time.monotonic()
-        # the collector would go through all that the compiler made again and again, and keep the executor waiting
+        # the collector would scan all objects of the compiler again and again, and delay the executor
         gc.disable()
         for name in self._steps:
             self.worker.put(partial(self._compile, name, ready, begin), lambda why: self._give_up(ready))
 
     def wait(self, name: str, stop: Callable[[], bool] = lambda: False) -> None:
-        """Wait for the kernels of a step; those of a step that was left out are compiled by who needs them.
+        """Wait for the kernels of a step; a step that was left out is compiled when it is first used.
 
         Raises
         ------
@@ -67,7 +67,7 @@ class Kernels:
                 raise Cancelled('cancelled while kernels were compiled')
 
     def has(self, name: str) -> bool:
-        """Return whether the kernels of a step are there, or it was left out."""
+        """Return whether the kernels of a step are compiled, or the step was left out."""
         return name not in self._done or self._done[name].is_set()
 
     def _compile(self, name: str, ready: Callable[[], None], begin: float) -> None:
@@ -77,30 +77,30 @@ class Kernels:
         self._done[name].set()
         if name == 'live map':
             ready()
-        self._one_less()
+        self._count_done()
 
     def _give_up(self, ready: Callable[[], None]) -> None:
-        """Let everybody go on: whoever needs a kernel compiles it, and says so if it fails."""
+        """Let all who wait continue: kernels are compiled when first used, and a failure is reported there."""
         first = not self.has('live map')
         for done in self._done.values():
             done.set()
         if first:
             ready()
-        self._one_less()
+        self._count_done()
 
-    def _one_less(self) -> None:
-        """Count a step that is over, well or not; the last one ends the work."""
+    def _count_done(self) -> None:
+        """Count a step that ended or failed; the last one ends the work."""
         self._left -= 1
         if not self._left:
             self._end()
 
     def _end(self) -> None:
         self.stage = ''
-        # what a picture needs is a hundred thousand objects more, and there as well by now; a fault in it is told of
-        # when pictures are drawn, and must not leave the collector off
+        # imported while the collector is off, since pictures need about 100 000 further objects; a failure is reported
+        # when pictures are drawn, and must not prevent that the collector is enabled
         with suppress(Exception):
             importlib.import_module('..files.drawing', __package__)
-        # what is there by now stays; the collector need not look at it again
+        # these objects live as long as the process; the collector need not scan them again
         gc.freeze()
         gc.enable()
         self.at_work.discard(self)

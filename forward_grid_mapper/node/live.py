@@ -1,4 +1,4 @@
-"""The live map in the background: takes readings as they come, and hands out immutable snapshots."""
+"""The live map in the background: adds readings as they arrive, and gives immutable snapshots."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from ..core.maps.log_odds_map import LogOddsMap
 from .background import Worker
 
 BATCH = 20_000
-"""Readings that are added at once, so that a reset need not wait for half a million."""
+"""Most readings that are added at once, so that a reset does not wait long."""
 
 
 Place = Callable[[Readings], Readings]
-"""Moves readings to where they belong on the map."""
+"""Transforms readings to the frame of the map."""
 
 
 class LiveSnapshot(NamedTuple):
@@ -33,14 +33,14 @@ class LiveSnapshot(NamedTuple):
 
 
 class LiveMap:
-    """Keeps the log-odds map in a thread of its own; its methods return at once, but for `snapshot`.
+    """Keeps the log-odds map in its own thread; all methods except `snapshot` return at once.
 
     Attributes
     ----------
     generation : int
-        Of the map that goes on; what belongs to an earlier one is dropped.
+        Generation of the current map; tasks for an earlier one are dropped.
     grid : Grid
-        Of the map so far.
+        Grid of the current map.
     """
 
     def __init__(
@@ -56,9 +56,9 @@ class LiveMap:
         ----------
         parameters : Parameters
         publish : callable
-            Takes a snapshot, in the map's thread.
+            Receives a snapshot, in the map's thread.
         log : callable
-            Takes what goes wrong.
+            Receives failures.
         prepare : callable
             Called in the map's thread before anything else.
         """
@@ -73,14 +73,14 @@ class LiveMap:
         self.worker.put(prepare)
 
     def offer(self, readings: Readings, place: Place | None = None) -> None:
-        """Have readings added soon, where `place` puts them."""
+        """Have readings added soon, transformed by `place`."""
         self._offered += len(readings)
         for first in range(0, len(readings), BATCH):
             part = readings.select(slice(first, first + BATCH))
             self.worker.put(partial(self._add, part, place, self.generation))
 
     def replace(self, made: LogOddsMap) -> None:
-        """Go on from another map, in place of all that was offered so far."""
+        """Continue from another map instead of all readings so far."""
         self.worker.put(partial(self._replace, made, self.generation))
         self.touch()
 
@@ -89,12 +89,12 @@ class LiveMap:
         self._published = -1
 
     def change(self, parameters: Parameters) -> None:
-        """Use other parameters for the readings that come."""
+        """Use other parameters for later readings."""
         self._parameters = parameters
         self.worker.put(lambda: self._map.change(parameters))
 
     def restart(self, parameters: Parameters, generation: int) -> None:
-        """Begin anew, without readings; what is handed out from here on is of another generation."""
+        """Begin again without readings; later snapshots have another generation."""
         self.generation = generation
         self._offered = self._published = 0
         self._parameters = parameters
@@ -102,18 +102,18 @@ class LiveMap:
         self.worker.put(self._clear)
 
     def publish(self, now: bool = False) -> None:
-        """Have the map published if readings were added since the last time, `now` even where an earlier one waits."""
+        """Have the map published if readings were added since the last time; with `now`, even if a request waits."""
         if self._offered != self._published and (now or not self._publishing):
             self._publishing = True
             self._published = self._offered
             self.worker.put(partial(self._publish, self.generation), self._not_published)
 
     def when_added(self, work: Callable[[], None], failed: Callable[[str], object]) -> None:
-        """Have `work` called, in the map's thread, when all that was offered is in the map."""
+        """Have `work` called, in the map's thread, after all readings so far were added."""
         self.worker.put(work, failed)
 
     def snapshot(self) -> LiveSnapshot:
-        """Wait until all that was offered is in the map, and return it; not to be called by the executor.
+        """Wait until all readings so far were added, and return the map; must not be called by the executor.
 
         Raises
         ------

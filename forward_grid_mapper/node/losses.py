@@ -1,8 +1,8 @@
-"""Messages that were lost before the node could take them, estimated from what did arrive.
+"""Estimates of lost messages, from the messages that arrived.
 
-A middleware keeps a bounded number of messages for a subscription, and drops the oldest of more, also where the
-subscription is reliable; neither side is told. Publishers number their messages, so the gaps tell. Where a middleware
-hands out no numbers, gaps in the stamps of a sensor do, as long as it measures at a steady rate.
+A middleware keeps a bounded number of messages for a subscription, and drops the oldest of more, even if QoS is
+reliable; neither side is informed. Publishers number their messages, so losses follow from gaps. If a middleware gives
+no numbers, losses follow from gaps in the stamps of a sensor, if it measures at a steady rate.
 """
 
 from __future__ import annotations
@@ -12,16 +12,16 @@ from collections.abc import Callable
 from typing import Any
 
 MOST_STREAMS = 256
-"""Publishers, or sensors, of a topic that are told apart."""
+"""Most publishers, or sensors, of a topic that are distinguished."""
 
-STRANGE = 100
-"""Messages missing at once from which on a publisher that was not known is the likelier cause, if there is one."""
+NEW_PUBLISHER_GAP = 100
+"""Gap, messages, from which an unknown publisher is more likely than a loss, if there is one."""
 
 LASTING = 10.0
-"""Seconds for which a loss is worth a warning."""
+"""Seconds for which the node warns of a loss."""
 
 STEADY = 8
-"""Intervals of about the same length after which a sensor counts as steady."""
+"""Intervals of similar length after which the rate of a sensor is steady."""
 
 
 class Losses:
@@ -30,51 +30,51 @@ class Losses:
     Attributes
     ----------
     lost : int
-        Messages so far.
+        Number of messages so far.
     recent : float
-        When some were lost last, by `time.monotonic`.
+        Time of the last loss, by `time.monotonic`.
     """
 
     def __init__(self, publishers: Callable[[], int]) -> None:
-        """Begin with nothing lost; `publishers` returns how many publish the topic now."""
+        """Begin with no losses; `publishers` returns the number of publishers of the topic."""
         self._publishers = publishers
         self.clear()
         self.begin_anew()
 
     def begin_anew(self) -> None:
-        """Forget which message came last, since nobody listened for a while."""
+        """Forget the last numbers and stamps, since the node was not subscribed for a while."""
         self._newest: list[int] = []
         self._stamps: dict[str, tuple[int, float, int]] = {}
 
     def clear(self) -> None:
-        """Begin to count anew."""
-        self._told = self.lost = 0
+        """Set the counts to 0."""
+        self._reported = self.lost = 0
         self.recent = -LASTING
 
     def taken(self, info: dict[str, Any], frame: str, stamp: int) -> None:
-        """Note a message, with what rclpy says of it, its frame_id, and its stamp in nanoseconds."""
+        """Note a message: rclpy's info, frame_id, and stamp in nanoseconds."""
         number = info.get('publication_sequence_number')
         missing = self._by_stamp(frame, stamp) if number is None else self._by_number(number)
         if missing:
             self.add(missing)
 
-    def told(self, info: Any) -> None:
-        """Note what the middleware says of losses; what it says and what gaps tell may be the same messages."""
-        self._told += info.total_count_change
-        if self._told > self.lost:
-            self.add(self._told - self.lost)
+    def reported(self, info: Any) -> None:
+        """Note losses that the middleware reports; they may be the same messages as those of gaps."""
+        self._reported += info.total_count_change
+        if self._reported > self.lost:
+            self.add(self._reported - self.lost)
 
     def add(self, missing: int) -> None:
-        """Note messages that nobody will take any more."""
+        """Add lost messages."""
         self.lost += missing
         self.recent = time.monotonic()
 
     def _by_number(self, number: int) -> int:
-        """Return how many messages are missing before this one, of the publisher whose numbers come nearest."""
+        """Return the number of messages missing before this one, for the publisher with the nearest number."""
         before = [(number - newest, k) for k, newest in enumerate(self._newest) if newest < number]
         if before:
             gap, k = min(before)
-            if gap <= STRANGE or self._publishers() <= len(self._newest):
+            if gap <= NEW_PUBLISHER_GAP or self._publishers() <= len(self._newest):
                 self._newest[k] = number
                 return gap - 1
         if len(self._newest) == MOST_STREAMS:
@@ -83,7 +83,7 @@ class Losses:
         return 0
 
     def _by_stamp(self, frame: str, stamp: int) -> int:
-        """Return how many messages of a sensor's usual interval fit between its last one and this one, less one."""
+        """Return the number of missing messages: usual intervals since the sensor's last message, minus one."""
         last, interval, steady = self._stamps.get(frame, (stamp, 0.0, 0))
         if len(self._stamps) >= MOST_STREAMS and frame not in self._stamps:
             return 0

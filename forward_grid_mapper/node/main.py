@@ -1,11 +1,11 @@
-"""`mapper`: starts the node and ends it in order."""
+"""`mapper`: starts the node, and shuts it down in order."""
 
 from __future__ import annotations
 
 import signal
 
 if __name__ == '__main__':
-    # Ctrl-C while this is imported ends it at once and without a traceback; see `Stopper` for what comes then
+    # until `Stopper` exists, Ctrl-C ends the process at once, without a traceback
     signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 import os
@@ -34,7 +34,7 @@ LOG_EVERY = 10.0
 
 
 class _Stop(Exception):
-    """Raised inside the executor to end its spinning."""
+    """Raised inside the executor to stop spinning."""
 
 
 def _raise_stop() -> None:
@@ -42,7 +42,7 @@ def _raise_stop() -> None:
 
 
 def _spin(executor: Any, node: Any) -> None:
-    """Spin until `_Stop` or the end of ROS; a callback that fails is logged, and must not take the map with it."""
+    """Spin until `_Stop` or the shutdown of ROS; a callback that fails is logged, and the node continues."""
     logged = 0.0
     while executor.context.ok():
         try:
@@ -54,12 +54,12 @@ def _spin(executor: Any, node: Any) -> None:
             if now > logged + LOG_EVERY:
                 logged = now
                 node.get_logger().error(f'a callback failed, mapping continues: {traceback.format_exc()}')
-            # one that fails all the time must not take all of the time
+            # so that a callback that always fails does not use all processor time
             time.sleep(0.001)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the node until it has to stop; return the exit code."""
+    """Run the node until it is stopped; return the exit code."""
     if '--version' in (sys.argv[1:] if arguments is None else arguments):
         print(f'mapper of forward_grid_mapper {__version__}')
         return 0
@@ -84,7 +84,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             file=sys.stderr,
         )
         return 1
-    # callbacks get their turn soon where EM is between two kernels
+    # threads switch often, so that callbacks do not wait long for EM between two kernels
     sys.setswitchinterval(0.0005)
     from . import complaints
 
@@ -103,8 +103,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if left:
         print(f'mapper: error: {complaints.of_arguments(left)}\n{USAGE}', file=sys.stderr)
         return 2
-    # here, as a command line that cannot be is to be told of at once, and this takes a second; numpy starts threads
-    # when it is imported, which must have the signals blocked
+    # imported here, since it takes a second, and a faulty command line is reported at once; numpy starts threads when
+    # it is imported, and the signals must be blocked before
     from .kernels import Kernels
     from .mapper_node import MapperNode
 
@@ -131,7 +131,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             node.close()
             node.destroy_node()
         if executor is not None:
-            # or else it finds, when it is collected, that ROS is gone, and prints a traceback
+            # otherwise it finds ROS shut down when it is collected, and prints a traceback
             executor.shutdown(0.0)
         rclpy.try_shutdown()
     code = 0
@@ -139,7 +139,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f'mapper: error: {node.failure}', file=sys.stderr)
         code = 1
     if Kernels.at_work:
-        # the compiler must not be at work when its libraries are unloaded
+        # the compiler must not run while its libraries are unloaded
         sys.stdout.flush()
         sys.stderr.flush()
         os._exit(code)

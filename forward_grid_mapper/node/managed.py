@@ -1,4 +1,4 @@
-"""A node with a lifecycle, which Nav2's lifecycle manager can drive, or that starts by itself."""
+"""A lifecycle node: started by Nav2's lifecycle manager, or by itself."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ except ImportError:  # without lifecycle_msgs it is a node like any other, and s
 
 
 class ManagedNode(Base):
-    """Turns transitions into four methods, and destroys after the last what was created since the first.
+    """Maps transitions to four methods, and destroys at cleanup what was created since the configuration.
 
-    A subclass has `configure`, `activate`, `deactivate` and `close`. What they raise refuses the transition, and is
-    logged; the node is then as it was before. What a `configure` that failed has created is destroyed here, what an
-    `activate` that failed has created it destroys itself.
+    A subclass has `configure`, `activate`, `deactivate` and `close`. If one raises, the transition fails, and the error
+    is logged; the node keeps its state. What a failed `configure` has created is destroyed here; a failed `activate`
+    destroys it itself.
     """
 
     def __init__(self, name: str, **options: Any) -> None:
@@ -35,7 +35,7 @@ class ManagedNode(Base):
         self._refusal: Exception | None = None
         self._starting = False
         super().__init__(name, **options)
-        # what the node itself is made of stays
+        # entities of the node itself are not destroyed at cleanup
         self._created.clear()
         for service in self.services:
             if service.srv_name.endswith('/change_state'):
@@ -44,16 +44,16 @@ class ManagedNode(Base):
     # for subclasses
 
     def configure(self) -> None:
-        """Make everything but subscriptions."""
+        """Create everything except subscriptions."""
 
     def activate(self) -> None:
-        """Begin to take messages."""
+        """Subscribe."""
 
     def deactivate(self) -> None:
-        """Take no messages any more."""
+        """Unsubscribe."""
 
     def close(self) -> None:
-        """End what `configure` began."""
+        """End the work that `configure` began."""
 
     # starting without a manager
 
@@ -63,7 +63,7 @@ class ManagedNode(Base):
         Raises
         ------
         Exception
-            What either raised.
+            If either failed.
         """
         self._starting = True
         try:
@@ -71,20 +71,20 @@ class ManagedNode(Base):
                 self.configure()
                 self.activate()
                 return
-            for turn in (self.trigger_configure, self.trigger_activate):
-                turn()
+            for transition in (self.trigger_configure, self.trigger_activate):
+                transition()
                 if self._refusal is not None:
                     raise self._refusal
         finally:
             self._starting = False
 
     def wait_for_manager(self) -> None:
-        """Say that the node waits to be configured.
+        """Log that the node waits for its configuration.
 
         Raises
         ------
         MapperError
-            If nobody could.
+            If there is no lifecycle service.
         """
         if not MANAGED:
             raise MapperError('autostart is false, but without lifecycle_msgs nothing else can start the node')
@@ -94,30 +94,30 @@ class ManagedNode(Base):
 
     def on_configure(self, state: Any) -> Any:
         """Configure the node."""
-        return self._turn(self.configure, undo=True)
+        return self._transition(self.configure, undo=True)
 
     def on_activate(self, state: Any) -> Any:
         """Activate the node."""
-        return self._turn(self.activate)
+        return self._transition(self.activate)
 
     def on_deactivate(self, state: Any) -> Any:
         """Deactivate the node."""
-        return self._turn(self.deactivate)
+        return self._transition(self.deactivate)
 
     def on_cleanup(self, state: Any) -> Any:
         """Make the node unconfigured."""
-        return self._turn(self._undo)
+        return self._transition(self._undo)
 
     def on_shutdown(self, state: Any) -> Any:
-        """End the node's work for good; its process goes on until it is ended."""
-        return self._turn(self._undo)
+        """End the node's work; its process continues until it is stopped."""
+        return self._transition(self._undo)
 
     def on_error(self, state: Any) -> Any:
         """Make the node unconfigured after something failed."""
-        return self._turn(self._undo)
+        return self._transition(self._undo)
 
-    def _turn(self, work: Callable[[], None], undo: bool = False) -> Any:
-        """Do the work of a transition; return whether it succeeded."""
+    def _transition(self, work: Callable[[], None], undo: bool = False) -> Any:
+        """Do the work of a transition, and return its result."""
         try:
             self._refusal = None
             work()
@@ -132,7 +132,7 @@ class ManagedNode(Base):
             return TransitionCallbackReturn.FAILURE
 
     def _answered(self, change: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
-        """Have a transition that the state does not admit answered, which rclpy's service leaves without an answer."""
+        """Return a callback that answers an invalid transition; rclpy's service would not answer."""
 
         def answer(request: Any, response: Any) -> Any:
             try:
@@ -145,47 +145,47 @@ class ManagedNode(Base):
         return answer
 
     def _undo(self) -> None:
-        """End the work, and destroy what was created for it."""
+        """End the work, and destroy the entities created for it."""
         self.close()
         while self._created:
             destroy, entity = self._created.pop()
             destroy(entity)
 
     def destroy_node(self) -> None:
-        """Destroy the node; its state machine too, which would keep it in the middleware."""
+        """Destroy the node, and its state machine, which would keep the node in the middleware."""
         super().destroy_node()
-        # rclpy has no call for that
+        # rclpy has no function for that
         self.__dict__.pop('_state_machine', None)
 
-    # what is created is noted
+    # created entities are recorded
 
     def create_publisher(self, *arguments: Any, **options: Any) -> Any:
         """Create a publisher, as `Node` does."""
-        return self._noted(super().create_publisher(*arguments, **options), self.destroy_publisher)
+        return self._recorded(super().create_publisher(*arguments, **options), self.destroy_publisher)
 
     def create_subscription(self, *arguments: Any, **options: Any) -> Any:
         """Create a subscription, as `Node` does."""
         made = super().create_subscription(*arguments, **options)
-        # rclpy's own, made when use_sim_time is set: without it the clock would stand still for good
-        return made if made.msg_type is Clock else self._noted(made, self.destroy_subscription)
+        # rclpy creates it when use_sim_time is set: without it the clock would stop for ever
+        return made if made.msg_type is Clock else self._recorded(made, self.destroy_subscription)
 
     def destroy_subscription(self, subscription: Any) -> Any:
-        """Destroy a subscription, as `Node` does, and forget it: there are others with every activation."""
+        """Destroy a subscription, as `Node` does, and forget it, since each activation creates others."""
         self._created = [noted for noted in self._created if noted[1] is not subscription]
         return super().destroy_subscription(subscription)
 
     def create_service(self, *arguments: Any, **options: Any) -> Any:
         """Create a service, as `Node` does."""
-        return self._noted(super().create_service(*arguments, **options), self.destroy_service)
+        return self._recorded(super().create_service(*arguments, **options), self.destroy_service)
 
     def create_timer(self, *arguments: Any, **options: Any) -> Any:
         """Create a timer, as `Node` does."""
-        return self._noted(super().create_timer(*arguments, **options), self.destroy_timer)
+        return self._recorded(super().create_timer(*arguments, **options), self.destroy_timer)
 
     def create_guard_condition(self, *arguments: Any, **options: Any) -> Any:
         """Create a guard condition, as `Node` does."""
-        return self._noted(super().create_guard_condition(*arguments, **options), self.destroy_guard_condition)
+        return self._recorded(super().create_guard_condition(*arguments, **options), self.destroy_guard_condition)
 
-    def _noted(self, entity: Any, destroy: Callable[[Any], Any]) -> Any:
+    def _recorded(self, entity: Any, destroy: Callable[[Any], Any]) -> Any:
         self._created.append((destroy, entity))
         return entity

@@ -1,4 +1,4 @@
-"""The topics and services that hand out maps: messages are made and sent in a thread of their own."""
+"""The topics and services of maps: messages are made and sent in a thread of their own."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability
 
 
 class MapPublishers:
-    """Publishes the latest maps, the same in topics and services.
+    """Publishes the latest maps, with the same contents for topics and services.
 
     Attributes
     ----------
     generation : int
-        How often maps were forgotten; maps of an earlier one are not published any more.
+        Counts how often maps were forgotten; maps of an earlier generation are not published.
     latest : dict of name → nav_msgs/OccupancyGrid
-        What was published last.
+        The last published messages.
     services : list of DeferredService
     """
 
@@ -53,15 +53,15 @@ class MapPublishers:
         frame : callable
             Returns the frame of the maps.
         before : callable
-            Given the name of a map that is asked for, what to call when it is up to date, and what to call with the
-            reason if it cannot be.
+            Receives the name of a map that a client requests, a callback for when it is up to date, and a callback that
+            receives the reason if it cannot be.
 
         Raises
         ------
         MapperError
-            If two maps were given the same topic.
+            If two maps have the same topic.
         """
-        # rclpy keeps the GIL while it sends: a thread that gave way with it would have the executor give way as well
+        # rclpy holds the GIL while it sends: at low priority, this thread would delay the executor
         self.worker = Worker('maps', node.get_logger().error, nice=0)
         self.generation = 0
         self._node, self._resolution, self._frame, self._before = node, resolution, frame, before
@@ -72,7 +72,7 @@ class MapPublishers:
         self._updates = MapUpdates.of(node, self._out['live_map'])
         self._lock = threading.Lock()
         self._pending: dict[str, tuple[Grid, NDArray[Any]]] = {}
-        self._asked: set[str] = set()
+        self._queued: set[str] = set()
         self._nothing = Grid(resolution, 0, 0, 1, 1), np.full((1, 1), -1, np.int8)
         self._ml_map = self._nothing
         nothing = Grid(resolution, 0, 0, 0, 0)
@@ -80,7 +80,7 @@ class MapPublishers:
         self.services = [DeferredService(node, GetMap, f'~/get_{name}', partial(self._get, name)) for name in MAPS]
 
     def publish(self, name: str, generation: int, grid: Grid, values: NDArray[Any]) -> None:
-        """Have a map of a generation published, instead of one of the same name that still waits for it; any thread.
+        """Have a map published; it replaces a waiting one of the same name. May be called from any thread.
 
         Parameters
         ----------
@@ -91,12 +91,12 @@ class MapPublishers:
         values : array of shape `grid.shape`
             As in `grid_message`.
         """
-        # held for a moment only, whatever the size of the map
+        # held only briefly for maps of any size
         with self._lock:
             if generation != self.generation:
                 return
-            waits = name in self._asked
-            self._asked.add(name)
+            waits = name in self._queued
+            self._queued.add(name)
             self._pending[name] = grid, values
             if name == 'ml_map':
                 self._ml_map = grid, values
@@ -105,17 +105,17 @@ class MapPublishers:
 
     @property
     def ml_map(self) -> tuple[Grid, NDArray[np.int8]]:
-        """Grid and cells of the ML map that was given last; a single cell not observed if none was."""
+        """Grid and cells of the last ML map; a single cell that is not observed if there is none."""
         with self._lock:
             return self._ml_map
 
     def refresh(self) -> None:
-        """Have the whole live map published where somebody needs it, after only parts of it were."""
+        """Have the whole live map published if only updates were sent and a subscriber needs the whole."""
         if self._updates and self._updates.stale:
             self.worker.put(self._updates.refresh)
 
     def clear(self) -> None:
-        """Have empty maps published, after which none of those that were there before comes."""
+        """Have empty maps published; maps of earlier generations are not published after them."""
         with self._lock:
             self.generation += 1
             generation = self.generation
@@ -124,7 +124,7 @@ class MapPublishers:
 
     def _publish(self, name: str) -> None:
         with self._lock:
-            self._asked.discard(name)
+            self._queued.discard(name)
             if name not in self._pending:
                 return
             grid, values = self._pending.pop(name)
@@ -136,12 +136,12 @@ class MapPublishers:
             self._out[name].publish(message)
 
     def _not_published(self, name: str, why: str) -> None:
-        # where no thread could start, the next map tries again
+        # if no thread could start, the next map tries again
         with self._lock:
-            self._asked.discard(name)
+            self._queued.discard(name)
 
     def _message(self, grid: Grid, values: NDArray[Any]) -> OccupancyGrid:
-        # tf2 refuses the leading slash that ROS 1 had
+        # tf2 refuses the leading slash of ROS 1
         return grid_message(grid, values, self._frame().lstrip('/'), self._node.get_clock().now().to_msg())
 
     def _get(self, name: str, reply: Reply) -> None:
@@ -151,5 +151,5 @@ class MapPublishers:
         def self_answer(why: str) -> None:
             reply.send(self.latest[name])
 
-        # what cannot be brought up to date is better than no answer
+        # an outdated map is better than no answer
         self._before(name, answer, self_answer)

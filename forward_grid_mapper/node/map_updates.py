@@ -1,7 +1,7 @@
-"""A map sent only where it changed, as `map_msgs/OccupancyGridUpdate`, to those who can put the parts together.
+"""Changed parts of a map, as `map_msgs/OccupancyGridUpdate`, if all subscribers can use them.
 
-RViz and Nav2's static layer listen to a map's topic and to the same name with `_updates`. The map itself stays what it
-is for everybody else: as long as a node listens to it and not to its updates, whole maps are sent and nothing else.
+RViz and Nav2's static layer subscribe to a map's topic and to the topic of the same name with `_updates`. Other nodes
+subscribe to the map alone: as long as there is one, only whole maps are sent.
 """
 
 from __future__ import annotations
@@ -16,16 +16,16 @@ from nav_msgs.msg import OccupancyGrid
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 
 WHOLE = 10.0
-"""Seconds after which the whole map is sent again if it changed: the two topics may overtake each other."""
+"""Seconds after which the whole map is sent again if it changed, since updates may arrive before their map."""
 
 UNKNOWN = '_NODE_NAME_UNKNOWN_'
-"""What a middleware calls a node that it has not found yet."""
+"""The middleware's name for a node that it has not discovered yet."""
 
 FEW = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
 
 
 class Box(NamedTuple):
-    """A part of a map, in cells from its first one."""
+    """A part of a map, in cells from cell (0, 0)."""
 
     x: int
     y: int
@@ -34,7 +34,7 @@ class Box(NamedTuple):
 
 
 def changed_box(before: OccupancyGrid, now: OccupancyGrid) -> Box | None:
-    """Return the smallest box that holds all cells in which two maps of one grid differ; None if there are none."""
+    """Return the smallest box around all cells that differ between two maps of the same grid; None if none differ."""
     shape = now.info.height, now.info.width
     differ = np.frombuffer(before.data, np.int8).reshape(shape) != np.frombuffer(now.data, np.int8).reshape(shape)
     rows, columns = np.flatnonzero(differ.any(axis=1)), np.flatnonzero(differ.any(axis=0))
@@ -45,13 +45,13 @@ def changed_box(before: OccupancyGrid, now: OccupancyGrid) -> Box | None:
 
 
 def listeners(node: Any, topic: str) -> dict[bytes, tuple[str, str]]:
-    """Return the nodes that listen to a topic, (namespace, name) by the identity of the subscription."""
+    """Return the nodes that subscribe to a topic, as (namespace, name) by the GID of the subscription."""
     found = node.get_subscriptions_info_by_topic(topic)
     return {bytes(info.endpoint_gid): (info.node_namespace, info.node_name) for info in found}
 
 
 class MapUpdates:
-    """Publishes a map: where it changed, if everybody who listens to the map listens to its updates as well."""
+    """Publishes changed parts of a map if all subscribers of the map subscribe to its updates as well."""
 
     def __init__(self, node: Any, whole: Any, kind: Any) -> None:
         """`whole` is the publisher of the map, `kind` is `map_msgs.msg.OccupancyGridUpdate`."""
@@ -60,7 +60,7 @@ class MapUpdates:
         self._last: OccupancyGrid | None = None
         self._stale = False
         self._sent = 0.0
-        self._heard: set[bytes] = set()
+        self._whole_subscribers: set[bytes] = set()
 
     @classmethod
     def of(cls, node: Any, whole: Any) -> MapUpdates | None:
@@ -73,11 +73,11 @@ class MapUpdates:
 
     @property
     def stale(self) -> bool:
-        """Whether the map that late subscribers get lacks updates."""
+        """Whether the map for late subscribers lacks updates."""
         return self._stale
 
     def publish(self, now: OccupancyGrid) -> None:
-        """Publish the map, or what changed of it since the last time."""
+        """Publish the map, or its changes since the last time."""
         before, self._last = self._last, now
         if before is None or not _one_grid(before, now) or self._somebody_needs_the_whole():
             self._publish_whole(now)
@@ -86,23 +86,25 @@ class MapUpdates:
             self._stale = True
 
     def refresh(self) -> None:
-        """Publish the whole map if late subscribers would get one that lacks updates."""
+        """Publish the whole map if late subscribers would get an outdated one."""
         if self._stale and self._last is not None and self._somebody_needs_the_whole():
             self._publish_whole(self._last)
 
     def _publish_whole(self, now: OccupancyGrid) -> None:
-        # who comes from here on gets this map
-        self._heard = set(listeners(self._node, self._whole.topic_name))
+        # later subscribers get this map
+        self._whole_subscribers = set(listeners(self._node, self._whole.topic_name))
         self._whole.publish(now)
         self._sent, self._stale = time.monotonic(), False
 
     def _somebody_needs_the_whole(self) -> bool:
-        """Return whether parts would leave anybody without the map, now or later."""
-        heard = listeners(self._node, self._whole.topic_name)
-        follow = Counter(listeners(self._node, self._out.topic_name).values())
-        alone = any(count > follow[node] or node[1] == UNKNOWN for node, count in Counter(heard.values()).items())
-        new = not self._heard.issuperset(heard)
-        return alone or new or not heard or time.monotonic() > self._sent + WHOLE
+        """Return whether there are subscribers, now or later, to whom updates would be of no use."""
+        subscribers = listeners(self._node, self._whole.topic_name)
+        of_updates = Counter(listeners(self._node, self._out.topic_name).values())
+        alone = any(
+            count > of_updates[node] or node[1] == UNKNOWN for node, count in Counter(subscribers.values()).items()
+        )
+        new = not self._whole_subscribers.issuperset(subscribers)
+        return alone or new or not subscribers or time.monotonic() > self._sent + WHOLE
 
     def _update(self, now: OccupancyGrid, box: Box) -> Any:
         cells = np.frombuffer(now.data, np.int8).reshape(now.info.height, now.info.width)
@@ -115,7 +117,7 @@ class MapUpdates:
 
 
 def _one_grid(a: OccupancyGrid, b: OccupancyGrid) -> bool:
-    """Return whether two maps have the same cells in the same frame."""
+    """Return whether two maps have the same grid in the same frame."""
     return bool(
         a.header.frame_id == b.header.frame_id
         and a.info.resolution == b.info.resolution

@@ -1,7 +1,7 @@
-"""The node: wires subscriptions, the associator, the maps, EM and files together.
+"""The node: connects subscriptions, the associator, the maps, EM and files.
 
-The executor's thread owns the state, and does nothing that takes long: work on all readings or on a whole map is done
-by workers (`background`), which hand their results back through an inbox.
+The executor's thread owns the state, and does only short work: long work, on all readings or on a whole map, is done by
+workers (`background`), which return their results through an inbox.
 """
 
 from __future__ import annotations
@@ -43,33 +43,33 @@ from .trajectory import Trajectory
 
 NAME = 'forward_grid_mapper'
 FEED_PERIOD = 0.02
-"""Seconds between hand-overs of readings to the maps."""
+"""Seconds between two transfers of readings to the maps."""
 
 
 class MapperNode(ManagedNode):
-    """Maps what it receives. All callbacks run in one thread, and none of them does long work.
+    """Maps readings. All callbacks run in one thread, and none does long work.
 
     Attributes
     ----------
     parameters : Parameters
-        Those in force.
+        The current ones.
     mapping : bool
-        Whether readings are taken; before, those of an earlier run are read, and messages are held back.
+        Whether readings are mapped; before, those of an earlier run are restored, and messages are held back.
     workers : list of Worker
         All that work in the background.
     failure : str
-        Why the node cannot go on; empty while it can.
+        The reason why the node cannot continue; '' while it can.
     when_failed : callable
         Called by the executor when `failure` is set.
     """
 
     def __init__(self, **options: Any) -> None:
-        """Declare the parameters; `start`, or a lifecycle manager, has it begin to listen.
+        """Declare the parameters; `start`, or a lifecycle manager, configures and activates the node.
 
         Raises
         ------
         ParameterError
-            If a parameter given at start is not admitted.
+            If a parameter given at start is not valid.
         """
         super().__init__(NAME, automatically_declare_parameters_from_overrides=True, **options)
         self.parameters, _, warnings = ros_parameters.declare(self)
@@ -86,18 +86,18 @@ class MapperNode(ManagedNode):
     def _begin_anew(self) -> None:
         self._started = self.mapping = False
         self._when_ready: list[Callable[[], None]] = []
-        self._lacks = {'journal', 'kernels'}
+        self._missing = {'journal', 'kernels'}
         self._fed = {'live': 0, 'online': 0}
         self.workers: list[Worker] = []
         self._calls: list[DeferredService] = []
 
     def configure(self) -> None:
-        """Create topics and services, read the journal, and compile; messages are taken once it is active.
+        """Create topics and services, restore the journal, and compile; messages are received once the node is active.
 
         Raises
         ------
         MapperError
-            If the journal or the map frame cannot be had.
+            If a parameter is not valid for the system, or the journal cannot be opened.
         """
         self._begin_anew()
         node, log = self.parameters.node, self.get_logger()
@@ -116,7 +116,7 @@ class MapperNode(ManagedNode):
             )
         transforms = Transforms.of(self)
         extrinsics = Extrinsics(ros_parameters.mounts(self), transforms)
-        # with refine_poses it is this node that gives the transform
+        # with refine_poses this node publishes the transform
         looked_up = '' if node.refine_poses else node.map_frame
         self._map_frame = MapFrame(looked_up, transforms, self.parameters.association.pose_timeout)
         if looked_up and not transforms.available:
@@ -126,9 +126,9 @@ class MapperNode(ManagedNode):
         kernels = self.kernels = Kernels(log.info, log.error, node.online, node.refine_poses)
         self.trajectory = trajectory = Trajectory(self, self.associator, self._steady)
         self.maps = MapPublishers(self, self.parameters.grid.resolution, lambda: trajectory.frame, self._up_to_date)
-        # after what may be refused: a journal that was not closed keeps its folder
+        # last of what may fail: a journal that is not closed locks its folder
         self.journal = JournalKeeper(self, node.journal, self.associator)
-        trajectory.publishing, trajectory.changed = self.maps.worker, self._map_anew
+        trajectory.publishing, trajectory.changed = self.maps.worker, self._change_trajectory
         trajectory.following = Following(log, inbox, trajectory.follow) if node.online else None
         trajectory.begin()
         self.live = LiveMap(self.parameters, self._show_live, log.error, lambda: kernels.wait('live map'))
@@ -140,8 +140,8 @@ class MapperNode(ManagedNode):
         self.em.extrinsics, self.em.mounts = lambda: extrinsics.fixed, lambda: extrinsics.known
         self.online = self.em.online = self._online_worker(kernels) if node.online else None
         self.saver = Saver(self.em, self.live, self._account, log)
-        self._aside = Worker('readings', log.error)
-        self.workers = [self._aside, self.live.worker, self.maps.worker, self.em.worker.worker]
+        self._readings_worker = Worker('readings', log.error)
+        self.workers = [self._readings_worker, self.live.worker, self.maps.worker, self.em.worker.worker]
         self.workers += [part.worker for part in (self.saver, self.online, trajectory.following, kernels) if part]
         health = Health()
         self.intake = Intake(self, self.parameters, self.associator, self._map_frame, health.taken)
@@ -165,26 +165,28 @@ class MapperNode(ManagedNode):
             ('~/save_maps', self.saver.save_maps),
             ('~/reset', self.reset),
         ):
-            self._calls.append(DeferredService(self, Trigger, name, partial(self._when, handler)))
+            self._calls.append(DeferredService(self, Trigger, name, partial(self._answer_when_ready, handler)))
         self._calls += [DeferredService(self, SetBool, '~/pause', self.pause), *self.maps.services]
         self.create_timer(1.0, self.reporter.report, clock=self._steady)
         self._live_timer = self.create_timer(1.0 / node.publish_rate, self.publish_live, clock=self._steady)
         self._started = True
         self._poses_from = 'parameters and TF' if transforms.available else 'parameters (tf2_ros is not installed)'
-        # the live map has every reading, also those that max_readings drops
+        # the live map contains every reading, also those that max_readings removes
         self.associator.buffer.before_thinning.append(self._feed)
-        kernels.begin(lambda: inbox.put(lambda: self._has('kernels')))
-        self._aside.put(partial(self._restore, self.journal, inbox), lambda why: inbox.put(lambda: self._fail(why)))
+        kernels.begin(lambda: inbox.put(lambda: self._step_done('kernels')))
+        self._readings_worker.put(
+            partial(self._restore, self.journal, inbox), lambda why: inbox.put(lambda: self._fail(why))
+        )
 
     def _resolved(self, parameter: str, topic: str) -> str:
-        """Return the full name of a topic that a parameter gives."""
+        """Return the full name of a topic given as a parameter."""
         try:
             return str(self.resolve_topic_name(topic))
         except Exception as error:  # a class of rclpy's C extension
             raise MapperError(f'{parameter}: {topic!r} is not a valid topic name: {of_ros(error)}') from None
 
     def activate(self) -> None:
-        """Take messages from here on; they are mapped as soon as it can be."""
+        """Receive messages; they are mapped as soon as the node is ready."""
         self.intake.subscribe()
         node = self.parameters.node
         self.get_logger().info(
@@ -193,17 +195,17 @@ class MapperNode(ManagedNode):
         )
 
     def deactivate(self) -> None:
-        """Take no messages any more; maps and services stay."""
+        """Stop receiving messages; maps and services remain."""
         self.intake.unsubscribe()
         self.get_logger().info('inactive: nothing is received; maps and services stay')
 
     def close(self) -> None:
-        """End what goes on in the background."""
+        """End the work in the background."""
         if self._started:
             self._started = self.mapping = False
-            # before what may take as long as `stopping.GRACE`
+            # before work that may take as long as `stopping.GRACE`
             self.journal.close()
-            # a journal that is still being read must not reach what is configured next
+            # a journal that is still being read must not add readings to the next configuration
             self.associator.buffer.before_thinning.clear()
             self.em.close(2.0)
             if self.online:
@@ -211,10 +213,10 @@ class MapperNode(ManagedNode):
             if self.trajectory.following:
                 self.trajectory.following.close(2.0)
             self.live.worker.close(0.5)
-        # kernels are compiled to the end, whoever needs them next
+        # compilation is finished in any case, for the next configuration
         for worker in self.workers[:-1]:
             worker.close(0.5)
-        # what they wait for does not come any more
+        # calls that wait will get no result
         for service in self._calls:
             service.end('the node is being cleaned up')
         self._calls.clear()
@@ -222,7 +224,7 @@ class MapperNode(ManagedNode):
 
     def _undo(self) -> None:
         super()._undo()
-        # `Kernels` froze what there was, and the collector does not look at frozen objects
+        # `Kernels` froze the existing objects, and the collector ignores frozen ones
         for name in vars(self).keys() - self._own - {'_own'}:
             delattr(self, name)
         gc.unfreeze()
@@ -232,49 +234,49 @@ class MapperNode(ManagedNode):
 
     def _restore(self, journal: JournalKeeper, inbox: Inbox) -> None:
         journal.restore()
-        inbox.put(lambda: self._has('journal'))
+        inbox.put(lambda: self._step_done('journal'))
 
     def _fail(self, why: str) -> None:
         self.failure = why
         self.when_failed()
 
-    def _has(self, what: str) -> None:
-        """Begin to map once the earlier readings are back; say so once the live map has its kernels as well."""
+    def _step_done(self, what: str) -> None:
+        """Begin to map once the earlier readings are restored; log it once the live map has its kernels as well."""
         if what == 'journal':
-            self.associator.buffer.aside = self._thin_aside
+            self.associator.buffer.aside = self._thin_in_background
             self.journal.begin(self._steady)
             self.create_timer(FEED_PERIOD, self._feed, clock=self._steady)
             self.intake.begin()
             self._map()
-        self._lacks.discard(what)
-        if not self._lacks:
+        self._missing.discard(what)
+        if not self._missing:
             then = '' if self.intake.listening else '; activate the node to receive them'
             self.get_logger().info(f'ready: the live map is updated with the readings{then}')
 
     def _map(self) -> None:
-        """Answer those who waited, once what was held back is taken."""
+        """Answer waiting calls after the messages held back are processed."""
         if self.intake.busy:
             self.inbox.put(self._map)
             return
         self.mapping = True
         for work in self._when_ready:
-            # one that fails does not keep the others waiting
+            # if one fails, the others are still answered
             self.inbox.put(work)
         self._when_ready.clear()
 
-    def _when(self, handler: Callable[[Reply], None], reply: Reply) -> None:
-        """Have a service answered, once the earlier readings are back."""
+    def _answer_when_ready(self, handler: Callable[[Reply], None], reply: Reply) -> None:
+        """Answer a service once the earlier readings are restored."""
         if self.mapping:
             handler(reply)
         else:
             self._when_ready.append(lambda: answered(handler, reply, self.get_logger().error))
 
-    def _thin_aside(self, thin: Callable[[], Any], done: Callable[[Any], None]) -> None:
+    def _thin_in_background(self, thin: Callable[[], Any], done: Callable[[Any], None]) -> None:
         def work() -> None:
             thinned = thin()
             self.inbox.put(lambda: done(thinned))
 
-        self._aside.put(work, lambda why: self.inbox.put(lambda: done(None)))
+        self._readings_worker.put(work, lambda why: self.inbox.put(lambda: done(None)))
 
     # parameters
 
@@ -304,15 +306,15 @@ class MapperNode(ManagedNode):
                 self._when_ready.append(self._restart_online)
         if parameters.node.publish_rate != before.node.publish_rate:
             self._live_timer.timer_period_ns = round(NANOSECONDS / parameters.node.publish_rate)
-            # or else the old period has to pass first
+            # otherwise the old period ends first
             self._live_timer.reset()
 
     # maps
 
-    def _map_anew(self, live: LogOddsMap | None, count: int) -> None:
-        """Go on along another trajectory: from the live map of the first `count` readings, and without the online map.
+    def _change_trajectory(self, live: LogOddsMap | None, count: int) -> None:
+        """Continue with another trajectory: with the live map of the first `count` readings, and a new online map.
 
-        Without a live map only the frame has another name.
+        Without a live map only the name of the frame has changed.
         """
         if live is None:
             self.live.touch()
@@ -323,7 +325,7 @@ class MapperNode(ManagedNode):
         self._feed()
 
     def _feed(self) -> None:
-        """Hand the readings that came to the maps; their threads add them."""
+        """Give new readings to the maps; their threads add them."""
         buffer = self.associator.buffer
         if len(buffer) > self._fed['live']:
             self.live.offer(buffer.snapshot(self._fed['live']), self.trajectory.place)
@@ -339,7 +341,7 @@ class MapperNode(ManagedNode):
         self.online.tick()
 
     def publish_live(self) -> None:
-        """Have the live map published if it changed."""
+        """Have the live map published if it has changed."""
         if self.mapping:
             self._feed()
             self.live.publish()
@@ -349,7 +351,7 @@ class MapperNode(ManagedNode):
         self.maps.publish('live_map', snapshot.generation, snapshot.grid, snapshot.probability)
 
     def _up_to_date(self, name: str, answer: Callable[[], None], failed: Callable[[str], object]) -> None:
-        """Call `answer` when a map of this name has all readings, if that is up to the node."""
+        """Call `answer` once a map contains all readings, if it is the live map; otherwise at once."""
         if name == 'live_map' and self.mapping:
             self._feed()
             self.live.publish(now=True)
@@ -365,13 +367,13 @@ class MapperNode(ManagedNode):
         return OnlineWorker(self.parameters, publish, self.get_logger().error, lambda: kernels.wait('online map'))
 
     def _show_online(self, snapshot: OnlineSnapshot, generation: int) -> None:
-        # EM shows its own map while it runs
+        # during EM, its intermediate maps are shown
         if self.online and snapshot.epoch == self.online.epoch and self.em.current is None:
             self.maps.publish('ml_map', generation, snapshot.grid, snapshot.ml)
             self.maps.publish('uncertainty_map', generation, snapshot.grid, snapshot.uncertainty)
 
     def _restart_online(self) -> None:
-        """Begin the online map anew, from the readings that are kept."""
+        """Begin the online map again, from the readings that are kept."""
         if self.online:
             buffer = self.associator.buffer
             self._fed['online'] = len(buffer)
@@ -383,12 +385,12 @@ class MapperNode(ManagedNode):
     def reset(self, reply: Reply) -> None:
         """Forget readings and maps; answer the service."""
         forgotten = len(self.associator.buffer)
-        # also what came since it last looked
+        # also readings since its last check
         self.journal.take()
         self.associator.clear(self.parameters)
         self.intake.forget()
         kept = self.journal.reset()
-        # late subscribers must not get the maps that were forgotten
+        # late subscribers must not get maps that were forgotten
         self.trajectory.begin()
         self.maps.clear()
         self.em.reset()
@@ -398,12 +400,12 @@ class MapperNode(ManagedNode):
         reply.send(True, f'{forgotten} readings and all maps were deleted{kept}')
 
     def pause(self, reply: Reply) -> None:
-        """Stop or go on taking readings; answer the service."""
+        """Pause or continue mapping; answer the service."""
         self.intake.paused = paused = bool(reply.request.data)
         reply.send(True, 'readings are ignored until pause is called with false' if paused else 'mapping')
 
     def _account(self) -> Account:
-        """Return what a report says of the node."""
+        """Return the state of the node for a report."""
         associator, node, name = self.associator, self.parameters.node, self.get_fully_qualified_name()
         self._feed()
         rejections = [

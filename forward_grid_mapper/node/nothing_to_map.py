@@ -1,4 +1,4 @@
-"""Why EM has no reading to map, in words."""
+"""The reason why EM has no reading to map, in words."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from ..core.messages.rep117 import ODOMETRY_REASONS, REASONS
 
 
 def nothing_to_map(associator: PoseAssociator, range_topics: Sequence[str], odom_topic: str, no_map_frame: str) -> str:
-    """Return why no reading was accepted.
+    """Return the reason why no reading was accepted.
 
-    The topics have their full names; `no_map_frame` says what keeps odometry out of the map frame, if anything does.
+    Topics are full names; `no_map_frame` is the fault that keeps odometry out of the map frame, or ''.
     """
     return f'there is nothing to map: {_why(associator, range_topics, odom_topic, no_map_frame)}'
 
@@ -21,7 +21,7 @@ def _why(associator: PoseAssociator, range_topics: Sequence[str], odom_topic: st
     if not received:
         return f'no Range message has been received on {", ".join(range_topics)} since the start or reset'
     came, refused = associator.odometry_received, associator.odometry_rejected
-    # odometry that waits for TF has not come as far as the associator
+    # odometry that waits for TF has not reached the associator
     if no_map_frame and not came and set(rejected) <= {'no_odometry'}:
         return no_map_frame
     if not rejected:

@@ -1,4 +1,4 @@
-"""The online map in the background: takes commands from a queue, and publishes immutable snapshots."""
+"""The online map in the background: tasks from a queue, results as immutable snapshots."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ from .background import Worker
 class OnlineSnapshot(NamedTuple):
     """The online map at a moment.
 
-    `epoch` is that of the worker when it was made; `ml` and `uncertainty` are as in `MapSet`, `searched` is what EM
-    may start from. All have shape `grid.shape`, and nobody changes them.
+    `epoch` is that of the worker when it was made; `ml` and `uncertainty` are as in `MapSet`, `searched` is a map
+    from which EM may start. All have shape `grid.shape`, and nothing changes them.
     """
 
     epoch: int
@@ -34,16 +34,16 @@ class OnlineSnapshot(NamedTuple):
 
 
 class OnlineWorker:
-    """Keeps an online map of the readings that it is offered, and publishes it at a bounded rate.
+    """Keeps an online map of readings, and publishes it at a bounded rate.
 
-    All methods are called by one thread and return at once; the map belongs to the worker's.
+    All methods are called by one thread and return at once; the worker's thread owns the map.
 
     Attributes
     ----------
     epoch : int
-        How often the map was begun anew or replaced: snapshots of an earlier one are out of date.
+        Counts how often the map was begun again or replaced: snapshots of an earlier epoch are out of date.
     kept : int
-        Number of readings that the map keeps; those that say the same as another one are counted with it.
+        Number of readings in the map; those with equal contents are counted separately.
     """
 
     def __init__(
@@ -59,9 +59,9 @@ class OnlineWorker:
         ----------
         parameters : Parameters
         publish : callable
-            Takes a snapshot, in the worker's thread.
+            Receives a snapshot, in the worker's thread.
         log : callable
-            Takes what goes wrong.
+            Receives failures.
         prepare : callable
             Called in the worker's thread before anything else.
         """
@@ -71,19 +71,19 @@ class OnlineWorker:
         self._publish_snapshot, self._log = publish, log
         self._map = OnlineMap(parameters)
         self._start: tuple[Grid, NDArray[np.int8]] | None = None
-        # held while the epoch changes, or a map of it is kept to start from
+        # held while the epoch changes, and while a map is stored as the start of EM
         self._lock = threading.Lock()
         self._changed = self._publishing = False
         self._next = 0.0
         self.worker.put(prepare)
 
     def offer(self, readings: Readings, place: Callable[[Readings], Readings] | None = None) -> None:
-        """Have readings added soon, where `place` puts them."""
+        """Have readings added soon, transformed by `place`."""
         wanted = self._map
         self.worker.put(lambda: self._add(wanted, lambda: place(readings) if place else readings))
 
     def restart(self, parameters: Parameters, readings: Callable[[], Readings] | None = None) -> None:
-        """Forget the map; begin anew with other parameters and, if given, the readings that `readings` returns.
+        """Forget the map; begin again with other parameters and, if given, the readings that `readings` returns.
 
         It is called in the worker's thread.
         """
@@ -104,22 +104,22 @@ class OnlineWorker:
         self._next = 0.0
 
     def adopt(self, maps: MapSet) -> None:
-        """Go on from the map that EM found."""
+        """Continue from the map that EM found."""
         with self._lock:
             self.epoch, self._start = self.epoch + 1, (maps.grid, maps.searched)
         wanted = self._map
         self.worker.put(lambda: self._adopt(wanted, maps))
 
     def show(self) -> None:
-        """Have the map published again, even if it does not change."""
+        """Have the map published again, even if it has not changed."""
         self._changed = True
 
     def so_far(self) -> tuple[Grid, NDArray[np.int8]] | None:
-        """Return the grid and the map to start EM from, as of the last snapshot, or None if there is none yet."""
+        """Return grid and map of the last snapshot, from which EM may start; None if there is none."""
         return self._start
 
     def tick(self) -> None:
-        """Have the map published if it changed and it is time; to be called again and again."""
+        """Have the map published if it has changed and the period is over; to be called often."""
         if self._changed and not self._publishing and time.monotonic() >= self._next:
             self._next = time.monotonic() + 1.0 / self._parameters.node.publish_rate
             self._publishing, self._changed = True, False
@@ -127,11 +127,11 @@ class OnlineWorker:
             self.worker.put(lambda: self._publish(wanted, epoch), lambda why: self._published())
 
     def close(self, seconds: float) -> None:
-        """End the thread."""
+        """Cancel the work, and wait at most so many seconds for the end of the thread."""
         self._map.cancel()
         self.worker.close(seconds)
 
-    # in the worker's thread; `wanted` is the map that a command is meant for, which may have been given up since
+    # in the worker's thread; `wanted` is the map of a task, which may have been replaced since
 
     def _add(self, wanted: OnlineMap, readings: Callable[[], Readings]) -> None:
         if wanted is not self._map:
@@ -144,7 +144,7 @@ class OnlineWorker:
         except (MapperError, MemoryError) as error:
             why = str(error) or 'there is not enough memory'
             if wanted.taken > taken:
-                # no lasting trouble
+                # the readings are in the map, so this is no lasting failure
                 self._log(f'online map: the search will continue with the next readings: {why}')
                 return
             raise MapperError(f'{len(new)} readings are not in the online map: {why}') from None

@@ -1,8 +1,8 @@
-"""The robot's pose on the map for others: the transform from the map to odometry, and the path.
+"""The robot's pose in the map frame for other nodes: the transform from map to odometry, and the path.
 
-The transform is stamped a little later than the odometry that it is good for, as that of SLAM nodes is, so that whoever
-asks for the pose of now need not wait for the next one. While odometry is silent it is repeated, so that whoever starts
-then has the map's frame as well; a transform for a later time would say what nobody knows.
+As with other SLAM nodes, the stamp of the transform is a little later than that of odometry, so that lookups of the
+current pose need not wait for the next one. While odometry is silent, the transform is repeated, so that late
+subscribers get the map frame as well; a transform for a later time would be a guess.
 """
 
 from __future__ import annotations
@@ -26,26 +26,26 @@ PERIOD = 0.05
 """Seconds between two transforms."""
 
 REPEAT = 1.0
-"""Seconds after which a transform is sent again where nothing is new."""
+"""Seconds after which the transform is repeated if nothing is new."""
 
 TOLERANCE = NANOSECONDS // 5
-"""Nanoseconds that a transform's stamp is later than odometry's."""
+"""Nanoseconds from odometry's stamp to the stamp of the transform."""
 
 LATEST = (1 << 31) * NANOSECONDS - 1
-"""The latest stamp that a message has room for."""
+"""The latest stamp that fits into a message."""
 
 MOST_POINTS = 2000
-"""Poses of the path at the most: more would keep the executor for long when the middleware takes them."""
+"""Most poses of the path: with more, the middleware would block the executor for long."""
 
 STEP = 0.1
-"""Metres between two of them, at least."""
+"""Shortest distance between two of them, metres."""
 
 TRANSFORMS = QoSProfile(depth=100)
 LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
 def transform_sender(node: Any) -> Callable[[TransformStamped], object] | None:
-    """Return what sends a transform on TF, by tf2_ros or else with tf2_msgs alone; None without either."""
+    """Return a function that sends a transform on TF, by tf2_ros, or else by tf2_msgs; None without both."""
     try:
         from tf2_ros import TransformBroadcaster
     except ImportError:
@@ -62,9 +62,9 @@ def transform_sender(node: Any) -> Callable[[TransformStamped], object] | None:
 
 
 class PosePublishers:
-    """Publishes where the robot is on the map.
+    """Publishes the pose of the robot in the map frame.
 
-    Without tf2_ros and tf2_msgs the pose goes to `~/pose` instead of TF; its covariance is zero, which is unknown.
+    Without tf2_ros and tf2_msgs the pose is published on `~/pose` instead of TF; its covariance is 0: unknown.
     """
 
     def __init__(self, node: Any) -> None:
@@ -82,28 +82,28 @@ class PosePublishers:
     def send(
         self, frames: tuple[str, str, str], correction: Floats, newest: tuple[int, Pose2], repeat: bool = True
     ) -> None:
-        """Send the transform, or the pose, if odometry or the correction is new, or as a repetition.
+        """Send the transform, or the pose, if odometry or the correction is new, or to repeat it.
 
         Parameters
         ----------
         frames : (str, str, str)
-            Of the map, of odometry, and of the robot.
+            Names of the map frame, the odometry frame and the base frame.
         correction : float64, shape (3,)
-            The pose of odometry's frame in the map frame.
+            The pose of the odometry frame in the map frame.
         newest : (int, Pose2)
             The last pose of odometry.
         repeat : bool
-            Whether it is sent again after `REPEAT` seconds.
+            Whether it is repeated after `REPEAT` seconds.
         """
         stamp, pose = newest
         x, y, yaw = correction.tolist()
         sent_stamp, sent = self._sent
         now = time.monotonic()
-        # a stamp that is far behind what was sent is right, and the one that was sent was wrong
+        # if a stamp is far before the last one sent, that one was wrong
         if sent_stamp - JUMP <= stamp <= sent_stamp:
             if sent == (x, y, yaw) and not (repeat and now >= self._due):
                 return
-            # TF warns of a second transform of the same stamp, and odometry may have ended
+            # TF warns of a second transform with the same stamp, and odometry may have ended
             stamp = sent_stamp + 1
         self._sent, self._due = (stamp, (x, y, yaw)), now + REPEAT
         map_frame, odom_frame, _ = (frame.lstrip('/') for frame in frames)
@@ -124,16 +124,16 @@ class PosePublishers:
             self._pose.publish(message)
 
     def forget(self) -> None:
-        """Send the next transform whatever its stamp, since the clock jumped or the drive begins anew."""
+        """Send the next transform with any stamp, since the clock jumped or a new drive begins."""
         self._sent = (-1, ())
 
     def publish_path(self, frame: str, trajectory: Odometry | None, stamp: Any) -> None:
-        """Publish a trajectory as the path, kept for late subscribers; without one, a path of no poses."""
+        """Publish a trajectory as the path, with durability for late subscribers; None for an empty path."""
         self._path.publish(path_message(frame, trajectory, stamp))
 
 
 def path_message(frame: str, trajectory: Odometry | None, stamp: Any) -> Path:
-    """Return the path along a trajectory, of `MOST_POINTS` poses at the most."""
+    """Return the path of a trajectory, with at most `MOST_POINTS` poses."""
     path = Path()
     path.header.frame_id, path.header.stamp = frame.lstrip('/'), stamp
     if trajectory is None or not len(trajectory.stamp):

@@ -1,4 +1,4 @@
-"""A run of EM that finds the trajectory first: what `process_bag --refine-poses` does, in the node's worker."""
+"""A run of EM that refines the trajectory first, as `process_bag --refine-poses` does, in the node's worker."""
 
 from __future__ import annotations
 
@@ -27,23 +27,22 @@ from ..files.trajectory_text import calibration_words
 from .background import reason
 
 BATCH = 20_000
-"""Readings after which the live map looks whether it is still wanted."""
+"""Readings after which the construction of a live map checks for cancellation."""
 
 
 class Drive(NamedTuple):
-    """What a trajectory is found from: the poses of odometry, and all readings that they placed."""
+    """Input of refinement: the poses of odometry, and all readings that they placed."""
 
     odometry: Odometry
     readings: Readings
 
 
 class Found(NamedTuple):
-    """What became of a trajectory.
+    """The trajectory of a run.
 
-    `refinement` is None where none was to be found, `correction` where odometry stays. `live` is the live map of the
-    drive's readings, None where the one that there is need not be replaced. `follower` goes on from where the drive is
-    by now; None where it is not to be followed. `kept` says why the run by itself leaves odometry as it is, where the
-    trajectory of an earlier one goes on; otherwise it is empty.
+    `refinement` is None if none was wanted, `correction` if odometry is used. `live` is the live map of the drive's
+    readings, None if the current one is still right. `follower` continues the trajectory; None if it is not followed.
+    `kept` is the reason why this run alone would use odometry, if the trajectory of an earlier run is kept; else ''.
     """
 
     refinement: Refinement | None
@@ -54,12 +53,12 @@ class Found(NamedTuple):
 
 
 class RefiningMapper:
-    """Runs from readings to maps as `Mapper` does, at the poses of the trajectory that the readings speak for.
+    """Makes maps of readings as `Mapper` does, at the poses of the refined trajectory.
 
     Attributes
     ----------
     found : Found or None
-        Set before the maps are made.
+        Set by `run`, once the maps are made.
     """
 
     def __init__(
@@ -76,13 +75,13 @@ class RefiningMapper:
         ----------
         parameters : Parameters
         drive : callable
-            Called in the thread of the run, once the readings are there.
+            Called in the thread of the run, once the readings are available.
         refine : bool
-            Whether to look for a trajectory; without, odometry stays.
+            Whether to refine the trajectory; otherwise that of odometry is used.
         before : Found or None
-            The trajectory in force, along which the live map is so far; None if it is odometry's.
+            The current trajectory, on which the live map is based; None if it is that of odometry.
         now : callable, optional
-            Called in the thread of the run, returns the drive so far: what came since the begin is followed.
+            Called in the thread of the run; returns the drive so far, so that the part after the begin is followed.
         """
         self.found: Found | None = None
         self._now = now
@@ -103,7 +102,7 @@ class RefiningMapper:
         self._mapper.cancel()
 
     def so_far(self) -> tuple[Grid, NDArray[np.int8]] | None:
-        """Return what `Mapper.so_far` does."""
+        """Return the result of `Mapper.so_far`."""
         return self._mapper.so_far()
 
     def run(
@@ -112,9 +111,9 @@ class RefiningMapper:
         watch: Watch = lambda stage, progress: None,
         start: tuple[Grid, NDArray[np.int8]] | None = None,
     ) -> MapSet:
-        """Return the maps of `readings`, which odometry placed; the rest is as in `Mapper.run`.
+        """Return the maps of `readings`, which odometry placed; see `Mapper.run` for the parameters.
 
-        `start` is used only where odometry stays.
+        `start` is used only with the trajectory of odometry.
         """
         drive, refinement, correction = self._drive(), None, None
         seconds: dict[str, float] = {}
@@ -132,7 +131,7 @@ class RefiningMapper:
         maps = self._mapper.run(readings, watch, start)
         maps.statistics['seconds'] = {**seconds, **maps.statistics['seconds']}
         if refinement is not None:
-            # the readings are kept once
+            # so that the readings are in memory only once
             refinement = replace(refinement, readings=maps.readings)
         if refinement is not None and correction is not None and self._now is not None:
             watch('following', None)
@@ -141,7 +140,7 @@ class RefiningMapper:
         return maps
 
     def _follow(self, correction: Correction, found: Refinement, now: Callable[[], Drive]) -> None:
-        """Follow what was driven while the drive before was looked at; without it the maps are as good."""
+        """Follow what was driven during the refinement; the maps are valid even if this fails."""
         follower = self._follower = Follower(
             correction, found.calibration, self._parameters, found.noise, found.right_angles
         )
@@ -180,7 +179,7 @@ class RefiningMapper:
 
 
 def outcome_words(found: Found) -> str:
-    """Return what became of the trajectory, in words; empty if none was to be found."""
+    """Return a description of the trajectory, in words; '' if no refinement was wanted."""
     refinement, correction = found.refinement, found.correction
     if refinement is None:
         return ''

@@ -1,4 +1,4 @@
-"""The node's report, once a second: diagnostics of all its parts, and warnings in the log."""
+"""Diagnostics of all parts of the node, once a second, and warnings in the log."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from .verdict_log import VerdictLog
 
 
 class Reporter:
-    """Publishes what the parts of the node say of themselves."""
+    """Publishes the diagnostics of all parts of the node."""
 
     def __init__(
         self,
@@ -42,7 +42,7 @@ class Reporter:
         kernels: Kernels,
         workers: Iterable[Worker],
     ) -> None:
-        """Prepare; `workers` are all that work in the background."""
+        """Prepare; `workers` are all workers in the background."""
         self._node, self._health, self._intake, self._associator = node, health, intake, associator
         self._extrinsics, self._map_frame, transforms = frames
         self._live, self._em, self._journal, self._trajectory = live, em, journal, trajectory
@@ -52,13 +52,13 @@ class Reporter:
         )
         self._verdicts = VerdictLog(node.get_logger())
         self._reported: set[str] = set()
-        self._lost: set[str] = set()
-        self._quiet: set[str] = set()
+        self._without_pose: set[str] = set()
+        self._silent_before: set[str] = set()
         self._no_map_frame = self._no_name = self._far = False
         self._out = node.create_publisher(DiagnosticArray, '/diagnostics', 10)
 
     def report(self) -> None:
-        """Publish the diagnostics of now."""
+        """Publish the current diagnostics."""
         self._name_frames()
         name = self._node.get_fully_qualified_name().lstrip('/')
         topics = {'Range': self._em.range_topics, 'Odometry': [self._em.odom_topic]}
@@ -76,17 +76,17 @@ class Reporter:
             no_map_frame := self._map_frame_fault(),
             lambda kind: self._surroundings.absent(kind, topics[kind]),
         )
-        faults = [*self._intake.faults(), *self._surroundings.faults(), *self._nameless()]
+        faults = [*self._intake.faults(), *self._surroundings.faults(), *self._no_frame_id()]
         counts = self._associator.buffer.counts()
         limits = [
             *self._associator.limits.warnings(),
             *sensor_rejections(self._associator.rejected_by_frame, counts, OF_POSES),
         ]
-        # what is wrong with frames is told of where each is found out
+        # faults of frames are logged by the functions that detect them
         silent = statuses[0].message == no_map_frame or statuses[0].message.startswith(diagnostics.NO_POSE)
         bad = statuses[0].level != DiagnosticStatus.OK
         well = statuses[0].message == diagnostics.MAPPING and not (faults or limits)
-        self._verdicts.look([*([statuses[0].message] if bad and not silent else []), *limits], well)
+        self._verdicts.update([*([statuses[0].message] if bad and not silent else []), *limits], well)
         diagnostics.add_faults(statuses[0], [*faults, *limits, *self._em.wrong_input])
         statuses += [*self._journal.statuses(name), *self._trajectory.statuses(name)]
         statuses.append(self._em.sensors.status(name, counts, self._silent(counts)))
@@ -94,10 +94,10 @@ class Reporter:
         self._out.publish(diagnostics.array(statuses, self._node.get_clock().now().to_msg()))
 
     def _background(self, name: str) -> DiagnosticStatus:
-        """Return the status of what works in the background."""
+        """Return the status of the work in the background."""
         values, failed = {}, []
         for worker in self._workers:
-            # asked once, since it may change meanwhile
+            # read once, since it may change meanwhile
             trouble, waiting = worker.trouble, worker.waiting
             values[worker.name] = trouble or (f'{waiting} to do' if waiting else 'idle')
             if trouble:
@@ -108,19 +108,19 @@ class Reporter:
         return diagnostics.status(f'{name}: background', level, message, name, values)
 
     def _silent(self, counts: Mapping[str, Any]) -> dict[str, float]:
-        """Return the sensors that stopped sending and for how long; the log is told of them and of their return."""
+        """Return silent sensors and the seconds since their last message; log when they stop and when they return."""
         found = {frame: seconds for frame, seconds in self._intake.heard.silent().items() if frame in counts}
         log = self._node.get_logger()
-        if new := found.keys() - self._quiet:
+        if new := found.keys() - self._silent_before:
             log.warning(f'these sensors have stopped sending: {diagnostics.listed(new)}')
-        # a reset forgets who was silent, too
-        if back := [frame for frame in self._quiet - found.keys() if frame in self._intake.heard]:
+        # after a reset, nothing is known of sensors that were silent
+        if back := [frame for frame in self._silent_before - found.keys() if frame in self._intake.heard]:
             log.info(f'these sensors send again: {diagnostics.listed(back)}')
-        self._quiet = set(found)
+        self._silent_before = set(found)
         return found
 
     def _map_frame_fault(self) -> str:
-        """Return what is wrong with the transform to the map frame; the log is told when it begins and when it ends."""
+        """Return the fault of the transform to the map frame, or ''; log its begin and its end."""
         fault = self._map_frame.fault()
         if fault and not self._no_map_frame:
             self._no_map_frame = True
@@ -130,8 +130,8 @@ class Reporter:
             self._node.get_logger().info('the transform to map_frame is available')
         return fault
 
-    def _nameless(self) -> list[str]:
-        """Warn of odometry whose frame has no name, which maps then lack as well; the log is told once."""
+    def _no_frame_id(self) -> list[str]:
+        """Return a warning if odometry has no frame_id, so that maps have none either; log it once."""
         nameless = bool(len(self._associator.record)) and not self._associator.map_frame
         text = (
             'odometry has no frame_id in its header: RViz and Nav2 cannot use a map in that frame, and TF has no '
@@ -143,15 +143,15 @@ class Reporter:
         return [text] * nameless
 
     def _name_frames(self) -> None:
-        """Name sensors without a pose in the log, each once, and those that have one after all."""
+        """Log sensors without a pose, each once, and those whose pose became known."""
         unknown = self._associator.unknown_frames
-        # a reset forgets which are unknown, too
-        for frame in sorted((self._lost - unknown).intersection(self._associator.buffer.counts())):
+        # a reset also forgets which frames are unknown
+        for frame in sorted((self._without_pose - unknown).intersection(self._associator.buffer.counts())):
             self._node.get_logger().info(f'sensor {frame} now has a pose on the robot')
-        # also those that are rejected, or wait
+        # also sensors whose readings are rejected, or wait
         sent = {frame.lstrip('/') for frame in self._intake.heard}
         unheard = self._extrinsics.known.keys() - sent
-        # said once, however many frames are new
+        # logged once for any number of new frames
         named = f'; there are poses for {diagnostics.listed(unheard)}: is it one of these?' if unheard else ''
         for frame in sorted(unknown - self._reported)[: diagnostics.SHOWN]:
             if len(self._reported) >= MOST_FRAMES:
@@ -173,7 +173,7 @@ class Reporter:
                 f'its readings are rejected{named}'
             )
             named = ''
-        self._lost = unknown & self._reported
+        self._without_pose = unknown & self._reported
         if not self._far and (far := far_mounts(self._extrinsics.fixed)):
             self._far = True
             self._node.get_logger().warning(far[0])

@@ -1,4 +1,4 @@
-"""The parameter table as ROS parameters: descriptors, ranges, validation, and the sensors' poses."""
+"""The parameter table as ROS parameters: descriptors, ranges, validation, and the poses of sensors."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ from ..core.messages.mounts import mount_from
 ROS_OWN = ('use_sim_time', 'start_type_description_service', 'qos_overrides')
 NAMES = {row.name for row in TABLE}
 CONFIGURED = {row.name for row in TABLE if row.read_only}
-"""Parameters that `configure` reads, as it does the poses of sensors."""
+"""Parameters that `configure` reads, like the poses of sensors."""
 
 AT_START = ('autostart',)
-"""Of these, what only the start of the process asks for."""
+"""Those of them that only the start of the process reads."""
 
 
 def descriptor(row: Parameter) -> ParameterDescriptor:
@@ -48,10 +48,10 @@ def descriptor(row: Parameter) -> ParameterDescriptor:
 
 
 def declare(node: Node) -> tuple[Parameters, dict[str, Pose2], list[str]]:
-    """Declare every parameter; return their values, the sensors' poses, and warnings about names that mean nothing.
+    """Declare every parameter; return their values, the poses of sensors, and warnings about unknown names.
 
-    The node must have been made with `automatically_declare_parameters_from_overrides`, so that the poses, whose
-    names nobody knows beforehand, are there.
+    The node must be created with `automatically_declare_parameters_from_overrides`, since the names of the poses are
+    not known beforehand.
 
     Raises
     ------
@@ -63,7 +63,7 @@ def declare(node: Node) -> tuple[Parameters, dict[str, Pose2], list[str]]:
     values = {}
     for row in TABLE:
         value = row.default
-        # the new name wins
+        # the new name takes precedence
         for name in (former.get(row.name, ''), row.name):
             if name in given:
                 value = row.check(given[name].value)
@@ -71,16 +71,16 @@ def declare(node: Node) -> tuple[Parameters, dict[str, Pose2], list[str]]:
         values[row.name] = value
         stored = list(value) if isinstance(value, tuple) else value
         node.declare_parameter(row.name, stored, descriptor(row), ignore_override=True)
-    return Parameters.from_flat(values), _extrinsics(given), _strangers(given)
+    return Parameters.from_flat(values), _extrinsics(given), _unknown_names(given)
 
 
 def mounts(node: Node) -> dict[str, Pose2]:
-    """Return the poses of sensors that parameters give.
+    """Return the poses of sensors that are given as parameters.
 
     Raises
     ------
     ParameterError
-        If a value is no pose.
+        If a value is not a pose.
     """
     return _extrinsics(node.get_parameters_by_prefix(''))
 
@@ -95,11 +95,11 @@ def validator(
     Parameters
     ----------
     current : callable
-        Returns the parameters in force.
+        Returns the current parameters.
     accept : callable
-        Takes the new ones when all are admitted.
+        Receives the new ones if all are valid.
     configured : callable
-        Returns whether the node has read those that it reads when it is configured.
+        Returns whether the node is configured, so that it has read the parameters in `CONFIGURED`.
     """
 
     def check(changes: list[RosParameter]) -> SetParametersResult:
@@ -121,9 +121,9 @@ def validator(
 
 
 def with_points(changes: list[RosParameter]) -> list[RosParameter]:
-    """Return parameters that are to be set, whole numbers for parameters of type double as such.
+    """Return parameters with integers converted to doubles where the parameter has this type.
 
-    So `p_hit 1` is not refused for being written without a point, and the parameter keeps its type.
+    So `p_hit 1` is accepted without a decimal point, and the parameter keeps its type.
     """
     floats = {row.name for row in TABLE if row.type is float}
     return [
@@ -142,7 +142,7 @@ def _extrinsics(given: dict[str, RosParameter]) -> dict[str, Pose2]:
     return extrinsics
 
 
-def _strangers(given: dict[str, RosParameter]) -> list[str]:
+def _unknown_names(given: dict[str, RosParameter]) -> list[str]:
     warnings = []
     for name in given:
         pose = name.startswith('sensors.') and name.endswith('.pose')

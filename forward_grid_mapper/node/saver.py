@@ -1,4 +1,4 @@
-"""The service save_maps: writes the latest maps to files, one call after the other."""
+"""The service save_maps: writes the latest maps to files, one call at a time."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ from .live import LiveMap
 from .refining import Found
 
 USES = {'ml_map.yaml': ' for Nav2', 'report.html': ' for a browser', 'report.txt': ''}
-"""Files that a caller is told of by name, and what for."""
+"""Files that the answer names, and what they are for."""
 
 
 class Account(NamedTuple):
-    """What a report says of the node and its readings, as they were when the maps were asked for.
+    """The state of the node and its readings for a report, when the maps were requested.
 
-    `source` is as `write_results` takes it, `accepted` counts readings, `path` is the robot's as odometry gives it,
-    `odometry` stamps and poses of it.
+    `source` is as in `write_results`, `accepted` is the number of readings, `path` is that of the robot by odometry,
+    `odometry` are stamps and poses.
     """
 
     source: dict[str, Any]
@@ -43,7 +43,7 @@ class Account(NamedTuple):
 
 
 class Saver:
-    """Writes maps in a thread of its own, so that each call finds a folder name that is free."""
+    """Writes maps in a thread of its own, so that each call finds a free folder name."""
 
     def __init__(self, em: EmService, live: LiveMap, account: Callable[[], Account], logger: Any) -> None:
         """Prepare; `account` is called by the executor."""
@@ -51,7 +51,7 @@ class Saver:
         self._em, self._live, self._account, self._logger = em, live, account, logger
 
     def save_maps(self, reply: Reply) -> None:
-        """Answer the service; where EM has not run, run it first."""
+        """Answer the service; run EM first if it has not run."""
         if self._em.maps is None and self._em.current is not None:
             self._logger.info('save_maps waits for the end of EM')
         self._em.when_there_are_maps(lambda outcome: self._save(outcome, reply))
@@ -105,7 +105,7 @@ class Saver:
         names = {path.name for path in folder.iterdir()}
         shown = [f'{folder / name}{use}' for name, use in USES.items() if name in names]
         said = [', '.join([*shown, f'and {counted(len(names) - len(shown), "file")} more'])]
-        # a robot that drives measures on while it is told of its map
+        # a robot that drives receives readings meanwhile
         if newer > 0:
             said.append(f'{counted(newer, "reading")} arrived after EM')
         if count := len(report['warnings']) - (newer > 0):

@@ -1,4 +1,4 @@
-"""The health of each sensor, as a status of `/diagnostics`, and which of them sends nothing any more."""
+"""The health of each sensor, as a status of `/diagnostics`, and which sensors have stopped sending."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from .diagnostics import listed, status
 
 
 class SensorWatch:
-    """Keeps the table of the latest EM run; before the first, there are counts alone."""
+    """Keeps the table of the latest EM run; before the first, the status has counts only."""
 
     def __init__(self) -> None:
         self._table: dict[str, SensorHealth] = {}
@@ -34,9 +34,9 @@ class SensorWatch:
         name : str
             Of the node.
         counts : dict of name → (int, int)
-            Readings accepted so far, and those without echo; for sensors that the last run of EM did not judge.
+            Readings accepted so far, and those without echo; for sensors that are not in the table.
         quiet : dict of name → float, optional
-            Seconds for which sensors that stopped sending have sent nothing.
+            Seconds since the last message of sensors that have stopped sending.
         """
         quiet = quiet or {}
         table = self._table

@@ -1,4 +1,4 @@
-"""One orderly end, however often Ctrl-C is pressed: SIGINT and SIGTERM become a single request to stop."""
+"""An orderly shutdown: any number of SIGINT and SIGTERM become a single request to stop."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from collections.abc import Callable
 
 SIGNALS = {signal.SIGINT, signal.SIGTERM}
 GRACE = 5.0
-"""Seconds that an orderly end may take before the process is ended anyway."""
+"""Longest duration of an orderly shutdown, seconds; then the process is ended."""
 
 
 class Stopper:
-    """Waits for the signals in a thread of its own, so that they interrupt nothing.
+    """Waits for the signals in a thread of its own, so that they interrupt no other.
 
-    To be made before any other thread, since threads inherit the signal mask. `ros2 launch` sends SIGINT twice, which
-    would otherwise hit the cleanup as a KeyboardInterrupt.
+    It must be created before any other thread, since threads inherit the signal mask. `ros2 launch` sends SIGINT twice;
+    the second one would raise KeyboardInterrupt during the shutdown.
     """
 
     def __init__(self) -> None:
@@ -28,7 +28,7 @@ class Stopper:
         threading.Thread(target=self._wait, daemon=True, name='stopper').start()
 
     def call(self, stop: Callable[[], None]) -> None:
-        """Set what ends the program; until then a signal ends it at once, since nothing can be lost yet."""
+        """Set the function that ends the program; before, a signal ends it at once, since no data can be lost yet."""
         with self._lock:
             self._stop = stop
             late = self.requested.is_set()

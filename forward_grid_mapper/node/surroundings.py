@@ -1,4 +1,4 @@
-"""Faults around the node, which it can only see by asking: publishers it cannot receive from, no clock, namesakes."""
+"""Faults in the ROS graph: publishers with incompatible QoS, no clock, nodes with the same name."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from rclpy.qos import DurabilityPolicy, QoSCompatibility, QoSProfile, Reliabilit
 from .diagnostics import listed
 
 PERIOD = 3.0
-"""Seconds between two looks."""
+"""Seconds between two checks."""
 
 KINDS = {'Range': 'sensor_msgs/msg/Range', 'Odometry': 'nav_msgs/msg/Odometry'}
 PARAMETER = {'Range': 'range_topics, or remap sonar', 'Odometry': 'odom_topic, or remap odom'}
-"""What names the topics of a kind."""
+"""Parameters that set the topics of a kind."""
 
 
 class Surroundings:
-    """Looks around now and then, and reports each fault once in the log and as long as it lasts in diagnostics."""
+    """Checks the graph periodically; logs each fault once, and reports it while it lasts."""
 
     def __init__(
         self,
@@ -28,15 +28,15 @@ class Surroundings:
         transforms: tuple[str, ...] = (),
         frames_missing: Callable[[], bool] = lambda: False,
     ) -> None:
-        """Prepare to look.
+        """Prepare to check.
 
         Parameters
         ----------
         node : Node
         subscriptions : dict of topic → QoSProfile
-            What the node listens to, other than TF.
+            Subscriptions of the node, except TF.
         transforms : tuple of str
-            The topics of TF, and of static TF; none where it does not listen to TF.
+            The topics of TF and of static TF; empty if the node does not subscribe to TF.
         frames_missing : callable
             Returns whether a sensor has no pose.
         """
@@ -48,11 +48,11 @@ class Surroundings:
         self._faults: list[str] = []
 
     def faults(self) -> list[str]:
-        """Return what is wrong, in words."""
+        """Return the faults, in words."""
         now = time.monotonic()
         if now >= self._next:
             self._next = now + PERIOD
-            self._faults = [*self._deaf(), *self._transforms_lost(), *self._timeless(), *self._namesakes()]
+            self._faults = [*self._incompatible(), *self._transforms_lost(), *self._no_clock(), *self._same_names()]
             for fault in self._faults:
                 if fault not in self._reported and len(self._reported) < 100:
                     self._reported.add(fault)
@@ -60,7 +60,7 @@ class Surroundings:
         return self._faults
 
     def absent(self, kind: str, topics: Sequence[str]) -> str:
-        """Say why no 'Range' or no 'Odometry' comes on topics, to be put behind what is missing; empty if unknown."""
+        """Return the reason why no 'Range' or 'Odometry' arrives on topics, for the end of a message; '' if unknown."""
         of_kind, said = KINDS[kind], []
         for topic in topics:
             types = {publisher.topic_type for publisher in self._node.get_publishers_info_by_topic(topic)}
@@ -78,7 +78,7 @@ class Surroundings:
         remedy = f'; {kind} is published on {listed(elsewhere)}: set {PARAMETER[kind]}' if elsewhere else ''
         return f': {", ".join(said)}{remedy}'
 
-    def _deaf(self) -> list[str]:
+    def _incompatible(self) -> list[str]:
         faults = []
         of_transforms = dict.fromkeys(self._transforms, QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE))
         for topic, wanted in (self._subscriptions | of_transforms).items():
@@ -98,7 +98,7 @@ class Surroundings:
         return list(dict.fromkeys(faults))
 
     def _transforms_lost(self) -> list[str]:
-        """Name publishers whose static transforms may have come before this node listened."""
+        """Return faults of publishers whose static transforms may have been sent before this node subscribed."""
         if not self._frames_missing():
             return []
         names = {
@@ -111,8 +111,8 @@ class Surroundings:
         }
         return sorted(names)
 
-    def _timeless(self) -> list[str]:
-        """Say that there is no simulated time, once publishers had the time to be found."""
+    def _no_clock(self) -> list[str]:
+        """Return the fault of missing simulated time, once there was time to discover publishers."""
         clock = self._node.get_clock()
         if not clock.ros_time_is_active or clock.now().nanoseconds or time.monotonic() < self._begin + PERIOD:
             return []
@@ -123,7 +123,7 @@ class Surroundings:
             'bag with --clock, or leave out use_sim_time'
         ]
 
-    def _namesakes(self) -> list[str]:
+    def _same_names(self) -> list[str]:
         own = self._node.get_name(), self._node.get_namespace()
         count = sum(pair == own for pair in self._node.get_node_names_and_namespaces())
         name = self._node.get_fully_qualified_name()

@@ -1,7 +1,7 @@
-"""The trajectory in force: what readings are moved by on their way to the maps, and what others are told of it.
+"""The current trajectory: it places readings on the maps, and is published for other nodes.
 
-The associator keeps readings and poses as odometry gives them, and so does the journal. What `refine_poses` finds is a
-correction, applied wherever they go to a map; without one they go there as they are, to the bit.
+The associator and the journal keep readings and poses as odometry gives them. The result of `refine_poses` is a
+correction, applied to readings on their way to a map; without one, readings are not changed at all.
 """
 
 from __future__ import annotations
@@ -33,32 +33,32 @@ from .pose_publishers import PERIOD, PosePublishers
 from .refining import Drive, Found, RefiningMapper, outcome_words
 
 MAP = 'map'
-"""Name of the map frame where `map_frame` gives none (REP 105)."""
+"""Name of the map frame if `map_frame` is empty (REP 105)."""
 
 
 LASTING = 1.0
-"""Seconds after which a stamp of odometry that is far ahead of the one before counts, though none has followed it."""
+"""Seconds after which a stamp of odometry that is far ahead of the one before is used, even if none follows it."""
 
-GROWS = 0.5
-"""Metres of driving after which the path is published again."""
+PATH_EVERY = 0.5
+"""Metres of driving between two messages of the path."""
 
 RECENT = 60_000_000_000
-"""Nanoseconds of odometry before the last look, which say how far apart its poses are."""
+"""Nanoseconds of odometry before the last check, from which the usual distance of its poses follows."""
 
 AFTER_JUMP = SHORTEST
-"""Metres after a jump of odometry from which on the node refines by itself, if it does at all: then there is something
-to tell by where the robot is."""
+"""Metres after a jump of odometry at which the node refines by itself, if `refine_every` is set: enough to find the
+pose of the robot."""
 
 LEAST_EVERY = 1.0
-"""Metres between two runs that the node begins by itself, so that there is time for run_em between them."""
+"""Shortest distance between two runs that the node begins by itself, metres, so that run_em gets its turn."""
 
-GROWN = 0.1
-"""Part of the drive that must be new for the node to refine by itself: a run looks at all of it, so that runs after
-equal ways would cost more and more."""
+NEW_PART = 0.1
+"""Fraction of the drive that must be new before the node refines by itself: a run uses the whole drive, so that at
+equal distances runs would cost more and more."""
 
 
 class _Jump(NamedTuple):
-    """A jump of odometry: the stamp after it, nanoseconds, by how far, and after which way of the drive, metres."""
+    """A jump of odometry: the stamp after it, nanoseconds; its size, and the distance driven before it, metres."""
 
     stamp: int
     far: float
@@ -72,33 +72,33 @@ class _Jump(NamedTuple):
 
 
 class Trajectory:
-    """Owned by the executor.
+    """The state of the trajectory. The executor owns it.
 
     Attributes
     ----------
     on : bool
-        Whether maps are in the map frame, and the transform from there to odometry's is published.
+        Whether maps are in the map frame, and the transform from map to odometry is published.
     correction : Correction or None
-        What readings are moved by.
+        Places readings in the map frame; None if odometry is used.
     found : Found or None
-        What became of the trajectory of the latest maps; None where none was looked for.
+        Trajectory of the latest maps; None if none was estimated.
     publishing : Worker
         Makes long messages.
     changed : callable
-        Called when maps are to be made anew: with the live map, None if only the frame changed, and with the number of
+        Called when maps must be made again: with the live map, None if only the frame has changed, and the number of
         readings in it.
     refine : callable
-        Called when the drive has grown by `refine_every`; returns whether a run was begun.
+        Called when the drive has grown by `refine_every`; returns whether a run began.
     listening : callable
-        Returns whether the node is active: one that is not leaves the transform to others, such as AMCL.
+        Returns whether the node is active: an inactive node leaves the transform to others, such as AMCL.
     following : Following or None
-        Goes on with what was found while the robot drives; None where this is not wanted.
+        Continues the trajectory while the robot drives; None if this is not wanted.
     driven : float
-        Metres since the drive began, as far as they were looked at.
+        Metres since the begin of the drive, up to the last check.
     """
 
     def __init__(self, node: Any, associator: PoseAssociator, clock: Any) -> None:
-        """Prepare for `begin`; `clock` is that of timers."""
+        """Prepare for `begin`; `clock` is the clock of timers."""
         self._node, self._associator, self._clock = node, associator, clock
         self.publishing: Worker | None = None
         self._out: PosePublishers | None = None
@@ -119,7 +119,7 @@ class Trajectory:
 
     @property
     def obstacle(self) -> str:
-        """Why there can be no other trajectory than odometry's, in words; empty if there can."""
+        """The reason why odometry must be used as the trajectory, in words; '' if there is none."""
         if self._associator.map_frame.lstrip('/') != self._map_frame:
             return ''
         return (
@@ -129,14 +129,14 @@ class Trajectory:
 
     @property
     def frame(self) -> str:
-        """The frame of the maps; empty while odometry has named none and no parameter does."""
+        """The frame of the maps; '' if neither odometry nor a parameter has named one."""
         if self.on and not self.obstacle:
             return self._map_frame
         return self._associator.map_frame or str(self._parameters.node.map_frame)
 
     @property
     def place(self) -> Callable[[Readings], Readings] | None:
-        """What readings are moved by on their way to a map; None if they stay."""
+        """The function that places readings in the map frame; None if they are not moved."""
         return None if self.correction is None else self.correction.apply
 
     @property
@@ -149,7 +149,7 @@ class Trajectory:
         return (self._parameters.node.map_frame or MAP).lstrip('/')
 
     def begin(self) -> None:
-        """Begin a drive, with the trajectory of odometry."""
+        """Begin a drive, with odometry as the trajectory."""
         self.correction = self.found = None
         if self.following is not None:
             self.following.begin(None)
@@ -166,7 +166,7 @@ class Trajectory:
     def mapper(
         self, parameters: Parameters, drive: Callable[[], Drive], now: Callable[[], Drive]
     ) -> RefiningMapper | Mapper:
-        """Return what makes the maps of a run; `drive` returns what it was begun with, `now` what there is by then."""
+        """Return a mapper for a run; `drive` returns the drive at its begin, `now` the drive so far."""
         self._refined_at = self.driven
         refine, before = parameters.node.refine_poses and not self.obstacle, None
         if self.found is not None and self.correction is not None:
@@ -176,10 +176,10 @@ class Trajectory:
         return RefiningMapper(parameters, drive, refine, before, None if self.following is None else now)
 
     def adopt(self, found: Found | None, count: int) -> None:
-        """Take what was found for the maps of the first `count` readings; None if they are as odometry has it."""
+        """Use the trajectory of a run for the maps of the first `count` readings; None if that is odometry."""
         before, live = self.frame, found.live if found else None
         self.correction = found.correction if found else None
-        # the live map belongs to the one who shows it
+        # the live map and the follower have other owners
         self.found = found._replace(live=None, follower=None) if found and found.refinement else None
         refinement = found.refinement if found else None
         looked_at = refinement.trajectory.stamp[-1:] if refinement else np.zeros(0, np.int64)
@@ -195,17 +195,17 @@ class Trajectory:
             self.changed(live, count)
 
     def follow(self, correction: Correction) -> None:
-        """Take the correction that goes on from the one that was adopted."""
+        """Use a correction that continues the adopted one."""
         self.correction = correction
 
     def outcome(self) -> str:
-        """Return what became of the trajectory of the latest maps, in words; empty if it is odometry's anyway."""
+        """Return a description of the trajectory of the latest maps, in words; '' if odometry is used anyway."""
         if self._parameters.node.refine_poses and self.obstacle:
             return f'odometry is used as the trajectory: {self.obstacle}'
         return outcome_words(self.found) if self.found else ''
 
     def statuses(self, name: str) -> list[DiagnosticStatus]:
-        """Return the status of the trajectory, if it is to be refined."""
+        """Return the status of the trajectory; none if it is not refined."""
         if not (self.on or self._parameters.node.refine_poses):
             return []
         values: dict[str, Any] = {
@@ -258,40 +258,40 @@ class Trajectory:
             return
         frames = self.frame, associator.map_frame, associator.base_frame
         self._out.send(frames, self._correction_at(newest[0]), newest, self.listening())
-        self._drive_on(*newest)
+        self._advance(*newest)
 
     def _lasts(self, stamp: int) -> bool:
-        """Return whether a stamp has been the newest for a while: TF never forgets one that was wrong and far ahead."""
+        """Return whether a stamp has been the newest for a while: TF would keep a wrong one, far ahead, for ever."""
         if self._ahead is None or self._ahead[0] != stamp:
             self._ahead = stamp, time.monotonic()
         return time.monotonic() - self._ahead[1] > LASTING
 
     def _correction_at(self, stamp: int) -> NDArray[np.float64]:
-        """Return the pose of odometry's frame on the map, shape (3,), as readings of a stamp are moved."""
+        """Return the pose of the odometry frame in the map frame at a stamp, shape (3,)."""
         if self.correction is None:
             return np.zeros(3)
-        # earlier than the end is what comes after the clock jumped back, as where a bag is played again and again
+        # stamps before the end occur after the clock jumped back, as when a bag is played repeatedly
         return (self.correction if stamp >= self.correction.end else self.correction.until(stamp)).last
 
-    def _drive_on(self, stamp: int, pose: Pose2) -> None:
-        """Count the way, and do what is due after it."""
+    def _advance(self, stamp: int, pose: Pose2) -> None:
+        """Update the distance driven, and do the work that is due."""
         before, self._at = self._at or (stamp, pose), (stamp, pose)
-        self._count(before, stamp, pose)
+        self._add_distance(before, stamp, pose)
         if self.following is not None and self._parameters.node.refine_poses:
             self.following.offer(pose, lambda: (self._associator.buffer.snapshot(), self._associator.record.snapshot()))
-        if self.driven - self._shown_at >= GROWS and not self._showing:
+        if self.driven - self._shown_at >= PATH_EVERY and not self._showing:
             self._show_path()
         every = self._parameters.node.refine_every
         if not every or not self._parameters.node.refine_poses:
             return
-        due = max(every, LEAST_EVERY, GROWN * self.driven) <= self.driven - self._refined_at
+        due = max(every, LEAST_EVERY, NEW_PART * self.driven) <= self.driven - self._refined_at
         if self._jump is not None and self._jump.driven >= self._refined_at:
             due = due or self.driven - self._jump.driven >= AFTER_JUMP
         if due and self.refine():
             self._refined_at = self.driven
 
-    def _count(self, before: tuple[int, Pose2], stamp: int, pose: Pose2) -> None:
-        """Add the way since the last look, which may be long ago where messages come fast, without jumps."""
+    def _add_distance(self, before: tuple[int, Pose2], stamp: int, pose: Pose2) -> None:
+        """Add the distance driven since the last check, without jumps; many messages may have arrived since."""
         recent = Odometry(*self._associator.record.since(before[0] - RECENT))
         first, at = int(np.searchsorted(recent.stamp, before[0])), jumps(recent)
         at = at[at > first]
@@ -307,7 +307,7 @@ class Trajectory:
             self._node.get_logger().warning(str(self._jump))
 
     def _show_path(self) -> None:
-        """Have the trajectory published, and behind its end the poses of odometry as they are on the map."""
+        """Have the trajectory published, continued by poses of odometry in the map frame."""
         out, frame, correction, since = self._out, self.frame, self.correction, self._since
         if out is None or self.publishing is None:
             return
@@ -315,7 +315,7 @@ class Trajectory:
         if not self.on:
             self.publishing.put(lambda: out.publish_path(frame, None, stamp))
             return
-        # snapshots never change
+        # snapshots are immutable
         stamps, poses = self._associator.record.snapshot()
         self._shown_at, self._showing = self.driven, True
 

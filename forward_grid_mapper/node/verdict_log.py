@@ -1,4 +1,4 @@
-"""What the log is told of the input: each fault when it has lasted, and that all is well again."""
+"""The log of input faults: each fault once it lasts, and the end of all faults."""
 
 from __future__ import annotations
 
@@ -8,41 +8,41 @@ from collections.abc import Sequence
 from typing import Any
 
 LOOKS = 2
-"""Looks in a row, a second apart, after which a fault is no passing one, as at the start."""
+"""Consecutive checks, a second apart, after which a fault is logged: at the start, some faults pass."""
 
 AGAIN = 60.0
-"""Seconds after which a fault that came back is told of again."""
+"""Seconds before a fault that returned is logged again."""
 
 MOST = 100
-"""Faults that are remembered."""
+"""Most faults that are remembered."""
 
-# of how many seconds a sensor is judged changes with how often it sends
+# the time over which readings are judged depends on the rate of the sensor
 _NUMBER = re.compile(r'\blast second\b|\blast \d+ s\b|\d+(?:\.\d+)?')
 
 
 class VerdictLog:
-    """Tells the log what diagnostics say every second: once when it begins, and once when it has ended."""
+    """Logs what diagnostics report every second: a fault once, and the end of all faults."""
 
     def __init__(self, logger: Any) -> None:
         self._log = logger
         self._seen: dict[str, int] = {}
-        self._told: dict[str, float] = {}
+        self._logged: dict[str, float] = {}
         self._open: set[str] = set()
         self._bad = False
 
-    def look(self, faults: Sequence[str], well: bool) -> None:
-        """Take the faults of now, and whether readings are mapped without any; numbers in them do not make them new."""
+    def update(self, faults: Sequence[str], well: bool) -> None:
+        """Update with the current faults, and whether mapping is free of faults; numbers do not distinguish faults."""
         now = time.monotonic()
         kinds = {_NUMBER.sub('#', fault): fault for fault in faults}
         self._seen = {kind: self._seen.get(kind, 0) + 1 for kind in kinds}
         self._open.intersection_update(kinds)
         for kind, fault in kinds.items():
-            # one that came back too early is told of later, if it stays
-            if kind in self._open or self._seen[kind] < LOOKS or now < self._told.get(kind, -AGAIN) + AGAIN:
+            # a fault that returned too early is logged later, if it lasts
+            if kind in self._open or self._seen[kind] < LOOKS or now < self._logged.get(kind, -AGAIN) + AGAIN:
                 continue
-            if len(self._told) >= MOST:
-                self._told.clear()
-            self._told[kind] = now
+            if len(self._logged) >= MOST:
+                self._logged.clear()
+            self._logged[kind] = now
             self._open.add(kind)
             self._bad = True
             self._log.warning(fault)

@@ -1,1 +1,1 @@
-"""Recorded drives, from bags and journals, as readings and an account of how they came about."""
+"""Recorded drives, from bags and journals, as readings and data for the report."""

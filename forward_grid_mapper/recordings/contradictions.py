@@ -1,4 +1,4 @@
-"""What speaks against mapping several drives together: other frames, other sensors, or the same drive twice."""
+"""Reasons against one map of several drives: other frames, other sensors, or the same drive twice."""
 
 from __future__ import annotations
 
@@ -16,20 +16,21 @@ from ..core.messages.message_types import Pose2
 from ..core.messages.thinning import mixed, name_hashes
 
 SHARED = 0.5
-"""Part of the echoes of a drive that another one has as well, of the same sensor, stamp and range, from where on it is
-the same recording. Of two drives at other times none is; simulated ones, which all begin at one time, share few."""
+"""Fraction of the echoes of a drive that another drive has as well, with the same sensor, stamp and range, from which
+both are the same recording. It is 0 for two drives at different times, and small for simulated ones, whose stamps begin
+at the same time."""
 
 METRES, RADIANS = 0.01, math.radians(1.0)
-"""By how much the poses of a sensor, or its limits, must differ."""
+"""Smallest differences of the poses of a sensor, or of its limits, that cause a warning."""
 
 NAMED = 6
-"""Drives or sensors that a warning names."""
+"""Most drives or sensors that a warning names."""
 
 T = TypeVar('T')
 
 
 class Described(NamedTuple):
-    """What is compared of a drive: its name for the user, frames, sensor poses by frame, and limits by sensor."""
+    """Data of a drive for comparison: its name for the user, frames, sensor poses by frame, and limits by sensor."""
 
     name: str
     map_frame: str
@@ -39,7 +40,7 @@ class Described(NamedTuple):
 
 
 class Shared(NamedTuple):
-    """Two drives, by number, that share echoes: how many, and how many each has."""
+    """Two drives, by number, that share echoes: the number of shared echoes, and the number of each."""
 
     one: int
     other: int
@@ -48,17 +49,17 @@ class Shared(NamedTuple):
 
     @property
     def same(self) -> bool:
-        """Whether all echoes of both are shared."""
+        """Whether both have only shared echoes."""
         return self.shared == self.echoes[0] == self.echoes[1]
 
 
 def check_frames(drives: Sequence[Described]) -> None:
-    """Check that all drives are in one map frame.
+    """Check that all drives are in the same map frame.
 
     Raises
     ------
     InputError
-        If not; names the drives of each frame.
+        Otherwise; names the drives of each frame.
     """
     frames: dict[str, list[str]] = {}
     for drive in drives:
@@ -74,7 +75,7 @@ def check_frames(drives: Sequence[Described]) -> None:
 
 
 def shared_echoes(drives: Sequence[Readings]) -> list[Shared]:
-    """Return the pairs of drives of which one has at least the part `SHARED` of its echoes from the other."""
+    """Return the pairs of drives of which one shares at least the fraction `SHARED` of its echoes with the other."""
     echoes = [echoes_of(readings) for readings in drives]
     count = [len(hashes) for hashes in echoes]
     every = np.concatenate(echoes) if echoes else np.zeros(0, np.uint64)
@@ -117,21 +118,21 @@ def limits_of(readings: Readings) -> dict[str, tuple[float, float]]:
 
 
 def echoes_of(readings: Readings) -> NDArray[np.uint64]:
-    """Return the hashes of sensor, stamp and range of all echoes, in order, each once."""
+    """Return the hashes of sensor, stamp and range of all echoes, sorted and unique."""
     return np.unique(_echo_hashes(readings))
 
 
 def contradictions(drives: Sequence[Described]) -> list[str]:
-    """Return a warning for each thing in which drives of one robot (one base frame) differ."""
-    told: list[str] = []
+    """Return a warning for each difference between drives of the same robot (the same base frame)."""
+    warnings: list[str] = []
     robots: dict[str, list[Described]] = {}
     for drive in drives:
         robots.setdefault(drive.base_frame.lstrip('/'), []).append(drive)
     for group in robots.values():
-        told += _poses(group)
-        told += _limits(group)
-        told += _missing(group)
-    return told
+        warnings += _poses(group)
+        warnings += _limits(group)
+        warnings += _missing(group)
+    return warnings
 
 
 def _poses(drives: Sequence[Described]) -> Iterator[str]:
@@ -183,12 +184,12 @@ def _differing(
     key: Callable[[T], Hashable],
     same: Callable[[T, T], bool],
 ) -> Iterator[tuple[list[str], list[str], T, T]]:
-    """Yield drives whose values are not the usual ones, the sensors of which that is so, a usual value and another."""
+    """Yield drives with unusual values, the sensors concerned, a usual value and an unusual one."""
     found: dict[tuple[str, ...], list[tuple[str, T, T]]] = {}
     for frame in sorted({frame for value in values for frame in value}):
         mine = [(drive.name, value[frame]) for drive, value in zip(drives, values, strict=True) if frame in value]
         counts = Counter(key(value) for _, value in mine)
-        # of equally many the first
+        # the first, if several are equally frequent
         most = max(counts.values())
         usual = next(value for _, value in mine if counts[key(value)] == most)
         others = [(name, value) for name, value in mine if not same(value, usual)]
@@ -216,6 +217,6 @@ def _and_more(frames: Sequence[str]) -> str:
 
 
 def listed(names: Sequence[str]) -> str:
-    """Return names in a row, the first few of them."""
+    """Return a list of names in words, at most `NAMED` of them."""
     more = f' and {len(names) - NAMED} more' if len(names) > NAMED else ''
     return ', '.join(names[:NAMED]) + more

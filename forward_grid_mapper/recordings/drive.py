@@ -1,4 +1,4 @@
-"""What a recorded drive gives, wherever it was recorded: readings in the map frame, and an account of all messages."""
+"""A recorded drive, from a bag or a journal: readings in the map frame, and counts of all messages."""
 
 from __future__ import annotations
 
@@ -21,25 +21,25 @@ from ..core.trajectory.jumps import FASTEST, too_far
 from ..files.quality_warning import thinned
 
 MOST_JUMPED = 0.1
-"""Part of the steps that are jumps, from which on poses are in another unit, or none of a robot."""
+"""Fraction of steps that are jumps, from which the poses have a wrong unit, or are not those of a robot."""
 
 LEAST_JUMP = 0.1
-"""Metres that poses of one source may be off without any motion."""
+"""Metres that poses of one source may jump without a motion."""
 
 FEWEST_RETURNS = 4
-"""Steps to and fro below which they may be outliers."""
+"""Fewest steps to another place and back that are not regarded as outliers."""
 
 
 @dataclass(frozen=True)
 class Part:
-    """Which part of a drive to map: seconds after its first message, and seconds from there on."""
+    """The part of a drive to map: its begin in seconds after the first message, and its duration in seconds."""
 
     start: float = 0.0
     duration: float = math.inf
 
     @property
     def whole(self) -> bool:
-        """Whether that is all of the drive."""
+        """Whether it is the whole drive."""
         return self.start <= 0 and math.isinf(self.duration)
 
     def __str__(self) -> str:
@@ -47,13 +47,13 @@ class Part:
         return f'--start {self.start:g}{end}'
 
     def bounds(self, first: int) -> tuple[float, float]:
-        """Return the stamps, nanoseconds, that it lies between, the last one excluded; `first` is the drive's."""
+        """Return the stamps of its begin and end, nanoseconds, the end excluded; `first` is the first of the drive."""
         begin = first + _nanoseconds(self.start)
         return begin, begin + _nanoseconds(self.duration)
 
 
 def _nanoseconds(seconds: float) -> float:
-    """Return seconds as a whole number, since a stamp as a float is off by up to 128 and may be after the message."""
+    """Return whole nanoseconds, or what is not finite: floats are too coarse for stamps."""
     found = seconds * NANOSECONDS
     return round(found) if math.isfinite(found) else found
 
@@ -62,19 +62,19 @@ WHOLE = Part()
 
 
 class Spans:
-    """Takes the messages of a part of a drive, and tells which stamps there are.
+    """Selects the messages of a part of a drive, and records their stamps.
 
     Parameters
     ----------
     part : Part
         The drive begins with the first message that has a stamp.
     margin : float
-        Nanoseconds before and after the part whose odometry is taken as well.
+        Nanoseconds before and after the part for which odometry is selected as well.
 
     Attributes
     ----------
     ranges, odometry, left_out : list of int
-        The first and the last stamp of what is taken, and of what is not; empty where there is nothing.
+        The first and the last stamp of selected messages, and of the others; empty if there are none.
     """
 
     def __init__(self, part: Part, margin: float) -> None:
@@ -84,8 +84,8 @@ class Spans:
         self.odometry: list[int] = []
         self.left_out: list[int] = []
 
-    def taken(self, batch: MessageBatch) -> MessageBatch:
-        """Return the messages that are of the part."""
+    def select(self, batch: MessageBatch) -> MessageBatch:
+        """Return the messages of the part."""
         ranges, odometry = batch.ranges.stamp, batch.odometry.stamp
         if self._part.whole:
             _widen(self.ranges, ranges)
@@ -94,7 +94,7 @@ class Spans:
         if self._bounds is None and (first := _first_stamp(batch)) is not None:
             self._bounds = self._part.bounds(first)
         begin, end = self._bounds or self._part.bounds(0)
-        # as whole numbers, which floats of this size are not all
+        # as integers, since floats of this size do not represent all of them
         now = np.array([begin <= stamp < end for stamp in ranges.tolist()], np.bool_)
         near = [begin - self._margin <= stamp < end + self._margin for stamp in odometry.tolist()]
         moved = np.array(near, np.bool_)
@@ -106,7 +106,7 @@ class Spans:
 
 
 def _first_stamp(batch: MessageBatch) -> int | None:
-    """Return the stamp of the first message that has one; a driver may not have filled in that of the very first."""
+    """Return the stamp of the first message that has one; the first messages of some drivers have none."""
     found = []
     for kind in batch:
         stamped = np.flatnonzero(kind.stamp)
@@ -121,18 +121,18 @@ def _widen(span: list[int], stamps: NDArray[np.int64]) -> None:
         span[:] = min(both), max(both)
 
 
-class LogOddsMapOfAll:
-    """The live map of all readings of a drive, where `max_readings` lets EM have only some.
+class FullLiveMap:
+    """The live map of all readings of a drive, if `max_readings` restricts EM to some of them.
 
-    It costs nothing where no reading goes, since EM's result has the same live map then.
+    Without removed readings it needs no work, since the result of EM has the same live map.
     """
 
     def __init__(self, associator: PoseAssociator, parameters: Parameters) -> None:
         self._associator, self._live = associator, LogOddsMap(parameters)
         self._count = 0
-        associator.buffer.before_thinning.append(self._look)
+        associator.buffer.before_thinning.append(self._add_new)
 
-    def _look(self) -> None:
+    def _add_new(self) -> None:
         self._live.add(self._associator.buffer.snapshot(self._count))
         self._count = len(self._associator.buffer)
 
@@ -145,40 +145,40 @@ class LogOddsMapOfAll:
 
     def complete(self) -> LogOddsMap:
         """Return the map of all readings."""
-        self._look()
+        self._add_new()
         return self._live
 
 
 @dataclass(frozen=True)
 class Drive:
-    """What a bag or a journal holds for mapping.
+    """Data of a bag or a journal for mapping.
 
     Attributes
     ----------
     associator : PoseAssociator
         With all readings in the map frame.
     source : dict
-        What was read and rejected, for the report.
+        Data for the report.
     live : LogOddsMapOfAll
     mounts : mapping of str to Pose2, optional
-        Where no odometry was recorded, the poses of sensors on the robot that were given, by frame.
+        If there is no recorded odometry, the given poses of sensors on the robot, by frame.
     """
 
     associator: PoseAssociator
     source: dict[str, Any]
-    live: LogOddsMapOfAll
+    live: FullLiveMap
     mounts: Mapping[str, Pose2] | None = None
 
     @property
     def path_xy(self) -> NDArray[np.float64]:
-        """Where the robot drove, shape (P, 2), metres."""
+        """Path of the robot, shape (P, 2), metres."""
         return path_of(self.associator)
 
 
 def path_of(associator: PoseAssociator) -> NDArray[np.float64]:
-    """Return where the robot drove, shape (P, 2), metres: in order of stamps, where odometry came in another one."""
+    """Return the path of the robot, shape (P, 2), metres, in order of stamps even if odometry came in another one."""
     points, record = associator.path, associator.record
-    # a clock that jumped back has the record begin anew
+    # the record begins again after the clock jumped back
     if record.late and not associator.time_jumps:
         path = RobotPath()
         for x, y in record.snapshot()[1][:, :2].tolist():
@@ -188,14 +188,14 @@ def path_of(associator: PoseAssociator) -> NDArray[np.float64]:
 
 
 def length_of(associator: PoseAssociator) -> float:
-    """Return the metres that the robot drove; where odometry jumps faster than a robot drives it did not."""
+    """Return the distance driven by the robot, metres, without jumps of odometry."""
     whole = np.hypot(*np.diff(path_of(associator), axis=0).T).sum()
     steps, jumped = _steps(associator)
     return max(float(whole - steps[jumped].sum()), 0.0)
 
 
 def jumps_note(associator: PoseAssociator) -> list[str]:
-    """Return a note where odometry jumps, for those who map it as it is; not where it seems to do nothing else."""
+    """Return a note if odometry jumps, for users who map without refinement; not if it seems to consist of jumps."""
     steps, jumped = _steps(associator)
     count = int(np.count_nonzero(jumped))
     if not 0 < count < MOST_JUMPED * len(steps):
@@ -209,8 +209,8 @@ def jumps_note(associator: PoseAssociator) -> list[str]:
     ]
 
 
-def to_and_fro_note(associator: PoseAssociator) -> list[str]:
-    """Return a warning where poses jump to another place and at once back, as those of two sources do in turn."""
+def alternation_note(associator: PoseAssociator) -> list[str]:
+    """Return a warning if poses jump to another place and back, as when two sources publish alternately."""
     stamp, pose = associator.record.snapshot()
     if len(stamp) < 3:
         return []
@@ -229,13 +229,13 @@ def to_and_fro_note(associator: PoseAssociator) -> list[str]:
 
 
 def _steps(associator: PoseAssociator) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Return the metres between poses of odometry, and which of these steps no robot drives."""
+    """Return the distances between poses of odometry, metres, and a mask of the jumps, faster than a robot drives."""
     stamp, pose = associator.record.snapshot()
     steps: NDArray[np.float64] = np.hypot(*np.diff(pose[:, :2], axis=0).T)
     return steps, too_far(steps, np.diff(stamp) / NANOSECONDS)
 
 
 def thinning_note(associator: PoseAssociator) -> list[str]:
-    """Return a note where `max_readings` lets EM have only some of the readings."""
+    """Return a note if `max_readings` restricts EM to some of the readings."""
     count = len(associator.buffer)
     return list(filter(None, [thinned(min(count, associator.parameters.max_readings or count), count)]))

@@ -1,4 +1,4 @@
-"""Several drives in one map frame become the readings of one map, whatever the order in which they are given."""
+"""Several drives in the same map frame as the readings of one map, independent of the order of the drives."""
 
 from __future__ import annotations
 
@@ -28,22 +28,22 @@ from .given_poses import GivenPoses
 from .read_drive import read_drive
 
 MOST_ERRORS = 5
-"""Recordings that cannot be read whose errors are shown."""
+"""Most recordings whose errors are shown."""
 
 Watch = Callable[[str], None]
-"""Receives what goes on."""
+"""Receives a description of the current work."""
 
 
 @dataclass(frozen=True)
 class Drives:
-    """Drives that make one map, in canonical order: by their first stamps, then by what they hold.
+    """Drives for one map, in canonical order: by first stamp, then by contents.
 
     Attributes
     ----------
     drives : tuple of Drive
         At least one.
     source : dict
-        What was read and rejected, for the report; of a single drive its own, of several with a list of them, `drives`.
+        Data for the report: of a single drive, or of several with a list of them, `drives`.
     parameters : Parameters
     """
 
@@ -53,7 +53,7 @@ class Drives:
 
     @property
     def readings(self) -> Readings:
-        """The readings to map from: all that were accepted, or `max_readings` of them; not ordered."""
+        """The readings to map from: all accepted ones, or `max_readings` of them; unordered."""
         if len(self.drives) == 1:
             return self.drives[0].associator.readings
         return bounded(
@@ -63,7 +63,7 @@ class Drives:
 
     @property
     def path_xy(self) -> NDArray[np.float64]:
-        """Where the robots drove, shape (P, 2), metres; a row of NaN parts two drives."""
+        """Paths of the robots, shape (P, 2), metres; separated by rows of NaN."""
         parts = [self.drives[0].path_xy]
         for drive in self.drives[1:]:
             parts += [np.full((1, 2), np.nan), drive.path_xy]
@@ -75,7 +75,7 @@ class Drives:
         return self.drives[0].associator.map_frame
 
     def with_live(self, maps: MapSet) -> MapSet:
-        """Return the maps with the live map of all readings, where `max_readings` lets EM have only some."""
+        """Return the maps with the live map of all readings, if `max_readings` restricts EM to some of them."""
         if len(self.drives) == 1:
             return self.drives[0].live.on(maps)
         if len(maps.readings) == sum(len(drive.associator.buffer) for drive in self.drives):
@@ -97,26 +97,26 @@ def read_drives(
     say: Watch = lambda text: None,
     poses: GivenPoses | None = None,
 ) -> Drives:
-    """Read all drives that `words` mean (`find_recordings`).
+    """Read all drives given by `words` (see `find_recordings`).
 
     Parameters
     ----------
     words : sequence of Path or str
     parameters, extrinsics, range_topics, odom_topic
-        For every drive, as `read_drive` takes them.
+        For every drive, see `read_drive`.
     part : Part
         Of every drive.
     progress : callable, optional
         Called with (done, total) messages of a drive.
     say : callable, optional
-        Called with the name of each drive as it is read, where there are several.
+        Called with the name of each drive before it is read, if there are several.
     poses : GivenPoses, optional
-        Of all drives, as `read_drive` takes them.
+        For all drives, see `read_drive`.
 
     Raises
     ------
     BagError, InputError
-        If one of them cannot be read or mapped, or they are not in one map frame; names it.
+        If one of them cannot be read or mapped, or they are in different map frames; names it.
     """
     meant = find_recordings(words)
     paths, repeated = without_repetition(meant.paths)
@@ -138,7 +138,7 @@ def read_drives(
 
 
 def unreadable(errors: Sequence[tuple[Path, MapperError]], count: int) -> MapperError:
-    """Return the error about those of `count` drives that cannot be mapped."""
+    """Return the error on those of `count` drives that cannot be mapped."""
     lines = [
         '\n  ' + (f'{readable(path)}: ' * (readable(path) not in str(error)) + str(error)).replace('\n', '\n    ')
         for path, error in errors[:MOST_ERRORS]
@@ -152,28 +152,28 @@ def unreadable(errors: Sequence[tuple[Path, MapperError]], count: int) -> Mapper
 
 
 def without_repetition(paths: Sequence[Path]) -> tuple[list[Path], list[str]]:
-    """Return the recordings, each once, and a warning for those that are given more often, by whatever name.
+    """Return the recordings without repetitions, and a warning for each repeated one, even if the names differ.
 
-    Of a bag and one of its files the bag is taken, in whatever order they are given.
+    A bag takes precedence over its own files, in any order.
     """
     found: dict[object, Path] = {}
-    told = []
+    notes = []
     files = {path: _files(path) for path in paths}
-    # one whose files are a part of another one's comes after it
+    # bags before recordings that consist of a part of their files
     for path in sorted(paths, key=lambda path: -len(files[path])):
         keys = files[path]
         earlier = next((found[key] for key in keys if key in found), None)
         if earlier is not None:
             again = '' if earlier == path else f' again as {readable(path)}'
-            told.append(f'{readable(earlier)} is given{again or " more than once"}; it is read once')
+            notes.append(f'{readable(earlier)} is given{again or " more than once"}; it is read once')
             continue
         found.update(dict.fromkeys(keys, path))
     kept = set(found.values())
-    return [path for path in dict.fromkeys(paths) if path in kept], list(dict.fromkeys(told))
+    return [path for path in dict.fromkeys(paths) if path in kept], list(dict.fromkeys(notes))
 
 
 def _files(path: Path) -> list[object]:
-    """Return what tells a recording from others: its files, or where there are none its name."""
+    """Return keys that identify a recording: its files, or its name if there are none."""
     folder = path.parent if path.name == 'metadata.yaml' else path
     try:
         if folder.is_dir():
@@ -196,14 +196,14 @@ def digest_of(readings: Readings) -> bytes:
 
 
 def _together(drives: Sequence[Drive], repeated: list[str], parameters: Parameters) -> Drives:
-    """Put drives into canonical order, leave out copies, and say what they contradict each other in."""
+    """Put drives into canonical order, leave out copies, and add warnings about contradictions."""
     held = [drive.associator.buffer.snapshot() for drive in drives]
     keys = [(int(readings.stamp.min()), digest_of(readings)) for readings in held]
     order = sorted(range(len(drives)), key=lambda k: (keys[k], drives[k].source['bag']))
     described = [_described(drives[k], held[k]) for k in order]
     check_frames(described)
-    left_out, told = _copies(described, [held[k] for k in order])
-    warnings = [*repeated, *told]
+    left_out, notes = _copies(described, [held[k] for k in order])
+    warnings = [*repeated, *notes]
     kept = [k for k in range(len(order)) if k not in left_out]
     warnings += contradictions([described[k] for k in kept])
     chosen = tuple(drives[order[k]] for k in kept)
@@ -211,7 +211,7 @@ def _together(drives: Sequence[Drive], repeated: list[str], parameters: Paramete
         chosen[0].source['warnings'] += warnings
         return Drives(chosen, chosen[0].source, parameters)
     for drive in chosen:
-        # all drives together are thinned anew
+        # the note of thinning is made again for all drives together
         own = [text for text in drive.source['warnings'] if text not in thinning_note(drive.associator)]
         warnings += [f'{drive.source["bag"]}: {text}' for text in own]
     source = source_of_all([drive.source for drive in chosen], warnings)
@@ -228,27 +228,27 @@ def same_drive(others: Sequence[str], one: str) -> str:
 
 
 def _copies(drives: Sequence[Described], readings: Sequence[Readings]) -> tuple[set[int], list[str]]:
-    """Return which drives are left out as copies of an earlier one, and what to say of them and of parts of others."""
+    """Return the drives that are copies of an earlier one, and warnings about them and about partial copies."""
     pairs = shared_echoes(readings)
     copies: dict[int, list[int]] = {}
     left_out: set[int] = set()
-    # in order of their numbers, so that of several copies all are of the first one
+    # in order of numbers, so that all copies refer to the first one
     for pair in pairs:
         if pair.same and pair.one not in left_out:
             copies.setdefault(pair.one, []).append(pair.other)
             left_out.add(pair.other)
-    told = []
+    notes = []
     for one, others in copies.items():
-        told.append(same_drive([drives[k].name for k in others], drives[one].name))
+        notes.append(same_drive([drives[k].name for k in others], drives[one].name))
     for pair in pairs:
         if not {pair.one, pair.other} & left_out:
             names = drives[pair.one].name, drives[pair.other].name
             part, whole = names if pair.echoes[0] <= pair.echoes[1] else names[::-1]
-            told.append(
+            notes.append(
                 f'{pair.shared} of {min(pair.echoes)} echoes of {part} are in {whole} as well: it is a part of it, and '
                 f'what counts twice is wrong evidence; leave out {part}'
             )
-    return left_out, told
+    return left_out, notes
 
 
 def _described(drive: Drive, readings: Readings) -> Described:
@@ -258,7 +258,7 @@ def _described(drive: Drive, readings: Readings) -> Described:
 
 
 def source_of_all(sources: Sequence[Mapping[str, Any]], warnings: list[str]) -> dict[str, Any]:
-    """Return what was read of several drives together, and of each, for the report; `sources` are those of drives."""
+    """Return the report's data of several drives together, and of each; `sources` are those of drives."""
     stamps = [source['stamps'] for source in sources]
     topics = sorted({topic for source in sources for topic in source.get('range_topics') or ()})
     odometry = sorted({source['odom_topic'] for source in sources if source.get('odom_topic')})
@@ -280,7 +280,7 @@ def source_of_all(sources: Sequence[Mapping[str, Any]], warnings: list[str]) -> 
 
 
 def _summed(tables: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Return tables of counts, at any depth, added up."""
+    """Return the sum of tables of counts, which may be nested."""
     total: dict[str, Any] = {}
     for name in dict.fromkeys(name for table in tables for name in table):
         values = [table[name] for table in tables if name in table]

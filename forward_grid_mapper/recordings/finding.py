@@ -1,4 +1,4 @@
-"""Which recordings are meant: paths, patterns such as `monday_*`, and folders of bags."""
+"""Finds recordings: paths, patterns such as `monday_*`, and folders of bags."""
 
 from __future__ import annotations
 
@@ -14,32 +14,31 @@ from ..files.journal import drive_file
 from ..files.output_folder import readable
 
 _PART = re.compile(r'_\d+$')
-"""How rosbag2 ends the names of the files of one bag."""
+"""End of the names of a split bag's files in rosbag2."""
 
 _UNFINISHED = '.bag.active'
-"""How `rosbag record` calls a bag that it has not finished."""
+"""Suffix of a bag that `rosbag record` has not finished."""
 
 _RESULTS = 'report.json'
-"""A file that folders of maps have, whose bags hold maps."""
+"""A file in folders of results, whose bags contain maps."""
 
 
 class Recordings(NamedTuple):
-    """Paths of bags and journals, and warnings about what looks like one but is not among them."""
+    """Paths of bags and journals, and warnings about similar files that are not among them."""
 
     paths: list[Path]
     skipped: list[str]
 
 
 def find_recordings(words: Sequence[Path | str]) -> Recordings:
-    """Return the bags and journals that are meant, in the order given, those of a folder by name.
+    """Return the bags and journals that are given, in this order; those of a folder are sorted by name.
 
-    A word that names nothing, or something else than a bag, is returned as it is: what reads it says best what is
-    wrong.
+    A word that is neither a pattern nor a folder of bags is returned unchanged: errors are left to the reader of bags.
 
     Raises
     ------
     BagError
-        If a pattern fits nothing.
+        If a pattern matches nothing.
     """
     found = Recordings([], [])
     for word in words:
@@ -57,7 +56,7 @@ def find_recordings(words: Sequence[Path | str]) -> Recordings:
 
 
 def _bags_of(path: Path) -> Recordings:
-    """Return the bags in a folder that is no bag itself; none if `path` is anything else."""
+    """Return the bags in a folder that is not a bag itself; none if `path` is anything else."""
     nothing = Recordings([], [])
     if not path.is_dir() or (path / 'metadata.yaml').is_file():
         return nothing
@@ -72,11 +71,11 @@ def _bags_of(path: Path) -> Recordings:
     except OSError:
         return nothing
     skipped += [entry for entry in inside if entry.name.endswith(_UNFINISHED)]
-    told = [_left_out(path, skipped)] if skipped else []
-    # a file alone, and files of one bag that lost its metadata, are no folder of drives
+    warnings = [_left_out(path, skipped)] if skipped else []
+    # a single file, or the files of one bag without metadata, are not a folder of drives
     if _is_one(files) and (len(files) > 1 or not folders):
-        return Recordings([], told)
-    return Recordings([*folders, *files], told)
+        return Recordings([], warnings)
+    return Recordings([*folders, *files], warnings)
 
 
 def _files_in(folder: Path) -> list[Path]:
@@ -84,19 +83,19 @@ def _files_in(folder: Path) -> list[Path]:
 
 
 def _is_bag(folder: Path) -> bool:
-    """Return whether a folder is a bag, with its metadata or without."""
+    """Return whether a folder is a bag, with or without metadata."""
     if (folder / 'metadata.yaml').is_file():
         return True
     return _is_one(_files_in(folder))
 
 
 def _is_one(files: Sequence[Path]) -> bool:
-    """Return whether files are of one bag, by their names."""
+    """Return whether files belong to the same bag, by their names."""
     return len({_PART.sub('', Path(plain_name(file)).stem) for file in files}) == 1
 
 
 def _holds_recordings(folder: Path) -> bool:
-    """Return whether a folder that is no bag is a journal, or a folder of bags."""
+    """Return whether a folder that is not a bag is a journal, or a folder of bags."""
     if (folder / _RESULTS).is_file():
         return False
     return drive_file(folder) is not None or bool(_files_in(folder)) or any(folder.glob('*/metadata.yaml'))

@@ -1,4 +1,4 @@
-"""Poses that the user gives in a file, in place of those of a bag's odometry: a trajectory of SLAM or of a tracker."""
+"""Poses from a file that replace the odometry of a bag: a trajectory of SLAM or of a tracking system."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from ..files.output_folder import readable
 from ..files.pose_files import poses_from_csv, poses_from_tum
 
 MAP_FRAME = 'map'
-"""What the frame of the poses is called, which such files do not name."""
+"""Name of the frame of the poses, which such files do not name."""
 
 LATEST = 9e9
-"""Seconds that a stamp of 64 bit nanoseconds can hold, more or less."""
+"""Approximately the largest stamp of 64 bits of nanoseconds, seconds."""
 
 
 class GivenPoses(NamedTuple):
@@ -39,19 +39,19 @@ class GivenPoses(NamedTuple):
     pose: NDArray[np.float64]
 
     def between(self, begin: float, end: float, base_frame: str) -> Iterator[OdometryMessage]:
-        """Yield the poses of these nanoseconds, as odometry would give them."""
+        """Yield the poses between two stamps, nanoseconds, as messages of odometry."""
         first, last = np.searchsorted(self.stamp, [begin, end]).tolist()
         for stamp, pose in zip(self.stamp[first:last].tolist(), self.pose[first:last].tolist(), strict=True):
             yield OdometryMessage(stamp, MAP_FRAME, base_frame, Pose2(*pose))
 
 
 def read_given_poses(path: Path | str) -> GivenPoses:
-    """Read poses in the format of the TUM benchmark, or as CSV, which is told by the commas of its first line.
+    """Read poses in the format of the TUM benchmark, or as CSV, if the first line has commas.
 
     Raises
     ------
     InputError
-        If the file cannot be read, a line is wrong, or there is no pose or no stamp that can be; says which.
+        If the file cannot be read, a line is wrong, or there is no valid pose or stamp; names the reason.
     """
     path = Path(path)
     stamps, poses = poses_from_csv(path) if _is_csv(path) else poses_from_tum(path)
@@ -63,7 +63,7 @@ def read_given_poses(path: Path | str) -> GivenPoses:
             'if stamps are in nanoseconds, use CSV and name the column stamp_ns'
         )
     stamp = np.rint(stamps * NANOSECONDS).astype(np.int64)
-    # of poses with one stamp the first
+    # of poses with the same stamp, the first
     stamp, first = np.unique(stamp, return_index=True)
     return GivenPoses(path, stamp, poses[first])
 

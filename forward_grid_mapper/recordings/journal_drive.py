@@ -1,4 +1,4 @@
-"""A journal that a node kept becomes readings in the map frame, as a bag does."""
+"""The readings of a journal in the map frame, as from a bag."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from ..core.messages.rep117 import REASONS
 from ..files.journal_format import Contents
 from ..files.journal_reader import read
 from ..files.output_folder import readable
-from .drive import WHOLE, Drive, LogOddsMapOfAll, Part, length_of, thinning_note
+from .drive import WHOLE, Drive, FullLiveMap, Part, length_of, thinning_note
 
 MOST_NAMED = 10
-"""Parameters that a warning names."""
+"""Most parameters that a warning names."""
 
 
 def read_journal(
@@ -30,21 +30,21 @@ def read_journal(
     odom_topic: str | None = None,
     part: Part = WHOLE,
 ) -> Drive:
-    """Read a journal file; its readings are in the map frame already.
+    """Read a journal file; its readings are already in the map frame.
 
     Raises
     ------
     BagError
         If the file cannot be read.
     InputError
-        If it holds no reading that can be mapped.
+        If it has no reading that can be mapped.
     ParameterError
-        If topics are asked for.
+        If topics are given.
     """
     if range_topics or odom_topic:
         raise ParameterError(f'{path} is a journal, which has no topics; leave out --range-topics and --odom-topic')
     associator = PoseAssociator(lambda base, frame, stamp: None, parameters, patient=True)
-    live = LogOddsMapOfAll(associator, parameters)
+    live = FullLiveMap(associator, parameters)
     contents = Contents()
     first, last, names = math.inf, -math.inf, set()
     held = read(path, contents)
@@ -116,7 +116,7 @@ def _warnings(path: Path, contents: Contents, associator: PoseAssociator, parame
         for row in TABLE
         if row.group != 'node' and contents.parameters.get(row.name, row.default) != ours[row.name]
     }
-    # a file of the previous format has none
+    # a file of the previous format has no parameters
     if other and not contents.note:
         named = ', '.join(f'{name}={value}' for name, value in list(other.items())[:MOST_NAMED])
         warnings.append(f'the node that kept {path.name} mapped with {named}; use --set for the same values here')

@@ -1,4 +1,4 @@
-"""A recorded drive becomes readings in the map frame: the offline counterpart of the node's subscriptions."""
+"""The readings of a recorded drive in the map frame: the offline counterpart of the node's subscriptions."""
 
 from __future__ import annotations
 
@@ -23,45 +23,45 @@ from ..core.messages.pose_association import PoseAssociator
 from ..core.messages.rep117 import ODOMETRY_REASONS, REASONS, rejection_warnings, sensor_rejections
 from ..files.journal import drive_file
 from ..files.output_folder import readable
-from .drive import WHOLE, Drive, LogOddsMapOfAll, Part, Spans, length_of, thinning_note, to_and_fro_note
+from .drive import WHOLE, Drive, FullLiveMap, Part, Spans, alternation_note, length_of, thinning_note
 from .given_poses import GivenPoses
 from .journal_drive import read_journal
 
 __all__ = ['Drive', 'Extrinsics', 'read_drive']
 
-NOWHERE = {'unknown_extrinsics', 'after_odometry'}
-"""Why readings are rejected where only the poses of the sensors are missing: nearly every bag ends with a range."""
+POSES_MISSING = {'unknown_extrinsics', 'after_odometry'}
+"""Reasons of rejection if only the poses of the sensors are missing: nearly every bag ends with a range."""
 
 NO_STATIC = (
     'the bag has no /tf_static (nodes publish it once, as they start: record it from the start; of a split bag the '
     'first file has it, so give the whole folder)'
 )
-"""What is said where no transform is known."""
+"""Remedy if no transform is known."""
 
 NAMED = 3
-"""Frames that are named as examples."""
+"""Most frames that are named as examples."""
 
 MOST_OPTIONS = 24
-"""Sensors whose options a message spells out, to be copied."""
+"""Most sensors for which a message contains options to copy."""
 
 
 class Extrinsics:
-    """Where the sensors sit: given by the user, who wins, or by the bag's static transforms.
+    """Poses of the sensors on the robot: given by the user, or else by the bag's static transforms.
 
     Attributes
     ----------
     steep, used, unusable : dict of str
-        By frame: why a sensor says nothing of the plane, where its pose is from, and why its transform does not do.
+        By frame: why a sensor is too steep for a planar map, the source of its pose, and why its transform is invalid.
     doubts : dict
-        What is to be said of poses that are in doubt, in order.
+        Warnings about doubtful poses, in order.
     moving : mapping of str
-        The parents of frames that move, which `advice` tells of.
+        The parents of moving frames, for `advice`.
     """
 
     def __init__(
         self, given: Mapping[str, Pose2], transforms: StaticTransforms, more: Callable[[], StaticTransforms]
     ) -> None:
-        """`more` finds transforms that are asked where `transforms` do not join a sensor to the robot."""
+        """`more` returns transforms that are used if `transforms` do not connect a sensor to the robot."""
         self._given = {frame.lstrip('/'): pose for frame, pose in given.items()}
         self._transforms, self._more = transforms, cache(more)
         self._found: dict[tuple[str, str], Pose2 | str | None] = {}
@@ -72,7 +72,7 @@ class Extrinsics:
         self.moving: Mapping[str, str] = {}
 
     def __call__(self, base_frame: str, frame: str, stamp: int) -> Pose2 | str | None:
-        """Return the pose of a sensor, as `ExtrinsicsLookup` has it; static transforms are so at any stamp."""
+        """Return the pose of a sensor, as defined by `ExtrinsicsLookup`; static transforms hold for any stamp."""
         key = (base_frame, frame)
         if key not in self._found:
             self._found[key] = self._look_up(base_frame, frame)
@@ -102,16 +102,16 @@ class Extrinsics:
 
     @property
     def poses(self) -> dict[str, Pose2]:
-        """Poses of the sensors that readings asked for, by frame."""
+        """Poses of the sensors that have readings, by frame."""
         return {frame: pose for (_, frame), pose in self._found.items() if isinstance(pose, Pose2)}
 
     @property
     def unused(self) -> list[str]:
-        """Frames with a given pose that no reading asked for."""
+        """Frames with a given pose that have no readings."""
         return sorted(set(self._given) - {frame.lstrip('/') for frame in self.used})
 
     def advice(self, base_frame: str, frames: Sequence[str]) -> str:
-        """Say what to do about frames without a pose."""
+        """Return a remedy for frames without a pose."""
         known = self._transforms.frames
         joined = f'/tf_static connects {", ".join(known[:12])}' if known else NO_STATIC
         if not base_frame:
@@ -126,12 +126,12 @@ class Extrinsics:
         )
 
     def _other_names(self, base_frame: str, frames: Sequence[str]) -> str:
-        """Say which frames the transforms have with another prefix, or that they lack the robot's."""
+        """Return the frames that transforms have with another prefix, in words, or that they lack the robot's."""
         known = self._transforms.frames
         by_end = {name.rpartition('/')[2]: name for name in reversed(known)}
         unknown = [frame for name in (base_frame, *frames) if (frame := name.lstrip('/')) and frame not in known]
         pairs = [(by_end[end], frame) for frame in unknown if (end := frame.rpartition('/')[2]) in by_end]
-        # where both have a prefix, they are of two robots
+        # two different prefixes are those of two robots
         found = [f'{name}, not {frame}' for name, frame in pairs if '/' not in name or '/' not in frame]
         if found:
             more = f', and {len(found) - NAMED} more' if len(found) > NAMED else ''
@@ -148,7 +148,7 @@ class Extrinsics:
         return ''
 
     def _on_joints(self, frames: Sequence[str]) -> str:
-        """Say which frames hang on others that may move."""
+        """Return the frames that are children of moving frames, in words."""
         tops = {frame.lstrip('/'): self._transforms.top_of(frame) for frame in frames}
         found = [f'{frame} on {top}' if frame != top else frame for frame, top in tops.items() if top in self.moving]
         if not found:
@@ -169,31 +169,31 @@ def read_drive(
     part: Part = WHOLE,
     poses: GivenPoses | None = None,
 ) -> Drive:
-    """Read a bag and bring its readings into the map frame, or take those of a journal.
+    """Read a bag and transform its readings to the map frame, or read a journal.
 
     Parameters
     ----------
     path : Path or str
     parameters : Parameters
     extrinsics : mapping
-        Poses of sensors in the robot's base frame that win over the bag's `/tf_static`.
+        Poses of sensors in the robot's base frame; they take precedence over the bag's `/tf_static`.
     range_topics, odom_topic
         Topics to use; by default those found by type.
     progress : callable, optional
         Called with (done, total) messages.
     part : Part
-        What to take, by stamps; the drive begins with its first message on these topics.
+        The part to read, by stamps; the drive begins with its first message on these topics.
     poses : GivenPoses, optional
-        To be taken in place of the bag's odometry.
+        They replace the bag's odometry.
 
     Raises
     ------
     BagError
-        If the bag cannot be read, or the topics are not there or ambiguous.
+        If the bag cannot be read, or topics are missing or ambiguous.
     InputError
-        If not a single reading got a pose, or none is of that part; says why.
+        If no reading got a pose, or none is in that part; names the reason.
     """
-    # a pipe would be waited for, a device may have no end
+    # reading a pipe would wait, and a device may have no end
     plain = Path(path).is_dir() or Path(path).is_file()
     journal = drive_file(Path(path)) if plain else None
     if journal is not None:
@@ -205,14 +205,14 @@ def read_drive(
             topics = bag.choose_topics(range_topics, odom_topic, any_poses=True)
         else:
             topics = bag.choose_range_topics(range_topics)
-        lookup = Extrinsics(extrinsics, bag.static_transforms(topics), partial(_standing, path))
+        lookup = Extrinsics(extrinsics, bag.static_transforms(topics), partial(_constant_transforms, path))
         associator = BatchAssociator(lookup, parameters)
-        live = LogOddsMapOfAll(associator, parameters)
-        # the poses before and after a reading place it
+        live = FullLiveMap(associator, parameters)
+        # a reading is placed by the poses before and after it
         margin = parameters.association.max_pose_gap * NANOSECONDS
         spans = Spans(part, margin)
         for batch in bag.batches(topics, progress):
-            associator.add_batch(spans.taken(batch))
+            associator.add_batch(spans.select(batch))
         if poses is not None and spans.ranges:
             spans.odometry = [int(poses.stamp[0]), int(poses.stamp[-1])]
             begin, end = spans.ranges
@@ -257,10 +257,10 @@ def read_drive(
     return Drive(associator, source, live)
 
 
-def _standing(path: Path | str) -> StaticTransforms:
-    """Return the transforms of a bag that stay the same; it may be open for reading elsewhere."""
+def _constant_transforms(path: Path | str) -> StaticTransforms:
+    """Return the constant transforms of a bag, which may be open elsewhere."""
     with Bag(path) as bag:
-        return bag.standing_transforms()
+        return bag.constant_transforms_on_tf()
 
 
 def _warnings(bag: Bag, associator: PoseAssociator, lookup: Extrinsics) -> list[str]:
@@ -282,19 +282,19 @@ def _warnings(bag: Bag, associator: PoseAssociator, lookup: Extrinsics) -> list[
             f"odometry's clock jumped back {counted(associator.time_jumps, 'time')}; readings that waited for a pose "
             'were dropped'
         )
-    warnings += to_and_fro_note(associator)
+    warnings += alternation_note(associator)
     warnings += associator.limits.warnings()
     for reason, count in associator.odometry_rejected.items():
         warnings.append(
             f'{count} of {associator.odometry_received} odometry messages were rejected: {ODOMETRY_REASONS[reason]}'
         )
-    told = {'unknown_extrinsics', STEEP} if lookup.steep else {'unknown_extrinsics'}
-    warnings += rejection_warnings(associator.rejected, associator.received, known=told)
-    return warnings + sensor_rejections(associator.rejected_by_frame, associator.buffer.counts(), told)
+    known = {'unknown_extrinsics', STEEP} if lookup.steep else {'unknown_extrinsics'}
+    warnings += rejection_warnings(associator.rejected, associator.received, known=known)
+    return warnings + sensor_rejections(associator.rejected_by_frame, associator.buffer.counts(), known)
 
 
 def _base_frame(bag: Bag) -> str:
-    """Return the frame that given poses are of: that of the bag's odometry, or else a usual one."""
+    """Return the base frame for given poses: that of the bag's odometry, or else a usual one."""
     known = bag.static_transforms().frames
     return bag.base_frame() or next((frame for frame in BASE_FRAMES if frame in known), BASE_FRAMES[0])
 
@@ -306,7 +306,7 @@ def _nothing_associated(
     undecodable: Mapping[str, int],
     poses: GivenPoses | None,
 ) -> Exception:
-    """Return the error that says why no reading got a pose, and what to do."""
+    """Return the error with the reason why no reading got a pose, and a remedy."""
     ranges, odometry = spans.ranges, spans.odometry
     lost = '; '.join(f'{count} on {topic} do not fit their type' for topic, count in undecodable.items())
     if not ranges or not odometry:
@@ -318,7 +318,7 @@ def _nothing_associated(
             )
         kind = 'Range' if not ranges else 'Odometry'
         return BagError(f'the chosen topics contain no readable {kind} message{f" ({lost})" if lost else ""}')
-    if associator.unknown_frames and set(associator.rejected) <= NOWHERE:
+    if associator.unknown_frames and set(associator.rejected) <= POSES_MISSING:
         return InputError(lookup.advice(associator.base_frame, sorted(associator.unknown_frames)))
     if set(associator.rejected) != {'zero_stamp'} and (ranges[1] < odometry[0] or ranges[0] > odometry[1]):
         a, b, c, d = (stamp / NANOSECONDS for stamp in (*ranges, *odometry))
@@ -331,7 +331,7 @@ def _nothing_associated(
     reasons = '; '.join(f'{count} {reason} ({REASONS[reason]})' for reason, count in associator.rejected.most_common())
     refused = associator.odometry_rejected
     if set(associator.rejected) == {'no_odometry'} and refused.total() == associator.odometry_received > 0:
-        # the clocks have no part in it
+        # clocks are not the reason
         reasons = f'none of {counted(refused.total(), "odometry message")} could be used'
     for reason, count in refused.most_common():
         reasons += f'; {count} odometry messages were rejected: {ODOMETRY_REASONS[reason]}'

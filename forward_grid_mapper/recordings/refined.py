@@ -1,4 +1,4 @@
-"""Drives along the trajectories that their readings speak for: each found and judged by itself, one map of all."""
+"""Drives with refined trajectories: each is estimated and judged separately, for one map of all."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from .drive import Drive
 from .drives import Drives
 
 Watch = Callable[[str, float], None]
-"""Receives what is going on, and how much of it is done, from 0 to 1."""
+"""Receives the current stage, and its progress from 0 to 1."""
 
 NO_MOUNTS = (
     'a journal contains no odometry. It can be computed from the readings of sensors that are fixed to the robot: '
@@ -43,31 +43,31 @@ NO_TIMES = (
 
 @dataclass(frozen=True)
 class RefinedDrives:
-    """Drives, and what became of the trajectory of each, in their order.
+    """Drives, and the trajectory of each, in their order.
 
     Attributes
     ----------
     drives : Drives
     odometry : tuple of Odometry
-        As it was recorded.
+        As recorded.
     outcomes : tuple of Refinement
     told : tuple of dict
-        What each drive that moved tells of its odometry with certainty.
+        The calibration that each drive with a refined trajectory determines.
     """
 
     drives: Drives
     odometry: tuple[Odometry, ...]
     outcomes: tuple[Refinement, ...]
-    told: tuple[dict[str, Estimate], ...]
+    estimates: tuple[dict[str, Estimate], ...]
 
     @property
     def moved(self) -> bool:
-        """Whether any drive has another trajectory than odometry's."""
+        """Whether any drive has another trajectory than that of odometry."""
         return any(_moved(odometry, outcome) for _, odometry, outcome in self._each)
 
     @property
     def readings(self) -> Readings:
-        """The readings to map from; those of `Drives.readings` where no drive moved."""
+        """The readings to map from; those of `Drives.readings` if no drive moved."""
         if not self.moved:
             return self.drives.readings
         if len(self.outcomes) == 1:
@@ -80,7 +80,7 @@ class RefinedDrives:
 
     @property
     def path_xy(self) -> NDArray[np.float64]:
-        """Where the robots drove, shape (P, 2), metres; a row of NaN parts two drives."""
+        """Paths of the robots, shape (P, 2), metres; separated by rows of NaN."""
         paths = [
             outcome.trajectory.pose[:, :2] if _moved(odometry, outcome) else drive.path_xy
             for drive, odometry, outcome in self._each
@@ -89,22 +89,24 @@ class RefinedDrives:
 
     @property
     def odometry_xy(self) -> NDArray[np.float64] | None:
-        """The same as odometry has it, of the drives that moved; None if none did."""
+        """The paths of odometry of the drives that moved; None if none did."""
         paths = [drive.path_xy for drive, odometry, outcome in self._each if _moved(odometry, outcome)]
         return _parted(paths) if paths else None
 
     def with_live(self, maps: MapSet) -> MapSet:
-        """Return the maps with the live map of all readings, where these stay and `max_readings` lets EM have some."""
+        """Return the maps with the live map of all readings, if no drive moved and `max_readings` restricts EM."""
         return maps if self.moved else self.drives.with_live(maps)
 
     @property
     def texts(self) -> dict[str, str]:
-        """Trajectories and calibrations of the drives that moved, as files to be written, by name."""
+        """Trajectories and calibrations of the drives that moved, as texts by file name."""
         found: dict[str, str] = {}
-        for number, ((drive, odometry, outcome), told) in enumerate(zip(self._each, self.told, strict=True), 1):
+        for number, ((drive, odometry, outcome), estimates) in enumerate(
+            zip(self._each, self.estimates, strict=True), 1
+        ):
             several = len(self.outcomes) > 1
             found |= trajectory_files(outcome, odometry, number if several else None)
-            if text := calibration_text(told, readable(drive.source['bag'])):
+            if text := calibration_text(estimates, readable(drive.source['bag'])):
                 found[f'odometry_calibration{f"_{number}" if several else ""}.yaml'] = text
         return found
 
@@ -114,7 +116,7 @@ class RefinedDrives:
 
 
 class Given(NamedTuple):
-    """A calibration of the odometry, by the names of `core.trajectory.odometry_model`, and the file that it is from."""
+    """A calibration of odometry, with the names of `core.trajectory.odometry_model`, and its file."""
 
     calibration: Mapping[str, float]
     file: str
@@ -127,21 +129,21 @@ def refine_drives(
     given: Given | None = None,
     refine: bool = True,
 ) -> RefinedDrives:
-    """Return the drives along their trajectories, and note in their reports what became of these.
+    """Return the drives with their trajectories, and add these to the report's data.
 
-    Each drive is refined for itself, and begins where odometry has it begin. Then those that moved are put, one after
-    the other, where they fit the map of the others best.
+    Each drive is refined separately, and begins at the first pose of its odometry. Then the drives that moved are
+    registered, one after the other, to the map of the others.
 
     Parameters
     ----------
     drives : Drives
     parameters : Parameters
     watch : callable
-        Called as the work goes on.
+        Receives the progress.
     given : Given, optional
         A calibration to apply to the odometry of all drives first.
     refine : bool
-        Whether to look for trajectories; without, odometry with its calibration is the trajectory.
+        Whether to refine; otherwise odometry with its calibration is the trajectory.
     """
     several = len(drives.drives) > 1
     odometry = [odometry_of(drive) for drive in drives.drives]
@@ -149,26 +151,26 @@ def refine_drives(
     for drive, poses in zip(drives.drives, odometry, strict=True):
         name = f'{readable(drive.source["bag"])}, ' if several else ''
         outcomes.append(_outcome(drive, poses, parameters, partial(_named, watch, name), given, refine))
-    told = []
+    estimates = []
     for drive, poses, outcome in zip(drives.drives, odometry, outcomes, strict=True):
-        told.append(_told(drive, poses, outcome, parameters, watch, given))
+        estimates.append(_estimates(drive, poses, outcome, parameters, watch, given))
     fitted = [''] * len(outcomes)
     if several and any(outcome.accepted for outcome in outcomes):
         watch('aligning the drives with each other', 0.0)
         outcomes, fitted = _fitted(outcomes, parameters)
-    rows = zip(drives.drives, odometry, outcomes, fitted, told, strict=True)
+    rows = zip(drives.drives, odometry, outcomes, fitted, estimates, strict=True)
     for number, (drive, poses, outcome, fits, known) in enumerate(rows, 1):
-        # of several drives, the report has copies
+        # with several drives, the report has copies of their data
         source = drives.source['drives'][number - 1] if several else drive.source
         source['trajectory'] = trajectory_data(outcome, number if several else None, fits, known)
         source['trajectory']['calibrated'] = given.file if given and _moved(poses, outcome) else ''
         if outcome.unplaced:
             name = f'{readable(drive.source["bag"])}: ' if several else ''
             drives.source['warnings'].append(f'{name}{outcome.jumps}')
-    return RefinedDrives(drives, tuple(odometry), tuple(outcomes), tuple(told))
+    return RefinedDrives(drives, tuple(odometry), tuple(outcomes), tuple(estimates))
 
 
-def _told(
+def _estimates(
     drive: Drive,
     odometry: Odometry,
     outcome: Refinement,
@@ -181,25 +183,25 @@ def _told(
     watch('calibration of odometry', 0.0)
     readings, trajectory, stop = drive.associator.readings, outcome.trajectory, np.zeros(1, np.uint8)
     if outcome.stretch is not None:
-        # wheels say nothing of what lies beyond a jump
+        # odometry beyond a jump does not contribute to the calibration
         begin, end = outcome.stretch
         readings = readings.select((readings.stamp >= begin) & (readings.stamp <= end))
         odometry, trajectory = odometry.between(begin, end), trajectory.between(begin, end)
     applied = odometry if given is None else _calibrated(odometry, given)
     if given is not None:
         readings = replaced(readings, odometry, applied)
-    told = determined_calibration(readings, applied, trajectory, outcome.calibration, parameters, stop)
+    estimates = determined_calibration(readings, applied, trajectory, outcome.calibration, parameters, stop)
     if not outcome.right_angles:
-        # without walls the yaw follows odometry where readings say little, and would agree with it
-        told = {name: each for name, each in told.items() if name not in YAW_ERRORS}
-    return told if given is None else combined_calibration(given.calibration, told)
+        # without walls, the yaw follows odometry where readings contain little information, and would agree with it
+        estimates = {name: each for name, each in estimates.items() if name not in YAW_ERRORS}
+    return estimates if given is None else combined_calibration(given.calibration, estimates)
 
 
 def _fitted(outcomes: list[Refinement], parameters: Parameters) -> tuple[list[Refinement], list[str]]:
-    """Return the outcomes with the drives that moved where they fit the others, and in words by how much that is.
+    """Return the outcomes with moved drives registered to the others, and descriptions of these transforms.
 
-    Those that odometry keeps are where the map is to be, unless their heading was lost; without any, the first drive
-    that moved is.
+    Drives with odometry as trajectory define the frame of the map, unless their heading was lost; without any, the
+    first drive that moved does.
     """
     out, words = list(outcomes), [''] * len(outcomes)
     moved = [k for k, outcome in enumerate(outcomes) if outcome.accepted]
@@ -224,7 +226,7 @@ def _fitted(outcomes: list[Refinement], parameters: Parameters) -> tuple[list[Re
 
 
 def odometry_of(drive: Drive) -> Odometry:
-    """Return the odometry of a drive: as recorded, or as readings of sensors tell it whose poses were given."""
+    """Return the odometry of a drive: as recorded, or from the poses of its readings if sensor poses were given."""
     odometry = Odometry.of(*drive.associator.odometry)
     return odometry if drive.mounts is None else recovered(odometry, drive.associator.readings, drive.mounts)
 
@@ -242,7 +244,7 @@ def _outcome(
         readings, odometry = replaced(readings, odometry, trajectory), trajectory
     if not refine:
         return Refinement(False, '', readings, odometry, {})
-    # with it comes scipy, a quarter of the time that `process_bag` takes to start, and most drives are mapped without
+    # it imports scipy, a quarter of the start time of `process_bag`, and most drives are mapped without it
     from ..core.trajectory.refinement import Refiner
 
     return Refiner(parameters).run(readings, odometry, watch)

@@ -10,7 +10,7 @@ import pytest
 from bag_samples import START
 
 from forward_grid_mapper.bags.choice import Topics
-from forward_grid_mapper.bags.namespaces import Parted, by_precedence, ranges_of
+from forward_grid_mapper.bags.namespaces import Assigned, by_precedence, ranges_of
 from forward_grid_mapper.bags.reader import Bag
 from forward_grid_mapper.bags.writer import BagWriter
 from forward_grid_mapper.core.common.errors import BagError
@@ -91,7 +91,7 @@ def test_topics_that_agree_are_not_told(tmp_path: Path) -> None:
 
 def test_ranges_of_a_robot() -> None:
     both = ('/r1/sonar/left', '/r2/sonar')
-    assert ranges_of('/r1/odom', ['/r1/odom', '/r2/odom'], both) == Parted(both[:1], both[1:])
+    assert ranges_of('/r1/odom', ['/r1/odom', '/r2/odom'], both) == Assigned(both[:1], both[1:])
     # one robot may have its odometry, or the ranges, in any namespace
     for odometry, others, ranges in (
         ('/odom', ['/odom', '/odometry/filtered'], ('/sonar', '/front/sonar')),
@@ -100,8 +100,8 @@ def test_ranges_of_a_robot() -> None:
         ('/r1/odom', ['/r1/odom'], ('/r1/sonar', '/r2/sonar')),
         ('/r1/odom', ['/r1/odom', '/r1/wheel/odom'], ('/r1/sonar',)),
     ):
-        assert ranges_of(odometry, others, ranges) == Parted(ranges, ()), odometry
-    assert ranges_of('/odom', ['/odom', '/r2/odom'], ('/sonar', '/r2/sonar')) == Parted(('/sonar',), ('/r2/sonar',))
+        assert ranges_of(odometry, others, ranges) == Assigned(ranges, ()), odometry
+    assert ranges_of('/odom', ['/odom', '/r2/odom'], ('/sonar', '/r2/sonar')) == Assigned(('/sonar',), ('/r2/sonar',))
 
 
 def test_precedence_of_fixed_transforms() -> None:

@@ -141,7 +141,7 @@ def test_commits_come_soon_and_put_never_waits(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize('what', ['file', 'log', 'both', 'folder', 'moved', 'replaced', 'file cut', 'log cut'])
 def test_a_file_that_goes_is_noticed_and_begun_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, what: str) -> None:
-    monkeypatch.setattr(journal_module, 'LOOK', 0.01)
+    monkeypatch.setattr(journal_module, 'CHECK_PERIOD', 0.01)
     folder, said = tmp_path / 'j', []
     journal, _ = opened(folder, said)
     for k in range(3):
@@ -187,7 +187,7 @@ def test_a_file_that_goes_is_noticed_and_begun_anew(tmp_path: Path, monkeypatch:
 
 def test_a_log_of_another_is_not_deleted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """As where somebody puts a backup in the place of the files; SQLite deletes a log by its name."""
-    monkeypatch.setattr(journal_module, 'LOOK', 0.01)
+    monkeypatch.setattr(journal_module, 'CHECK_PERIOD', 0.01)
     journal, _ = opened(tmp_path / 'j')
     written(journal, made(0, 10))
     backup = tmp_path / 'backup'

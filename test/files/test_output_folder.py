@@ -9,13 +9,13 @@ from pathlib import Path
 import pytest
 
 from forward_grid_mapper.core.common.errors import OutputError
-from forward_grid_mapper.files.output_folder import free_name, output_errors, output_folder, told_apart, unwritable
+from forward_grid_mapper.files.output_folder import distinguished, free_name, output_errors, output_folder, unwritable
 
 
 def test_paths_are_told_apart_by_their_ends() -> None:
-    assert told_apart(['/a/monday/bag', '/a/tuesday/bag', 'other']) == ['monday/bag', 'tuesday/bag', 'other']
-    assert told_apart(['/a/x/bag', '/b/x/bag']) == ['a/x/bag', 'b/x/bag']
-    assert told_apart(['bag', '/b/bag', 'bag', '', '/']) == ['bag', 'b/bag', 'bag', '.', '/']
+    assert distinguished(['/a/monday/bag', '/a/tuesday/bag', 'other']) == ['monday/bag', 'tuesday/bag', 'other']
+    assert distinguished(['/a/x/bag', '/b/x/bag']) == ['a/x/bag', 'b/x/bag']
+    assert distinguished(['bag', '/b/bag', 'bag', '', '/']) == ['bag', 'b/bag', 'bag', '.', '/']
 
 
 def names_in(folder: Path) -> list[str]:

@@ -15,7 +15,7 @@ from forward_grid_mapper.core.common.readings import Readings, in_canonical_orde
 from forward_grid_mapper.core.messages.message_types import NANOSECONDS, OdometryMessage, Pose2, RangeMessage
 from forward_grid_mapper.core.messages.pose_association import PoseAssociator
 from forward_grid_mapper.node.live import LiveMap, LiveSnapshot
-from forward_grid_mapper.recordings.drive import LogOddsMapOfAll
+from forward_grid_mapper.recordings.drive import FullLiveMap
 
 DRIVES = 100
 EXTRINSICS = {'left': Pose2(0.1, 0.1, 1.5), 'right': Pose2(0.1, -0.1, -1.5)}
@@ -89,14 +89,14 @@ def test_any_order_and_any_batches_give_the_same(max_readings: int) -> None:
         rng = random.Random(seed)
         messages = drive(rng)
         offline = PoseAssociator(lookup, parameters, patient=True)
-        whole = LogOddsMapOfAll(offline, parameters)
+        whole = FullLiveMap(offline, parameters)
         for message in messages:
             if isinstance(message, RangeMessage):
                 offline.add_range(message)
             else:
                 offline.add_odometry(message)
         offline.finish()
-        whole._look()
+        whole._add_new()
         theirs, live = in_canonical_order(offline.readings), whole._live
         readings, snapshot, accepted = of_the_node(late(messages, rng), parameters, rng)
         ours = in_canonical_order(readings)

@@ -234,7 +234,7 @@ def test_a_run_says_where_it_stands(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(em.time, 'monotonic', lambda: run.begin + 12.34)
     assert run.seconds == pytest.approx(12.34)
     assert str(run) == 'starting of 0 readings, 12.3 s'
-    assert not (run.by_itself or run.asked or run.shown or run.cancelled) and run.fresh()
+    assert not (run.by_itself or run.end_requested or run.shown or run.cancelled) and run.fresh()
     run.stage, run.count, run.progress = 'search', 70, Progress(3, 400, 5, 61.5)
     assert str(run).startswith('search of 70 readings, 12.3 s, iteration 3, ')
     assert str(run).endswith(' nats gained')

@@ -399,7 +399,7 @@ def test_a_clean_up_before_the_journal_is_read_leaves_nothing(inside: Callable[.
     node = inside().node
     assert node.trigger_configure() == TransitionCallbackReturn.SUCCESS
     part = weakref.ref(node.em)
-    node._when(node.em.run_em, Answer())
+    node._answer_when_ready(node.em.run_em, Answer())
     assert node.trigger_cleanup() == TransitionCallbackReturn.SUCCESS
     gc.collect()
     assert part() is None

@@ -7,7 +7,7 @@ import time
 
 import pytest
 
-from forward_grid_mapper.node.losses import LASTING, MOST_STREAMS, STEADY, STRANGE, Losses
+from forward_grid_mapper.node.losses import LASTING, MOST_STREAMS, NEW_PUBLISHER_GAP, STEADY, Losses
 
 MILLISECOND = 1_000_000
 
@@ -79,16 +79,16 @@ def test_a_sensor_without_a_rate_loses_nothing() -> None:
 def test_what_the_middleware_says_and_what_gaps_tell_count_once() -> None:
     losses = Losses(lambda: 1)
     numbered(losses, 1, 2, 8)
-    losses.told(Told(5))
+    losses.reported(Told(5))
     assert losses.lost == 5
-    losses.told(Told(3))
+    losses.reported(Told(3))
     assert losses.lost == 8
     losses.clear()
     assert losses.lost == 0
     assert losses.recent + LASTING <= 0
-    losses.told(Told(0))
+    losses.reported(Told(0))
     assert losses.recent + LASTING <= 0, 'nothing was lost'
-    losses.told(Told(2))
+    losses.reported(Told(2))
     assert losses.lost == 2
     assert time.monotonic() - LASTING < losses.recent <= time.monotonic()
 
@@ -135,7 +135,7 @@ def test_more_sensors_than_are_told_apart_are_left_out() -> None:
     assert at_steps(losses, *[1.0] * 20, 5.0, frame=f'sonar_{MOST_STREAMS - 1}')[-1] == 4
 
 
-@pytest.mark.parametrize(('gap', 'lost'), [(STRANGE, STRANGE - 1), (STRANGE + 1, 0)])
+@pytest.mark.parametrize(('gap', 'lost'), [(NEW_PUBLISHER_GAP, NEW_PUBLISHER_GAP - 1), (NEW_PUBLISHER_GAP + 1, 0)])
 def test_a_large_gap_is_another_publisher_where_there_is_one(gap: int, lost: int) -> None:
     losses = Losses(lambda: 2)
     numbered(losses, 1000, 1000 + gap)

@@ -174,7 +174,7 @@ def test_a_call_that_fails_after_the_start_does_not_hold_up_the_others(inside: C
 
     reply = SimpleNamespace(fail=told.append, send=lambda *fields: told.append(fields[0]))
     for handler in (fail, robot.node.reset):
-        robot.node._when(handler, reply)
+        robot.node._answer_when_ready(handler, reply)
     robot.until(lambda: len(told) == 2)
     assert told == ["it failed: KeyError('odd')", True]
 
@@ -238,7 +238,7 @@ def test_what_comes_while_the_journal_is_read_waits(inside: Callable[..., Inside
     assert (readings['readings received'], readings['readings waiting for a pose']) == ('50', '50')
     early: list[Any] = []
     for handler in (robot.node.em.run_em, robot.node.saver.save_maps):
-        robot.node._when(handler, SimpleNamespace(send=lambda *fields: early.append(fields)))
+        robot.node._answer_when_ready(handler, SimpleNamespace(send=lambda *fields: early.append(fields)))
     robot.until(lambda: len(robot.node.associator.buffer) == 50)
     # the first runs EM, the second waits for its maps
     robot.until(lambda: len(early) == 2)

@@ -88,7 +88,7 @@ def test_without_being_told_it_does_not(inside: Callable[..., Inside], quick: An
 def test_the_path_grows_as_the_robot_drives(
     inside: Callable[..., Inside], quick: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(trajectory, 'GROWS', 0.02)
+    monkeypatch.setattr(trajectory, 'PATH_EVERY', 0.02)
     robot = inside(refine_poses=True).start()
     shown: list[Any] = []
     out = robot.node.trajectory._out

@@ -311,16 +311,16 @@ def test_odometry_without_a_frame_is_told_of() -> None:
     robot = Taking()
     robot.intake.begin()
     reporter = reporter_of(robot)
-    assert reporter._nameless() == [], 'nothing came yet'
+    assert reporter._no_frame_id() == [], 'nothing came yet'
     robot.odometry(100.0, frame='')
     for _ in range(2):
-        (text,) = reporter._nameless()
+        (text,) = reporter._no_frame_id()
         assert 'odometry has no frame_id in its header' in text
     assert robot.node.warned == [text]
     named = Taking()
     named.intake.begin()
     named.odometry(100.0)
-    assert reporter_of(named)._nameless() == [] and named.node.warned == []
+    assert reporter_of(named)._no_frame_id() == [] and named.node.warned == []
 
 
 def test_without_a_base_frame_no_transform_is_asked_for() -> None:
@@ -329,7 +329,7 @@ def test_without_a_base_frame_no_transform_is_asked_for() -> None:
         robot.intake.begin()
         robot.odometry(100.0)
         reporter = reporter_of(robot)
-        reporter._reported, reporter._lost, reporter._far = set(), set(), False
+        reporter._reported, reporter._without_pose, reporter._far = set(), set(), False
         reporter._extrinsics = Extrinsics({}, Transforms())
         robot.associator.base_frame = child
         robot.associator.unknown_frames.add('sonar')
@@ -344,7 +344,7 @@ def test_poses_of_frames_that_nobody_sends_are_named_beside_one_without_a_pose()
     robot.intake.begin()
     drive(robot, 0, 3, 0)
     reporter = reporter_of(robot)
-    reporter._reported, reporter._lost, reporter._far = set(), set(), False
+    reporter._reported, reporter._without_pose, reporter._far = set(), set(), False
     # one whose readings wait
     robot.range(200.0, '/waits')
     poses = {name: Pose2(0.1, 0.0, 0.0) for name in ('sonar', 'us_left', 'us_right', 'waits')}

@@ -19,11 +19,11 @@ def test_a_fault_that_lasts_is_told_once_whatever_its_numbers(clock: Any) -> Non
     node = PlainNode()
     log = VerdictLog(node)
     for k in range(3, 200):
-        log.look([f'no Range for {k} s'], False)
+        log.update([f'no Range for {k} s'], False)
         clock.now += 1.0
     assert node.warned == ['no Range for 4 s']
-    log.look([], True)
-    log.look([], True)
+    log.update([], True)
+    log.update([], True)
     assert node.warned == ['no Range for 4 s', WELL]
 
 
@@ -31,8 +31,8 @@ def test_a_passing_fault_is_not_told(clock: Any) -> None:
     node = PlainNode()
     log = VerdictLog(node)
     for _ in range(5):
-        log.look(['1 of 2 readings were rejected'], False)
-        log.look([], True)
+        log.update(['1 of 2 readings were rejected'], False)
+        log.update([], True)
     assert node.warned == []
 
 
@@ -41,7 +41,7 @@ def test_a_fault_that_comes_and_goes_is_told_once_a_minute(clock: Any) -> None:
     log = VerdictLog(node)
     for _ in range(int(2 * AGAIN) // 3):
         for faults in (['gap'], ['gap'], []):
-            log.look(faults, not faults)
+            log.update(faults, not faults)
             clock.now += 1.0
     assert node.warned == ['gap', WELL] * 2
 
@@ -51,7 +51,7 @@ def test_a_fault_that_comes_back_for_good_is_told_though_it_came_early(clock: An
     log = VerdictLog(node)
     for second in range(300):
         faults = [] if 5 <= second < 10 else ['gap']
-        log.look(faults, not faults)
+        log.update(faults, not faults)
         clock.now += 1.0
     assert node.warned == ['gap', WELL, 'gap']
 
@@ -60,7 +60,7 @@ def test_the_time_in_which_readings_were_rejected_makes_no_new_fault(clock: Any)
     node = PlainNode()
     log = VerdictLog(node)
     for k in range(300):
-        log.look([f'{k} of 300 readings were rejected in the last {("second", "2 s", "10 s")[k % 3]}'], False)
+        log.update([f'{k} of 300 readings were rejected in the last {("second", "2 s", "10 s")[k % 3]}'], False)
         clock.now += 1.0
     assert node.warned == ['1 of 300 readings were rejected in the last 2 s']
 
@@ -69,6 +69,6 @@ def test_faults_of_ever_new_names_take_no_memory(clock: Any) -> None:
     log = VerdictLog(PlainNode())
     for k in range(5 * MOST):
         name = 'x' * k
-        log.look([name], False)
-        log.look([name], False)
-    assert len(log._told) <= MOST
+        log.update([name], False)
+        log.update([name], False)
+    assert len(log._logged) <= MOST

@@ -45,10 +45,10 @@ def test_what_wheels_do_is_asked_of_a_stretch_without_jumps(
     outcome = outcome_of(drive, stretch=stretch)
     odometry = Odometry.of(*drive.associator.odometry)
     for given in (None, refined.Given({'scale': 0.0}, 'c.yaml')):
-        refined._told(drive, odometry, outcome, Parameters(), lambda stage, part: None, given)
+        refined._estimates(drive, odometry, outcome, Parameters(), lambda stage, part: None, given)
     assert asked == [[count] * 3] * 2
     nothing = Refinement(True, 'placed', drive.associator.readings, outcome.trajectory, {})
-    assert refined._told(drive, odometry, nothing, Parameters(), lambda stage, part: None, None) == {}
+    assert refined._estimates(drive, odometry, nothing, Parameters(), lambda stage, part: None, None) == {}
     assert len(asked) == 2
 
 
@@ -57,7 +57,7 @@ def test_what_could_not_be_placed_is_warned_of(several: bool, monkeypatch: pytes
     one, other = drive_of('a.bag'), drive_of('b.bag')
     outcomes = [outcome_of(one, jumps='odometry jumps', unplaced=True), outcome_of(other, jumps='and is placed')]
     monkeypatch.setattr(refined, '_outcome', lambda drive, *_: outcomes[0 if drive is one else 1])
-    monkeypatch.setattr(refined, '_told', lambda *_: {})
+    monkeypatch.setattr(refined, '_estimates', lambda *_: {})
     monkeypatch.setattr(refined, '_fitted', lambda outcomes, parameters: (outcomes, [''] * len(outcomes)))
     source = {'warnings': [], 'drives': [dict(one.source), dict(other.source)]} if several else one.source
     drives: Any = SimpleNamespace(drives=(one, other) if several else (one,), source=source)

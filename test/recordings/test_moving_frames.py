@@ -160,8 +160,8 @@ def test_static_transforms_are_believed_more_than_repeated_ones(tmp_path: Path) 
 
 def test_long_recordings_are_not_read_twice_as_a_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = recorded(tmp_path / 'bag', [[MOVING], [BACK]])
-    monkeypatch.setattr(reader, 'MOST_LOOKED_AT', 20)
+    monkeypatch.setattr(reader, 'MOST_SEARCHED', 20)
     with Bag(path) as bag:
-        assert 10 <= sum(1 for _ in bag._looked_at({'/tf'})) < 40
+        assert 10 <= sum(1 for _ in bag._searched({'/tf'})) < 40
         assert bag.moving_frames() == {'base_footprint': 'odom', 'base_link': 'base_footprint'}
     assert read(path).associator.map_frame == 'odom'

@@ -9,7 +9,7 @@ import pytest
 
 from forward_grid_mapper.core.messages.message_types import OdometryMessage, Pose2
 from forward_grid_mapper.core.messages.pose_association import PoseAssociator
-from forward_grid_mapper.recordings.drive import jumps_note, length_of, path_of, to_and_fro_note
+from forward_grid_mapper.recordings.drive import alternation_note, jumps_note, length_of, path_of
 
 
 def drive(order: np.ndarray, stamps: np.ndarray) -> PoseAssociator:
@@ -98,7 +98,7 @@ def poses_of(points: list[tuple[float, float]], period: float = 0.05) -> PoseAss
 @pytest.mark.parametrize(('every', 'steps'), [(2, 99), (5, 40), (15, 14)])
 def test_two_sources_of_poses_on_one_topic_are_told(every: int, steps: int) -> None:
     points = [(0.02 * k, 0.5 * (k % every == every // 2)) for k in range(100)]
-    (note,) = to_and_fro_note(poses_of(points))
+    (note,) = alternation_note(poses_of(points))
     assert f'by 0.50 m in {steps} of 99 steps; do two nodes publish' in note
 
 
@@ -110,4 +110,4 @@ def test_what_is_no_second_source_is_not_told() -> None:
     one_outlier = [(0.02 * k + 2.0 * (k == 3), 0.0) for k in range(10)]
     jumped_once = [(0.02 * k + 2.0 * (k > 40), 0.0) for k in range(100)]
     for points in (fast, noisy, in_millimetres, one_outlier, jumped_once, [(0.0, 0.0)], []):
-        assert to_and_fro_note(poses_of(points)) == []
+        assert alternation_note(poses_of(points)) == []
