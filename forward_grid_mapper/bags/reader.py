@@ -53,7 +53,6 @@ class Bag:
         self.undecodable: dict[str, int] = {}
         self._sources: list[Source] = []
         self._damage: str | None = None
-        self._read = 0
 
     def __enter__(self) -> Bag:
         """Open the bag.

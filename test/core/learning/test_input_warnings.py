@@ -187,7 +187,7 @@ SCENARIOS: dict[str, tuple[Callable[[], Messages], str]] = {
     'no echo is a float below max_range': (lambda: own_silence(4.9999995), r'of the echoes are at 5\.000 m'),
     'no echo is min_range': (
         lambda: drive().with_ranges(lambda m: m._replace(range=m.min_range if m.range >= m.max_range else m.range)),
-        r'of the echoes are at 0\.100 m.*where it hears nothing\? Have it send \+inf',
+        r'of the echoes are at 0\.100 m.*if there is no echo\? Let it send \+inf',
     ),
     'variance in square millimetres': (
         lambda: drive().with_ranges(lambda m: m._replace(variance=9.0)),

@@ -1,0 +1,201 @@
+"""Warnings about values of Range messages that give a wrong map without any error: ranges, limits, cones, variances.
+
+They are a part of `input_warnings`, and use the readings alone.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..common.readings import Floats, Readings
+
+ENOUGH = 30
+"""Fewest readings of a sensor that is checked."""
+
+STILL = 0.01, 0.01
+"""Metres and radians: a robot that moves by less stands still."""
+
+JUDGED = 1.0
+"""Metres that sensors must have moved before their range limit is checked: from one place all walls may be near or
+far."""
+
+LEAST = 5
+"""Fewest readings of a sensor in such a block."""
+
+NARROW, WIDE = math.radians(3.0), math.radians(90.0)
+"""No sonar has a smaller or larger field of view than these."""
+
+REACHED = 0.6
+"""max_range is too large if all echoes are within this fraction of it."""
+
+SILENT = 0.05
+"""At least this fraction of the readings must have no echo: in a small closed room all echoes are near, but all
+readings have one."""
+
+ECHOES = 200
+"""Fewest echoes for checks of the range limit."""
+
+CEILING, ABOVE = 0.05, 0.005
+"""A driver that sends a certain range for 'no echo' does so in at least the first fraction of its echoes, and at most
+the second fraction is longer."""
+
+NONE = 0.01
+"""Then at most this fraction of the readings has no echo."""
+
+SAME = 0.0005
+"""Metres within which two ranges are the same value of the driver."""
+
+BELOW, DIRECTIONS = 0.05, 3
+"""Within so many metres below that range there are few echoes, unlike for a wall; and it is sent in at least so many
+twelfths of the circle."""
+
+FLOOR = 0.1
+"""Within so many metres above the shortest range there are few echoes, if it stands for 'no echo'."""
+
+SCATTER = 0.5
+"""The σ of no sonar is so many metres."""
+
+
+def range_warnings(readings: Readings) -> list[str]:
+    """Return warnings about the values of readings in the order of their stamps; empty if there is no suspicion."""
+    checks = (_ceiling, _floor, _field_of_view, _reach, _scatter)
+    return [text for check in checks if (text := check(readings))]
+
+
+def sensors(readings: Readings) -> Iterable[tuple[str, Readings]]:
+    """Yield name and readings of every sensor that has enough of them."""
+    for number, name in enumerate(readings.sensor_names):
+        mine = readings.sensor == number
+        if np.count_nonzero(mine) >= ENOUGH:
+            yield name, readings.select(mine)
+
+
+def _ceiling(readings: Readings) -> str:
+    """Check for a range below max_range that stands for 'no echo': the longest one, which occurs again and again."""
+    heard, towards = _echoes_of_all_that_answer(readings)
+    if len(heard) < ECHOES:
+        return ''
+    longest = round(float(np.quantile(heard, 1.0 - ABOVE)), 3)
+    same = np.abs(heard - longest) < SAME
+    nearly = (heard > longest - BELOW) & (heard < longest) & ~same
+    count, almost = int(np.count_nonzero(same)), int(np.count_nonzero(nearly))
+    if count < CEILING * len(heard) or count < 2 * almost or not _all_around(towards[same]):
+        return ''
+    return (
+        f'{count / len(heard):.0%} of the echoes are at {longest:.3f} m, hardly any is longer, and no reading is '
+        'without an echo: does the driver send this range if there is no echo? Then set the parameter max_range to '
+        f'{0.98 * longest:.2g}, otherwise a wall is mapped at that range'
+    )
+
+
+def _floor(readings: Readings) -> str:
+    """Check for a shortest range that stands for 'no echo': a driver may raise its 0 for that to min_range."""
+    heard, towards = _echoes_of_all_that_answer(readings)
+    if len(heard) < ECHOES:
+        return ''
+    shortest = round(float(np.quantile(heard, ABOVE)), 3)
+    same = np.abs(heard - shortest) < SAME
+    nearly = (heard < shortest + FLOOR) & (heard > shortest) & ~same
+    count, almost = int(np.count_nonzero(same)), int(np.count_nonzero(nearly))
+    if count < CEILING * len(heard) or count < 2 * almost or not _all_around(towards[same]):
+        return ''
+    # what a single sensor hears, or others all the time, may be the robot
+    parts = [float(np.mean(np.abs(mine.z - shortest) < SAME)) for _, mine in sensors(readings)]
+    at_it = [part for part in parts if part >= CEILING]
+    if len(at_it) < min(2, len(parts)) or min(at_it) > 0.5:
+        return ''
+    return (
+        f'{count / len(heard):.0%} of the echoes are at {shortest:.3f} m, hardly any is as short, and no reading is '
+        f'without an echo: does the driver send this range if there is no echo? Let it send +inf (REP 117), otherwise '
+        f'the robot is mapped as walled in'
+    )
+
+
+def _echoes_of_all_that_answer(readings: Readings) -> tuple[Floats, Floats]:
+    """Return ranges and directions, radians, of the echoes while the robot moves; none if readings have no echo."""
+    # during a standstill ranges are constant
+    parts = [mine.select(mine.echo & moving(mine)) for _, mine in sensors(readings)]
+    if not parts or np.count_nonzero(~readings.echo) > NONE * len(readings):
+        return np.zeros(0), np.zeros(0)
+    return np.concatenate([mine.z for mine in parts]), np.concatenate([mine.yaw for mine in parts])
+
+
+def _all_around(yaw: Floats) -> bool:
+    """Return whether directions are spread: along a wall, a constant range occurs in the same one for long."""
+    sectors = np.bincount((np.remainder(yaw, 2 * math.pi) / (2 * math.pi) * 12).astype(np.int64))
+    return int(np.count_nonzero(sectors >= LEAST)) >= DIRECTIONS
+
+
+def moving(mine: Readings) -> NDArray[np.bool_]:
+    """Return which readings of a sensor have another position or yaw of it than the reading before."""
+    moved = (np.hypot(np.diff(mine.x), np.diff(mine.y)) > STILL[0]) | (turned(mine) > STILL[1])
+    return np.append(False, moved)
+
+
+def turned(mine: Readings) -> Floats:
+    """Return the absolute turn of a sensor from each reading to the next, radians, shape (N - 1,)."""
+    turned: Floats = np.abs(np.remainder(np.diff(mine.yaw) + math.pi, 2 * math.pi) - math.pi)
+    return turned
+
+
+def _field_of_view(readings: Readings) -> str:
+    angle = 2 * readings.half_angle
+    odd = (angle < NARROW) | (angle > WIDE)
+    if np.count_nonzero(odd) < 0.5 * len(readings):
+        return ''
+    degrees = math.degrees(float(np.median(angle[odd])))
+    cause = (
+        'is it in degrees, or a default of a simulator?'
+        if degrees > 90
+        else 'is it half of the angle, or a default of the driver?'
+    )
+    return (
+        f'the field of view is {degrees:.3g} degrees, which no sonar has; {cause} field_of_view is the full angle of '
+        f'the cone in radians, 0.26 for 15 degrees: correct the driver, or set the parameter field_of_view'
+    )
+
+
+def _reach(readings: Readings) -> str:
+    echo = readings.echo & ~_of_fixed_distance(readings)
+    heard: Floats = readings.z[echo]
+    if max(np.ptp(readings.x), np.ptp(readings.y)) < JUDGED:
+        return ''
+    if len(heard) < ECHOES or np.count_nonzero(~echo) < SILENT * len(readings):
+        return ''
+    # a few random echoes may have any range
+    part: NDArray[np.float64] = heard / readings.z_max[echo]
+    farthest = float(np.quantile(part, 0.995))
+    if farthest > REACHED:
+        return ''
+    limit = float(np.median(readings.z_max))
+    metres = farthest * limit
+    unit = 'is max_range in centimetres, millimetres or feet?' if farthest < 0.1 else 'does the sensor reach that far?'
+    return (
+        f'max_range is {limit:g} m, and no echo is from beyond {metres:.1f} m: {unit} A reading without an echo is '
+        'evidence for free space up to max_range; set the parameter max_range to the range of the sensor'
+    )
+
+
+def _scatter(readings: Readings) -> str:
+    """Look for a variance by which ranges would say next to nothing."""
+    stated = readings.echo & (readings.sigma > 0.0) & ~_of_fixed_distance(readings)
+    if np.count_nonzero(stated) < max(ENOUGH, 0.5 * np.count_nonzero(readings.echo)):
+        return ''
+    sigma = float(np.median(readings.sigma[stated]))
+    if sigma < SCATTER:
+        return ''
+    return (
+        f'the messages state a variance of {sigma * sigma:.3g} m², as if ranges scattered by {sigma:.2g} m: is it in '
+        f'another unit, or the deviation? Correct the driver: variance is in square metres, and 0 where it is not known'
+    )
+
+
+def _of_fixed_distance(readings: Readings) -> NDArray[np.bool_]:
+    """Return which readings are echoes of fixed-distance rangers, at half of max_range (`rep117.measure`)."""
+    z, z_max, sigma = readings.z, readings.z_max, readings.sigma
+    found: NDArray[np.bool_] = np.isclose(2 * z, z_max) & np.isclose(12 * sigma, z_max)
+    return found
