@@ -11,7 +11,7 @@ Layers, from the bottom up; each imports only from those that stand above it in 
 ``node``        the ROS 2 node
 ``commands``    the command lines
 
-``library`` is for programs of others: `make_maps` and what goes with it can be imported from here.
+``library`` is for other programs: `make_maps` and related names can be imported from here.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ __version__ = '0.1.0'
 
 
 def __getattr__(name: str) -> Any:
-    """Import the library when one of its names is asked for: it takes a second, which a command line need not."""
+    """Import the library when one of its names is used: this takes a second, which command lines do not need."""
     if name in __all__:
         from . import library
 

@@ -1,7 +1,7 @@
 # PYTHON_ARGCOMPLETE_OK
-"""The entry of every command: `python3 -m forward_grid_mapper COMMAND …`, and one script each once it is installed.
+"""The entry of every command: `python3 -m forward_grid_mapper COMMAND …`, and a script for each when installed.
 
-Signals get their handlers before the commands' modules are imported, which takes a second.
+Handlers of signals are set before the commands' modules are imported, which takes a second.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ COMMANDS = {
 
 
 EXTRAS = {'rosbags': 'offline', 'matplotlib': 'offline', 'rclpy': 'ros'}
-"""The extra of the installation that brings a package which not every command needs."""
+"""The extras that install packages which only some commands need."""
 
 
 def run(command: str, arguments: Sequence[str] | None = None) -> int:
@@ -43,7 +43,7 @@ def run(command: str, arguments: Sequence[str] | None = None) -> int:
     except ModuleNotFoundError as error:
         if error.name is None or (package := error.name.partition('.')[0]) not in EXTRAS:
             raise
-        print(f'{command}: error: {_what_brings(package)}', file=sys.stderr)
+        print(f'{command}: error: {_how_to_install(package)}', file=sys.stderr)
         return 1
     try:
         return int(main(arguments))
@@ -52,35 +52,35 @@ def run(command: str, arguments: Sequence[str] | None = None) -> int:
 
 
 def _open_streams() -> None:
-    """Open the standard streams that the process was started without, as by `>&-`.
+    """Open standard streams that were closed when the process was started, as by `>&-`.
 
-    Python has None for them, and the next file that is opened takes the number of such a stream.
+    Python sets them to None, and the next opened file would get the descriptor of such a stream.
     """
     for name, mode in (('stdin', 'r'), ('stdout', 'w'), ('stderr', 'w')):
         if getattr(sys, name) is None:
             setattr(sys, name, open(os.devnull, mode, encoding='utf-8'))  # noqa: PTH123, SIM115 (for the whole process)
 
 
-def _to_a_pipe(work: Callable[[], int]) -> int:
-    """Do the work of a command, whose output may go to somebody who stops reading before its end, such as `head`."""
+def _with_output(work: Callable[[], int]) -> int:
+    """Run a command; the reader of its output may end early, such as `head`."""
     _open_streams()
     try:
         try:
             return work()
         finally:
-            # a command may have closed it
+            # the command may have closed it
             if not sys.stdout.closed:
                 sys.stdout.flush()
     except BrokenPipeError:
-        if not signals.nobody_reads():
+        if not signals.output_closed():
             raise
-        # the end of the interpreter must not find anything to write
+        # so that the interpreter has nothing to write at exit
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
 
 
-def _what_brings(package: str) -> str:
-    """Say how a package that is not installed can be."""
+def _how_to_install(package: str) -> str:
+    """Return how to install a missing package."""
     extra = f'pip install "forward_grid_mapper[{EXTRAS[package]}]", or .[{EXTRAS[package]}] in a checkout'
     if package == 'rclpy':
         return f"{package} is not installed: source ROS 2's setup.bash, or {extra}"
@@ -89,52 +89,52 @@ def _what_brings(package: str) -> str:
 
 def mapper() -> int:
     """Run `mapper`; return its exit code."""
-    return _to_a_pipe(lambda: run('mapper'))
+    return _with_output(lambda: run('mapper'))
 
 
 def process_bag() -> int:
     """Run `process_bag`; return its exit code."""
-    return _to_a_pipe(lambda: run('process_bag'))
+    return _with_output(lambda: run('process_bag'))
 
 
 def explain() -> int:
     """Run `explain`; return its exit code."""
-    return _to_a_pipe(lambda: run('explain'))
+    return _with_output(lambda: run('explain'))
 
 
 def learn() -> int:
     """Run `learn`; return its exit code."""
-    return _to_a_pipe(lambda: run('learn'))
+    return _with_output(lambda: run('learn'))
 
 
 def replay_bag() -> int:
     """Run `replay_bag`; return its exit code."""
-    return _to_a_pipe(lambda: run('replay_bag'))
+    return _with_output(lambda: run('replay_bag'))
 
 
 def simulate() -> int:
     """Run `simulate`; return its exit code."""
-    return _to_a_pipe(lambda: run('simulate'))
+    return _with_output(lambda: run('simulate'))
 
 
 def experiment() -> int:
     """Run `experiment`; return its exit code."""
-    return _to_a_pipe(lambda: run('experiment'))
+    return _with_output(lambda: run('experiment'))
 
 
 def warm_up() -> int:
     """Run `warm_up`; return its exit code."""
-    return _to_a_pipe(lambda: run('warm_up'))
+    return _with_output(lambda: run('warm_up'))
 
 
 def demo() -> int:
     """Run `demo`; return its exit code."""
-    return _to_a_pipe(lambda: run('demo'))
+    return _with_output(lambda: run('demo'))
 
 
 def main() -> int:
     """Run the command named by the first argument."""
-    return _to_a_pipe(_main)
+    return _with_output(_main)
 
 
 def _main() -> int:

@@ -1,4 +1,4 @@
-"""What the library is given: arrays of a user's program become stamps and poses, or an error that says what to do."""
+"""Input of the library: converts a user's arrays to stamps and poses, or raises errors with a remedy."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from .core.common.errors import InputError
 from .core.messages.message_types import NANOSECONDS, OdometryMessage, Pose2
 
 COARSEST = 1e-3
-"""Seconds between neighbouring numbers of a type of float, from which on it cannot hold stamps."""
+"""Smallest difference between neighbouring floats, seconds, from which a type is too coarse for stamps."""
 
 APART = (0.01, math.radians(1.0))
-"""Metres and radians by which two poses of one stamp are not the same."""
+"""Smallest differences, metres and radians, between two different poses of one stamp."""
 
 LEAVE_OUT = 'leave them out'
 
@@ -29,19 +29,19 @@ def column(name: str, values: ArrayLike, length: int | None = None) -> NDArray[n
     Raises
     ------
     InputError
-        If they are no real numbers, some are masked, or the shape is another one.
+        If they are not real numbers, some are masked, or the shape is another one.
     """
     filled = 'fill those with nan: np.ma.filled(ranges.astype(float), np.nan)'
     return _shaped(name, _numbers(name, values, filled if name == 'ranges' else LEAVE_OUT), length)
 
 
 def stamps(name: str, values: ArrayLike, length: int | None = None) -> NDArray[np.int64]:
-    """Return stamps in nanoseconds: of seconds, or of NumPy's datetime64 or timedelta64, which lose nothing.
+    """Return stamps in nanoseconds, from seconds, or without loss from NumPy's datetime64 or timedelta64.
 
     Raises
     ------
     InputError
-        As `column`; or if some are not finite, can only be of another unit, or have a type that is too coarse for them.
+        As `column`; or if some are not finite, can only have another unit, or have a type that is too coarse for them.
     """
     given = _array(name, values, LEAVE_OUT)
     if given.dtype.kind in 'mM':
@@ -77,8 +77,8 @@ def poses_of(stamp: NDArray[np.int64], poses: ArrayLike) -> list[OdometryMessage
     return [OdometryMessage(one, 'map', 'base', Pose2(*row)) for one, row in rows]
 
 
-def twofold(odometry: list[OdometryMessage]) -> list[str]:
-    """Return a warning where poses of one stamp differ; `odometry` is in order of stamps."""
+def ambiguous_stamps(odometry: list[OdometryMessage]) -> list[str]:
+    """Return a warning if poses of one stamp differ; `odometry` is in order of stamps."""
     count, far, turned = 0, 0.0, 0.0
     for before, after in pairwise(odometry):
         if before.stamp != after.stamp or before.pose is None or after.pose is None:

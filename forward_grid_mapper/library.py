@@ -1,4 +1,4 @@
-"""Mapping without ROS: arrays of poses and ranges become the three maps, by the code of the node and of the bags."""
+"""Mapping without ROS: arrays of poses and ranges to the three maps, by the same code as for the node and bags."""
 
 from __future__ import annotations
 
@@ -31,20 +31,20 @@ __all__ = ['Sonar', 'SonarMaps', 'make_maps', 'poses_from_csv', 'poses_from_tum'
 
 @dataclass(frozen=True)
 class Sonar:
-    """One sensor: where it sits on the robot, and what its data sheet says.
+    """A sensor: its pose on the robot, and values of its data sheet.
 
     Attributes
     ----------
     x, y : float
         Of the sensor in the robot's base frame (REP 103: x ahead, y to the left), metres.
     yaw : float
-        Where it looks, radians, counter-clockwise from x.
+        Direction of its axis, radians, counter-clockwise from x.
     field_of_view : float
         The full angle of its cone, radians.
     max_range, min_range : float
-        Metres. A range that is infinite, or not below `max_range`, says that nothing returned an echo.
+        Metres. A range that is infinite, or not below `max_range`, means that there was no echo.
     pitch : float
-        How far it looks down, or up if negative (REP 103), radians; what it measures is projected on the plane.
+        Downward angle of its axis, negative if upward (REP 103), radians; readings are projected on the plane.
     """
 
     x: float
@@ -85,24 +85,24 @@ class Sonar:
 
 @dataclass(frozen=True)
 class SonarMaps:
-    """What `make_maps` returns.
+    """The result of `make_maps`.
 
     Attributes
     ----------
     maps : MapSet
         The three maps, `maps.live`, `maps.ml` and `maps.uncertainty`, on the grid `maps.grid`.
     received : int
-        Ranges given.
+        Number of ranges given.
     rejected : dict of str to int
-        How many of them were not used, by reason (`core.messages.rep117.REASONS` has them in words).
+        Number of ranges that were not used, by reason (`core.messages.rep117.REASONS` describes them).
     warnings : tuple of str
-        What is wrong with the input although it raises no error, and what to do about it.
+        Faults of the input that are no errors, each with a remedy.
     path : float64, shape (P, 2)
-        Where the robot drove, metres.
+        Path of the robot, metres.
     source : dict
-        What the report says of the input.
+        The report's data on the input.
     judged : tuple of str
-        Those of the warnings that the maps gave rise to.
+        Those of the warnings that follow from the maps.
     """
 
     maps: MapSet
@@ -124,7 +124,7 @@ class SonarMaps:
         try:
             return write_results(folder, self.maps, self.source, self.path, title, judged=self.judged)
         except OutputError as error:
-            # a program has no options
+            # the option does not exist in a program
             raise OutputError(str(error).replace(' with -o', '')) from error
 
 
@@ -138,10 +138,10 @@ def make_maps(
     parameters: Mapping[str, Any] | None = None,
     watch: Watch = lambda stage, progress: None,
 ) -> SonarMaps:
-    """Map what sonars on a robot measured.
+    """Make the three maps of the readings of sonars on a robot.
 
-    Poses between two stamps are interpolated. Ranges are taken as in REP 117: +inf, or at least `max_range`, is "no
-    echo", NaN and what is below `min_range` is rejected and counted.
+    Poses are interpolated between stamps. Ranges follow REP 117: +inf, or at least `max_range`, is "no echo"; NaN and
+    values below `min_range` are rejected and counted.
 
     Parameters
     ----------
@@ -155,11 +155,11 @@ def make_maps(
         Metres.
     sensors : mapping of str to Sonar
     sensor_of : str or sequence of str, length N
-        The name of the sensor of each range, or of all.
+        Name of the sensor of each range, or of all.
     parameters : mapping, optional
         Values of `docs/parameters.md` by name, such as `{'resolution': 0.05}`.
     watch : callable, optional
-        Called with stage and progress as the work goes on, by `core.mapping.Mapper.run`.
+        Called with stage and progress during the work, see `core.mapping.Mapper.run`.
 
     Returns
     -------
@@ -168,7 +168,7 @@ def make_maps(
     Raises
     ------
     InputError
-        If shapes, units or names make no sense, or not a single range could be used; says why.
+        If shapes, units or names are inconsistent, or no range could be used; names the reason.
     ParameterError
         For an unknown name or a value out of range.
     """
@@ -207,7 +207,7 @@ def make_maps(
     associator.finish()
     if not len(associator.buffer):
         reasons = '; '.join(f'{n} {reason} ({REASONS[reason]})' for reason, n in associator.rejected.most_common())
-        reasons += ''.join(f'; {text}' for text in _told_of_poses(associator))
+        reasons += ''.join(f'; {text}' for text in _pose_warnings(associator))
         spans = f'poses span {odometry[0].stamp / 1e9:.3f} … {odometry[-1].stamp / 1e9:.3f} s'
         raise InputError(
             f'none of {len(values)} ranges could be used: {reasons}; {spans}, ranges '
@@ -216,9 +216,9 @@ def make_maps(
     maps = live.on(Mapper(chosen).run(associator.readings, watch))
     before = [
         *_of_the_node(chosen),
-        *arrays.twofold(odometry),
+        *arrays.ambiguous_stamps(odometry),
         *alternation_note(associator),
-        *_told_of_poses(associator),
+        *_pose_warnings(associator),
         *associator.limits.warnings(),
         *rejection_warnings(associator.rejected, len(values), 'ranges'),
         *sensor_rejections(associator.rejected_by_frame, associator.buffer.counts()),
@@ -239,8 +239,8 @@ def _of_the_node(parameters: Parameters) -> list[str]:
     return [f'these parameters are only for the node and are ignored: {", ".join(names)}'] if names else []
 
 
-def _told_of_poses(associator: PoseAssociator) -> list[str]:
-    """Return what is to be said of poses that were not used."""
+def _pose_warnings(associator: PoseAssociator) -> list[str]:
+    """Return warnings about poses that were not used."""
     return [
         f'{count} of {associator.odometry_received} poses were rejected: {ODOMETRY_REASONS[reason]}'
         for reason, count in associator.odometry_rejected.items()

@@ -1,1 +1,1 @@
-"""The command lines; each module's `main` is one command."""
+"""The command lines; the `main` of each module is one command."""

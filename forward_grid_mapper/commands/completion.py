@@ -10,21 +10,21 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     import argparse
 
-ASKED = '_ARGCOMPLETE'
-"""Set by the shell while it asks for completions."""
+REQUEST = '_ARGCOMPLETE'
+"""Environment variable that the shell sets when it requests completions."""
 
 
 def complete(commands: Mapping[str, tuple[str, str]], package: str) -> None:
-    """Answer the shell, and leave, if it asks for completions and argcomplete is installed.
+    """Answer the shell and exit, if it requests completions and argcomplete is installed.
 
     Parameters
     ----------
     commands : mapping
         Module and help of each command. Only the one on the command line is imported.
     package : str
-        That the modules are in.
+        Package of the modules.
     """
-    if ASKED not in os.environ:
+    if REQUEST not in os.environ:
         return
     try:
         import argcomplete
@@ -34,8 +34,8 @@ def complete(commands: Mapping[str, tuple[str, str]], package: str) -> None:
 
 
 def parser_of_all(commands: Mapping[str, tuple[str, str]], package: str, words: list[str]) -> argparse.ArgumentParser:
-    """Return a parser with all commands, of which those among `words` have their options."""
-    # it is not there yet when signals get their handlers
+    """Return a parser with all commands; those among `words` have their options."""
+    # imported late, after signals have their handlers
     import argparse
 
     made = argparse.ArgumentParser('forward_grid_mapper')
@@ -43,7 +43,7 @@ def parser_of_all(commands: Mapping[str, tuple[str, str]], package: str, words: 
     below = made.add_subparsers()
     for command, (module, text) in commands.items():
         parents = []
-        # the node takes what ROS takes
+        # the node has no options of its own
         if command in words and not module.startswith('node'):
             parents.append(importlib.import_module(f'.{module}', package).parser())
         below.add_parser(command, parents=parents, help=text, add_help=False)

@@ -1,4 +1,4 @@
-"""What all command lines need: errors without tracebacks, and progress once work takes longer than a second."""
+"""Common parts of command lines: errors without tracebacks, and progress for work longer than a second."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ PATIENCE = 1.0
 """Seconds of work before progress is shown."""
 
 LONG = 10.0
-"""Seconds of work after which warnings of its input are shown: the result may not be worth waiting for."""
+"""Seconds of work after which warnings of its input are shown: the result may not be worth the wait."""
 
 ON_SCREEN, IN_LOG = 0.2, 1.0
-"""Seconds between two looks at what is to be shown, on a terminal and elsewhere."""
+"""Seconds between two updates of the line of progress, on a terminal and elsewhere."""
 
 
 def run(
@@ -39,7 +39,7 @@ def run(
 ) -> int:
     """Run a command's body with its options; return its exit code, with errors reported in one line."""
     if isinstance(sys.stdout, io.TextIOWrapper):
-        # a path may hold what the terminal cannot show
+        # a path may have characters that the terminal cannot show
         sys.stdout.reconfigure(errors='backslashreplace')
     parser.add_argument('--version', action='version', version=f'%(prog)s of forward_grid_mapper {__version__}')
     try:
@@ -47,21 +47,21 @@ def run(
             with Interruptible():
                 return body(parser.parse_args(arguments))
         finally:
-            # here an error can still be reported
+            # errors of the output can still be reported here
             sys.stdout.flush()
     except MapperError as error:
         problem = str(error)
     except MemoryError:
         problem = 'there is not enough memory for a map of this size; raise resolution, or lower max_cells or max_range'
     except BrokenPipeError:
-        # the reader of our output went away, as `head` does
-        _still_printing()
+        # the reader of the output has ended, as `head` does
+        _output_works()
         return 1
     except OSError as error:
-        # of the work's files the work takes care; what remains is the output itself, or the working directory
-        problem = _what_failed(error) if _still_printing() else f'standard output: {error.strerror or error}'
+        # the work handles errors of its own files; others are those of the output or the working directory
+        problem = _in_words(error) if _output_works() else f'standard output: {error.strerror or error}'
     except Cancelled as cancelled:
-        # with SIGHUP the terminal is gone
+        # after SIGHUP there is no terminal
         with suppress(OSError):
             print(cancelled_line(parser.prog, cancelled.left), file=sys.stderr)
         return cancelled.code
@@ -72,8 +72,8 @@ def run(
     return 1
 
 
-def _still_printing() -> bool:
-    """Return whether stdout takes text; if not, let go of it, so that Python does not try again on its way out."""
+def _output_works() -> bool:
+    """Return whether standard output accepts text; if not, close it, so that Python does not fail again at exit."""
     try:
         sys.stdout.flush()
     except OSError:
@@ -83,27 +83,27 @@ def _still_printing() -> bool:
     return True
 
 
-def _what_failed(error: OSError) -> str:
-    """Return an error in words; the system names no file if it is about the working directory, or what is printed."""
+def _in_words(error: OSError) -> str:
+    """Return an error in words; without a file name, it concerns the working directory or standard output."""
     if error.filename is None:
         try:
             Path.cwd()
         except OSError:
             return 'the working directory does not exist any more; change to one that does'
-        # without a buffer (PYTHONUNBUFFERED) it is lost, and the next flush finds nothing wrong
+        # without a buffer (PYTHONUNBUFFERED) the text is lost, and the next flush finds no error
         if error.errno == errno.ENOSPC:
             return f'standard output: {error.strerror}'
     return str(error)
 
 
 class Ticker:
-    """Shows on stderr what goes on, in one line that is rewritten; silent for the first second.
+    """Shows progress on stderr, in one line that is rewritten; silent for the first second.
 
-    Used as a context manager. A thread keeps the clock running, since a stage may compile kernels without reporting. If
-    it is quiet, it says only that kernels are compiled, once.
+    Used as a context manager. A thread updates the time, since a stage may compile kernels without reports. If it is
+    quiet, it only reports the compilation of kernels, once.
 
-    tqdm does not do this: its bars count towards a total, which a search does not have, they stand still while nothing
-    is reported, and in a pipe they write a carriage return where a log wants a line.
+    tqdm cannot do this: its bars need a total, which a search does not have, they stop while nothing is reported, and
+    in a pipe they write a carriage return instead of a line.
     """
 
     def __init__(self, quiet: bool = False, stream: TextIO | None = None) -> None:
@@ -131,13 +131,13 @@ class Ticker:
             print('\r\033[K', end='', file=self._stream, flush=True)
 
     def say(self, text: str) -> None:
-        """Set what is going on."""
+        """Set the description of the current work."""
         self._text = text
         if not self._quiet:
             self._compiles = False
 
     def warn(self, warnings: Sequence[str]) -> None:
-        """Set what is known to be wrong with the input; it is shown if the work is long, else in the report alone."""
+        """Set warnings of the input; they are shown if the work is long, otherwise only in the report."""
         self._warnings = list(warnings)
 
     def reading(self, done: int, total: int) -> None:
@@ -162,7 +162,7 @@ class Ticker:
         while not self._done.wait(ON_SCREEN if on_screen else IN_LOG):
             seconds = time.monotonic() - self._begin
             if self._quiet:
-                self._tell_of_compiling(seconds)
+                self._note_compilation(seconds)
                 continue
             if seconds < PATIENCE or not self._text:
                 continue
@@ -170,7 +170,7 @@ class Ticker:
                 before = '\r\033[K' if on_screen else ''
                 print(*(f'{before}warning: {text}' for text in self._warnings), sep='\n', file=self._stream, flush=True)
                 self._warnings = []
-            # what was compiled a moment ago is shown until the next stage, so that the line does not flicker
+            # the note on compilation is shown until the next stage, so that the line does not flicker
             self._compiles = self._compiles or compiling()
             text = f'{self._text} {COMPILES}' if self._compiles else self._text
             if on_screen:
@@ -178,18 +178,18 @@ class Ticker:
                 line = shortened(f'{seconds:4.0f} s  {text}', self._columns() - 1)
                 print(f'\r\033[K{line}', end='', file=self._stream, flush=True)
             elif text != self._shown:
-                # a log file gets a line a change, at most one a second
+                # a log file gets a line for each change, at most one a second
                 self._shown = text
                 print(f'{seconds:4.0f} s  {text}', file=self._stream, flush=True)
 
-    def _tell_of_compiling(self, seconds: float) -> None:
-        """Say once, in a line that stays, why the first run takes so long."""
+    def _note_compilation(self, seconds: float) -> None:
+        """Print once, in a line that is not overwritten, why the first run takes so long."""
         if seconds >= PATIENCE and not self._compiles and compiling():
             self._compiles = True
             print(COMPILES.strip('()'), file=self._stream, flush=True)
 
     def _columns(self) -> int:
-        """Return the width of the terminal, which may change."""
+        """Return the current width of the terminal."""
         try:
             columns = os.get_terminal_size(self._stream.fileno()).columns
         except (OSError, ValueError, AttributeError):
@@ -198,5 +198,5 @@ class Ticker:
 
 
 def shortened(line: str, width: int) -> str:
-    """Return a line of at most `width` characters: one that wraps cannot be rewritten."""
+    """Return a line of at most `width` characters: a wrapped line cannot be rewritten."""
     return line if len(line) <= width else line[: max(width - 3, 0)] + '...'[: max(width, 0)]

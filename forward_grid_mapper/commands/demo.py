@@ -73,7 +73,7 @@ def _widths(doors: Iterable[float]) -> str:
 
 
 def through_node(folder: Path, bag: Path, recording: Recording, options: argparse.Namespace, ticker: Ticker) -> str:
-    """Replay a bag to the node and save its maps as `folder`/maps; return what EM said."""
+    """Replay a bag to the node and save its maps as `folder`/maps; return the message of run_em."""
     from .live_node import LiveNode
 
     saved = folder / 'saved'
@@ -88,7 +88,7 @@ def through_node(folder: Path, bag: Path, recording: Recording, options: argpars
         answer = node.call('run_em')
         ticker.say('saving the maps')
         node.call('save_maps')
-    # the only folder in there; the answer's text is for people, and a path may hold whatever separates its parts
+    # the only folder there; the answer's text is for people, and cannot be parsed for any path
     (made,) = saved.iterdir()
     made.rename(folder / 'maps')
     saved.rmdir()
@@ -96,7 +96,7 @@ def through_node(folder: Path, bag: Path, recording: Recording, options: argpars
 
 
 def offline(folder: Path, bag: Path, output: Path, options: argparse.Namespace, ticker: Ticker) -> str:
-    """Map a bag without ROS into `folder`/maps, to be known as `output`/maps; return what EM did."""
+    """Map a bag without ROS into `folder`/maps, which will be `output`/maps; return a description of the result."""
     parameters, _, ignored = chosen_parameters(options)
     drive = read_drive(bag, parameters, {}, progress=ticker.reading)
     drive.source['warnings'] += ignored
@@ -107,7 +107,7 @@ def offline(folder: Path, bag: Path, output: Path, options: argparse.Namespace, 
 
 
 def ros_is_here() -> bool:
-    """Whether the node can run."""
+    """Return whether the node can run."""
     try:
         import rclpy  # noqa: F401
     except ImportError:
@@ -116,8 +116,8 @@ def ros_is_here() -> bool:
 
 
 def demo(options: argparse.Namespace) -> int:
-    """Do what the command line asks for."""
-    # before the work: they may be wrong, or all that is asked for
+    """Run the command with its options."""
+    # first, since the parameters may be wrong, or only be printed
     chosen_parameters(options)
     output = Path(options.output) if options.output else free_name(Path.cwd(), 'demo_output')
     if not options.offline and not ros_is_here():

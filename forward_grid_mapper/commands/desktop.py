@@ -1,4 +1,4 @@
-"""Opening a result with the desktop's own viewer, or saying where it is."""
+"""Opens a result with the desktop's viewer, or prints its path."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from pathlib import Path
 
 
 def show(path: Path) -> None:
-    """Open a file with the desktop's viewer; say on stderr how to open it where there is no desktop."""
+    """Open a file with the desktop's viewer; without a desktop, print on stderr how to open it."""
     where = path.resolve()
     opener = _opener()
     if opener is not None:
         with open(os.devnull, 'r+b') as nothing:  # noqa: PTH123 (Path has no name for it)
             try:
-                # the viewer outlives us
+                # the viewer continues after this process
                 subprocess.Popen([opener, str(where)], stdin=nothing, stdout=nothing, stderr=nothing)
                 return
             except OSError as error:

@@ -1,4 +1,4 @@
-"""A DDS domain that nobody else on this machine has."""
+"""A DDS domain that no other process on this machine uses."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ from contextlib import contextmanager
 from ..core.common.errors import MapperError
 
 LAST = 100
-"""The highest domain that is taken: the ports of domains above 101 may be those that Linux gives to any program."""
+"""The highest domain that is used: Linux may give the ports of domains above 101 to any program."""
 
 PORTS = 250
 """Ports of one domain, the first of which is 7400 for domain 0 (DDSI-RTPS 2.5, section 9.6.2.3)."""
 
 FIRST_PARTICIPANT, LAST_PORT = 10, 249
-"""Ports of a domain, counted from its first: that of its first participant, and one that only its 120th would use."""
+"""Ports of a domain, counted from its first: that of its first participant, and one that only the 120th would use."""
 
 
 def _bound(port: int) -> socket.socket | None:
-    """Return a socket that holds a UDP port, or None where another one does."""
+    """Return a socket bound to a UDP port; None if the port is in use."""
     held = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     try:
         held.bind(('', port))
@@ -32,14 +32,14 @@ def _bound(port: int) -> socket.socket | None:
 
 @contextmanager
 def own_domain() -> Iterator[int]:
-    """Hold a domain, 1 to `LAST`, in which there is no participant, and which no other process holds by this function.
+    """Reserve a domain, 1 to `LAST`, without participants; other processes that call this function get other domains.
 
     Raises
     ------
     MapperError
-        If every domain is taken.
+        If every domain is in use.
     """
-    # processes that start together do not all try the same domains
+    # so that processes that start together begin with different domains
     for k in range(LAST):
         domain = 1 + (os.getpid() + k) % LAST
         first = 7400 + PORTS * domain

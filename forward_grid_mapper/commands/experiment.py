@@ -1,4 +1,4 @@
-"""`experiment`: the paper's figures 3 to 6, and maps from odometry that drifts, each as a table and a figure."""
+"""`experiment`: the paper's figures 3 to 6, and maps with drifting odometry, each as a table and a figure."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def experiment(options: argparse.Namespace) -> int:
-    """Do what the command line asks for."""
+    """Run the command with its options."""
     if options.seeds < 1:
         raise ParameterError('--seeds must be a positive number')
     parameters, _, ignored = chosen_parameters(options)
@@ -97,7 +97,7 @@ def maps(folder: Path, options: argparse.Namespace, parameters: Parameters, tick
 
 
 def drifting(folder: Path, options: argparse.Namespace, parameters: Parameters, ticker: Ticker) -> str:
-    """Draw maps from odometry that drifts, a figure for each world; return the table."""
+    """Draw maps with drifting odometry, a figure for each world; return the table."""
     table, figures = drift(options, parameters, ticker)
     ticker.say('drawing')
     for name, (rows, view) in figures.items():

@@ -12,7 +12,7 @@ from ..core.sensor.forward_model import expectations
 from ..files.panels import Curve, Tile
 
 NEAR, FAR, BESIDE = (1.5, 0.05), (2.6, -0.1), (2.0, 1.1)
-"""Places of the obstacles in the sensor's frame, metres: two in the cone, one beside it."""
+"""Positions of the obstacles in the sensor's frame, metres: two in the cone, one beside it."""
 
 MAX_RANGE = 4.0
 HALF_ANGLE = np.radians(12.0)
@@ -22,7 +22,7 @@ STEP = 0.005
 def density_of_ranges(parameters: Parameters) -> tuple[Curve, Tile]:
     """Return p(z | m) for all ranges up to the largest, and the map with the cone of one reading.
 
-    The likelihood is that of the mapper, asked once for each range.
+    The likelihood is computed by the mapper's function, for each range.
     """
     resolution = parameters.grid.resolution
     width, height = (int(np.ceil(length / resolution)) for length in (MAX_RANGE + 1.0, 2.8))
@@ -39,7 +39,7 @@ def density_of_ranges(parameters: Parameters) -> tuple[Curve, Tile]:
 
 
 def density_table(curve: Curve, parameters: Parameters) -> str:
-    """Return the peaks of the curve, and what they stand for."""
+    """Return the peaks of the curve, and their causes."""
     model, z, p = parameters.model, curve.x, curve.y
     hit = hit_probability(model, parameters.grid.resolution)
     weight = 1.0 - model.p_rand - model.p_lost
@@ -59,7 +59,7 @@ def density_table(curve: Curve, parameters: Parameters) -> str:
         at = k[int(p[k].argmax())]
         lines.append(f'{name:28s}{z[at]:8.2f}{p[at]:14.3f}{share:9.3f}')
     if model.p_lost:
-        # adds to the same peak as 'nothing hit'
+        # at the same range as 'nothing hit'
         lines.append(f'{"echo lost":28s}{MAX_RANGE:8.2f}{p[-1]:14.3f}{model.p_lost:9.3f}')
     lines.append(f'{"chance, everywhere":28s}{"":8s}{p.min():14.3f}{model.p_rand:9.3f}')
     lines.append('')

@@ -1,4 +1,4 @@
-"""Maps from wheel odometry that drifts: along true poses, along odometry, and along the trajectory that is found."""
+"""Maps with drifting wheel odometry: at true poses, at those of odometry, and at those of the refined trajectory."""
 
 from __future__ import annotations
 
@@ -31,17 +31,17 @@ WORLDS: dict[str, Callable[[int], Recording]] = {
     'corridor': lambda seed: corridor_drive(seed, 2),
     'building': lambda seed: drive(building_world(), building_tour(), 0.15, sonar_ring(16), NOISY, seed),
 }
-"""The paper's corridor, to and fro, and rooms and corridors of our own; by seed."""
+"""The paper's corridor in both directions, and our worlds of rooms and corridors; by seed."""
 
 LEVEL = 'high'
 
 RADIUS = 0.2
-"""Metres of a robot that is to drive on the map."""
+"""Radius of a robot for navigation on the map, metres."""
 
 MARGIN = 0.5
 
 WIDE = 2.6
-"""Width of a map, by its height, from which on it has a row for itself."""
+"""Ratio of width to height from which a map has its own row."""
 
 POSES = {'true': 'true poses', 'odometry': 'odometry', 'refined': 'refined'}
 
@@ -50,7 +50,7 @@ Figure = tuple[list[list[Tile]], Box]
 
 
 class Row(NamedTuple):
-    """What is made of one drive along one trajectory: absolute trajectory error in metres, F1, and navigable IoU."""
+    """Scores of one drive with one trajectory: absolute trajectory error in metres, F1, and navigable IoU."""
 
     ate: float
     f1: float
@@ -58,7 +58,7 @@ class Row(NamedTuple):
 
 
 def navigable(free: NDArray[np.bool_], resolution: float) -> NDArray[np.bool_]:
-    """Return the cells whose surroundings within `RADIUS` are all free; outside of the map nothing is."""
+    """Return the cells whose surroundings within `RADIUS` are all free; cells outside of the map are not free."""
     reach = math.ceil(RADIUS / resolution)
     padded = np.pad(free, reach)
     out = np.ones(free.shape, np.bool_)
@@ -71,7 +71,7 @@ def navigable(free: NDArray[np.bool_], resolution: float) -> NDArray[np.bool_]:
 
 
 def on_world(ml: NDArray[np.int8], grid: Grid, world: World) -> NDArray[np.int8]:
-    """Return a map at the cells of the world, -1 where it has none."""
+    """Return a map resampled to the cells of the world, -1 outside."""
     x, y = world.grid.centers()
     rows, _ = grid.cells_of(np.zeros(len(y)), y)
     _, columns = grid.cells_of(x, np.zeros(len(x)))
@@ -81,7 +81,7 @@ def on_world(ml: NDArray[np.int8], grid: Grid, world: World) -> NDArray[np.int8]
 
 
 def aligned(poses: Floats, true: Floats) -> Floats:
-    """Return the rigid motion, shape (3,), that brings poses nearest to the true ones."""
+    """Return the rigid transform, shape (3,), that aligns poses with the true ones."""
     a, b = poses[:, :2] - poses[:, :2].mean(0), true[:, :2] - true[:, :2].mean(0)
     turn = math.atan2((a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum(), (a * b).sum())
     c, s = math.cos(turn), math.sin(turn)
@@ -90,7 +90,7 @@ def aligned(poses: Floats, true: Floats) -> Floats:
 
 
 def drift(options: argparse.Namespace, parameters: Parameters, ticker: Ticker) -> tuple[str, dict[str, Figure]]:
-    """Return the table, and for each world the maps of its first drive with the box that they show."""
+    """Return the table, and for each world the maps of its first drive with the box shown."""
     lines = [
         f'Wheel odometry that drifts (simulate --drift {LEVEL}), {counted(options.seeds, "drive")} of each world:',
         'absolute trajectory error after rigid alignment, F1 with one cell of tolerance, and of the floor that a robot',
@@ -119,7 +119,7 @@ def drift(options: argparse.Namespace, parameters: Parameters, ticker: Ticker) -
 
 
 def one(exact: Recording, seed: int, parameters: Parameters) -> tuple[Figure, dict[str, Row], bool]:
-    """Return the maps of a drive, what they are worth, and whether the trajectory was refined."""
+    """Return the maps of a drive, their scores, and whether the trajectory was refined."""
     bent, true = with_drift(exact, LEVELS[LEVEL], seed), odometry_of(exact)
     odometry, world = odometry_of(bent), exact.world
     outcome = Refiner(parameters).run(bent.readings, odometry)
@@ -137,7 +137,7 @@ def one(exact: Recording, seed: int, parameters: Parameters) -> tuple[Figure, di
         maps = Mapper(parameters).run(at_poses(readings, compose(home, sensors)))
         there = on_world(maps.ml, maps.grid, world)
         if kind == 'true':
-            # the floor that could be known
+            # the navigable floor among the known cells
             floor = navigable((world.reference == 0) & (there >= 0), world.grid.resolution)
         free = navigable(there == 0, world.grid.resolution)
         ate = rms_after_alignment(path.pose, true.pose)
@@ -149,14 +149,14 @@ def one(exact: Recording, seed: int, parameters: Parameters) -> tuple[Figure, di
     tiles[2] = tiles[2]._replace(odometry_xy=ways['odometry'])
     truth = Tile('truth', world.grid, world.reference, path_xy=ways['true'])
     view = box_of([*ways.values()], world.grid.extent)
-    # as figures are laid out: wide maps one below the other
+    # the layout of figures: wide maps are stacked
     wide = (view[1] - view[0]) > WIDE * (view[3] - view[2])
     shown = [truth, *tiles]
     return ([[tile] for tile in shown] if wide else [shown[:2], shown[2:]], view), rows, outcome.accepted
 
 
 def box_of(ways: Sequence[NDArray[np.float64]], extent: Box) -> Box:
-    """Return the box around ways and a world, with a margin."""
+    """Return the box around paths and a world, with a margin."""
     points = np.concatenate([*ways, [[extent[0], extent[2]], [extent[1], extent[3]]]])
     (left, bottom), (right, top) = points.min(0) - MARGIN, points.max(0) + MARGIN
     return float(left), float(right), float(bottom), float(top)

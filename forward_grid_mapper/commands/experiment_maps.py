@@ -1,4 +1,4 @@
-"""The paper's experiments with maps, in simulation: the forward map against the standard map with its best gains."""
+"""The paper's experiments with maps, in simulation: the forward map, and the standard map with its best settings."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ GAINS = tuple(
         (0.55, 0.6, 0.7, 0.8, 0.9, 0.97), (0.1, 0.2, 0.3, 0.4, 0.45, 0.48), (0.3, 0.45, 0.49), (0.05, 0.1)
     )
 )
-"""The settings of the standard map among which the best is taken, which a user could not know; see `standard_map`."""
+"""Settings of the standard map of which the best is used, although users could not know it; see `standard_map`."""
 
 SEEDS_OF_GAINS = 2
-"""Drives along the corridor that every setting of the standard map is tried with: they are long."""
+"""Drives along the corridor with which every setting of the standard map is tried: they are long."""
 
 ONE_SUM = {row.name: row.plain for row in CONSTANTS if row.name in ('live_directions', 'live_echo_width')}
-"""The standard map as in the paper: readings of all directions in one sum, and arcs as a whole."""
+"""The standard map as in the paper: one sum over readings of all directions, and complete arcs."""
 
 PAPER = {
     'plain_model': True,
@@ -50,7 +50,7 @@ PAPER = {
 
 
 class Case(NamedTuple):
-    """A recording and the wall cells that a map of it should show."""
+    """A recording, and the wall cells that its map should show."""
 
     recording: Recording
     visible: Mask
@@ -59,7 +59,7 @@ class Case(NamedTuple):
 class Outcome(NamedTuple):
     """The scores of one method over several recordings, and its maps of the first.
 
-    `random` is how many readings of each recording a maximum likelihood map attributes to chance.
+    `random` is the number of readings of each recording that a maximum likelihood map attributes to chance.
     """
 
     scores: list[Scores]
@@ -98,7 +98,7 @@ def forward(cases: Iterable[Case], parameters: Parameters, title: str) -> Outcom
 
 
 def standard_map(gains: dict[str, float]) -> LogOddsMap:
-    """Return an empty standard map with these gains, of which `depth` is half the depth of its arcs, metres."""
+    """Return an empty standard map with these gains; `depth` is half the depth of its arcs, metres."""
     values = {k: v for k, v in gains.items() if k != 'depth'}
     return LogOddsMap(Parameters().varied({**values, **ONE_SUM}), (gains['depth'], gains['depth']))
 
@@ -116,17 +116,17 @@ def standard(cases: Iterable[Case], gains: dict[str, float], title: str) -> Outc
 
 
 def best(outcomes: Iterable[Outcome], worth: Callable[[Outcome], float]) -> Outcome:
-    """Return the outcome of the highest worth."""
+    """Return the outcome with the largest `worth`."""
     return max(outcomes, key=worth)
 
 
 def seen(recording: Recording) -> Case:
-    """Return the recording with the surface that its readings could see."""
+    """Return the recording with the surface that is visible to its readings."""
     return Case(recording, visible_surface(recording.world, recording.readings, SURFACE_DEPTH))
 
 
 def raw_data(case: Case, title: str) -> Tile:
-    """Return the cones of a recording over the walls, as the sonars measured them."""
+    """Return the measured cones of a recording over the walls."""
     world = case.recording.world
     return Tile(title, world.grid, np.where(world.reference == 1, 1.0, 0.0), case.recording.readings)
 
@@ -150,7 +150,7 @@ def door(options: argparse.Namespace, parameters: Parameters, ticker: Ticker) ->
             paper = forward(cases, Parameters.from_flat(PAPER), "maximum likelihood map, the paper's")
             tried = [standard(cases, gains, 'standard map, best F1') for gains in GAINS]
             top = best(tried, lambda outcome: outcome.f1)
-            # a map that calls everything free has a wide door too
+            # a map with all cells free has a wide door as well
             fair = [outcome for outcome in tried if outcome.f1 >= ours.f1 - 0.05] or [top]
             wide = best(fair, lambda outcome: min(s.door_widths[0] for s in outcome.scores) + outcome.f1 / 100)
             cells = [f'{o.f1:.3f}  {o.door}' for o in (ours, paper, top, wide)]
@@ -165,7 +165,7 @@ def door(options: argparse.Namespace, parameters: Parameters, ticker: Ticker) ->
 
 
 def passer_by(options: argparse.Namespace, parameters: Parameters, ticker: Ticker) -> tuple[str, list[list[Tile]]]:
-    """Return table and figure of the experiment with two doors on either side and a person who walks by."""
+    """Return table and figure of the experiment with two doors on each side and a person who walks by."""
     cases = [seen(passing_drive(seed)) for seed in range(options.seeds)]
     ticker.say('the forward map')
     ours = forward(cases, parameters, 'ours')
@@ -201,7 +201,7 @@ def passer_by(options: argparse.Namespace, parameters: Parameters, ticker: Ticke
 
 
 def fewest_doors(outcome: Outcome) -> int:
-    """Return how many doors are open in every recording."""
+    """Return the smallest number of open doors of all recordings."""
     return min(s.doors_open for s in outcome.scores)
 
 

@@ -1,4 +1,4 @@
-"""`explain`: why a cell of a map is what it is, reading by reading, in words."""
+"""`explain`: the evidence for the state of a cell, reading by reading, in words."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ SHOWN = 5
 COUNTS = ('-n', '--readings')
 
 FARTHEST = 1e9
-"""Metres; no map reaches so far, and numbers of cells stay whole."""
+"""Metres; no map is larger, and indices of cells remain integers."""
 
 LEAST_TYPICAL = 0.05
-"""Nats that one reading must say for it to be asked how many more of its kind it takes."""
+"""Smallest evidence of a typical reading, nats, for which the number of further readings is computed."""
 
 
 def parser() -> argparse.ArgumentParser:
@@ -57,7 +57,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def explain(options: argparse.Namespace) -> int:
-    """Do what the command line asks for."""
+    """Run the command with its options."""
     given = Path(options.maps)
     folder = given.parent if given.name == ARCHIVE and given.is_file() else given
     maps = read_npz(folder / ARCHIVE)
@@ -110,12 +110,12 @@ def explanation_data(
         'traversed': found.traversed,
         'number_of_readings': len(found.readings),
         'readings': rows,
-        'what_decides': _what_decides(maps, found, state),
+        'what_decides': _decisive_evidence(maps, found, state),
     }
 
 
 def _on_map(maps: MapArchive, x: float, y: float) -> bool:
-    """Return whether a place is in a cell of the map; that is asked of the cells, since edges are rounded."""
+    """Return whether a place is in a cell of the map; decided by the index, since edges are rounded."""
     if not math.isfinite(x) or not math.isfinite(y) or max(abs(x), abs(y)) > FARTHEST:
         return False
     (row,), (column,) = maps.grid.cells_of(np.array([x]), np.array([y]))
@@ -153,7 +153,7 @@ def explanation(maps: MapArchive, readings: Readings, found: CellEvidence, shown
         yield (
             f'  {_nats(found.wall)} nats for the cell together with its occupied neighbours, which share their readings'
         )
-    yield f'  {_what_decides(maps, found, state)}'
+    yield f'  {_decisive_evidence(maps, found, state)}'
     if shown and count:
         yield ''
         yield f'  {"nats":>7}  {"range":>8}  {"cell at":>8}  {"stamp":>19}  sensor'
@@ -169,7 +169,7 @@ def _range(readings: Readings, found: CellEvidence) -> NDArray[np.float64]:
 
 
 def _nats(value: float, digits: int = 1) -> str:
-    """Return nats with their sign; what rounds to nothing has none to speak of."""
+    """Return nats with their sign; without one if they are rounded to 0."""
     return f'{round(float(value), digits) + 0.0:+.{digits}f}'
 
 
@@ -182,15 +182,15 @@ def _name(readings: Readings, i: int) -> str:
 
 
 def _sensors(readings: Readings, which: NDArray[np.int64]) -> str:
-    """Return the sensors of some readings, those with most readings first."""
+    """Return the sensors of readings, those with most readings first."""
     counts = Counter(_name(readings, int(i)) for i in which)
     named = [name if n == 1 else f'{name} ({n})' for name, n in counts.most_common(SHOWN)]
     more = f' and {len(counts) - SHOWN} more' if len(counts) > SHOWN else ''
     return ', '.join(named) + more
 
 
-def _what_decides(maps: MapArchive, found: CellEvidence, state: int) -> str:
-    """Say in one sentence what made the cell what it is, and what would make it something else."""
+def _decisive_evidence(maps: MapArchive, found: CellEvidence, state: int) -> str:
+    """Return a sentence on the evidence that determined the cell, and on what would change its state."""
     total = found.data + found.prior
     if found.traversed:
         return 'a sensor traversed it, so it is free, independent of the readings'
@@ -238,12 +238,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _is_one(word: str) -> bool:
-    """Whether a word is an argument, not an option."""
+    """Return whether a word is an argument, not an option."""
     return not word.startswith('-') or word[1:2].isdigit() or word[1:2] == '.'
 
 
 def _parted(word: str) -> list[str]:
-    """Return the two numbers of a place such as 3.0,1.0, and any other word as it is."""
+    """Return the two numbers of a place such as 3.0,1.0, and any other word unchanged."""
     parts = word.split(',')
     try:
         return parts if len([float(part) for part in parts]) == 2 else [word]
@@ -252,7 +252,7 @@ def _parted(word: str) -> list[str]:
 
 
 def _positional(word: str) -> str:
-    """Return a word so that argparse takes negative numbers such as -1e-1 for numbers, not for options."""
+    """Return a word in a form that argparse does not mistake for an option, such as -1e-1."""
     try:
         float(word)
     except ValueError:

@@ -82,14 +82,14 @@ def parser() -> argparse.ArgumentParser:
 
 
 def learn(options: argparse.Namespace) -> int:
-    """Do what the command line asks for."""
+    """Run the command with its options."""
     parameters, extrinsics, ignored = chosen_parameters(options)
     extrinsics |= chosen_sensors(options)
     if options.rounds < 1:
         raise ParameterError('--rounds must be a positive number')
     output = Path(options.output) if options.output else None
     if output is not None:
-        # before the work, not after it
+        # before the work
         if os.path.lexists(output):
             raise OutputError(f'{output} exists; choose another file with --output, or remove it first')
         if not output.parent.is_dir():

@@ -1,4 +1,4 @@
-"""The node in a process of its own, for commands that show it at work."""
+"""Runs the node in a process of its own, for commands that demonstrate it."""
 
 from __future__ import annotations
 
@@ -22,17 +22,17 @@ from .signals import ENDS_WITH_STDIN
 
 NODE = '/forward_grid_mapper'
 START = 180.0
-"""Seconds that a node may take to get ready: its first start compiles."""
+"""Longest time for the start of the node, seconds: the first start compiles."""
 
 ORDERLY = 15.0
-"""Seconds that a child may take to end in order before it is killed; the node ends itself after 5."""
+"""Seconds before a child that does not end is killed; the node ends itself after 5."""
 
 
 def start_child(arguments: Sequence[str], environment: Mapping[str, str], **options: Any) -> subprocess.Popen[bytes]:
-    """Start one of our commands in a process that ends when this one does, even by SIGKILL.
+    """Start one of our commands in a process that ends with this one, even after SIGKILL.
 
-    The child reads its standard input until this process lets go of the other end. It has a session of its own, so
-    that Ctrl-C in the terminal reaches this process alone, which then ends the child in order.
+    The child reads its standard input, which ends with this process. It has its own session, so that Ctrl-C in the
+    terminal reaches only this process, which then ends the child in order.
     """
     return subprocess.Popen(
         [sys.executable, '-m', 'forward_grid_mapper', *arguments],
@@ -44,7 +44,7 @@ def start_child(arguments: Sequence[str], environment: Mapping[str, str], **opti
 
 
 def end_child(process: subprocess.Popen[bytes]) -> None:
-    """End a child in order if it lives, or else kill it; returns when it has ended."""
+    """End a child in order, or else kill it; return after its end."""
     process.terminate()
     try:
         process.wait(ORDERLY)
@@ -62,7 +62,7 @@ class LiveNode:
     """
 
     def __init__(self, folder: Path, parameters: Parameters, extrinsics: Iterable[tuple[str, Pose2]]) -> None:
-        """`folder` takes the node's parameters and its log."""
+        """`folder` is for the node's parameters and its log."""
         self._folder = folder
         self._log = folder / 'node.log'
         lines = [dump_parameters(parameters), '\n    # ---- Poses of the sensors on the robot\n\n']
@@ -74,7 +74,7 @@ class LiveNode:
         self._process: subprocess.Popen[bytes] | None = None
 
     def __enter__(self) -> LiveNode:
-        """Start the node; it is ended again if anything else fails."""
+        """Start the node; if anything else fails, end it."""
         try:
             self._start()
         except BaseException:
@@ -83,7 +83,7 @@ class LiveNode:
         return self
 
     def _start(self) -> None:
-        # neither other robots nor another demo may receive this one's messages
+        # other robots or demos must not receive these messages
         domain = str(self._domain.enter_context(own_domain()))
         self.environment.update(ROS_DOMAIN_ID=domain, ROS_AUTOMATIC_DISCOVERY_RANGE='LOCALHOST')
         with self._log.open('wb') as log:
@@ -112,7 +112,7 @@ class LiveNode:
             self._domain.close()
 
     def run(self, *arguments: str) -> None:
-        """Run another of our commands beside the node, and wait for its end.
+        """Run another command while the node runs, and wait for its end.
 
         Raises
         ------

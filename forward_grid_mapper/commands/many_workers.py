@@ -1,4 +1,4 @@
-"""`process_bag --workers`: the same maps by processes of this machine, or by those of a cluster."""
+"""`process_bag --workers`: the same maps by processes on this machine, or by those of a cluster."""
 
 from __future__ import annotations
 
@@ -27,19 +27,19 @@ from .options import output_name
 from .signals import Cancelled
 
 TILE = 30.0
-"""Metres; the edge of a tile where `--tiles` does not give one."""
+"""Edge of a tile without `--tiles`, metres."""
 
 MEMORY = 2.0
-"""Gigabytes that a worker may take, where `--memory-per-worker` does not say."""
+"""Most memory of a worker without `--memory-per-worker`, gigabytes."""
 
 LEAST_MEMORY = 0.5
-"""Gigabytes that a worker takes before it holds anything, and as much again."""
+"""Memory of an idle worker, gigabytes; it needs as much again for work."""
 
 WORKERS_A_CORE = 4
-"""Beyond, they only take each other's time and memory."""
+"""Most workers for each core: more only compete for time and memory."""
 
 RESERVED = 0.6e9
-"""Bytes of a worker that are not for pairs of cells and readings: Python, kernels and the readings of a tile."""
+"""Memory of a worker that is not for pairs of cells and readings, bytes: Python, kernels and a tile's readings."""
 
 
 def add_worker_options(parser: argparse.ArgumentParser) -> None:
@@ -82,12 +82,12 @@ def with_workers(
     default: str,
     tell: Callable[[argparse.Namespace, Mapping[str, Any], Path], None],
 ) -> int:
-    """Do what the command line asks for; `default` is the name of the folder, and `tell` prints what came out."""
+    """Run the command with its options; `default` is the name of the folder, and `tell` prints the result."""
     from ..scale.extra import need
 
     need()
     _check(options)
-    # imported only now: they need the extra
+    # imported late: they need the extra
     from ..scale.cluster import Cluster
     from ..scale.job import Job, Recordings, versions
     from ..scale.mapping import ScaledMapper
@@ -142,12 +142,12 @@ def with_workers(
 
 
 def beside(output: Path) -> Path:
-    """Return the folder in which a job works that writes to `output`: not in it, also where that is `.`."""
-    return Path(f'{os.path.abspath(output)}.work')  # noqa: PTH100 (as `output_folder` has it)
+    """Return the work folder of a job that writes to `output`: beside it, also if that is `.`."""
+    return Path(f'{os.path.abspath(output)}.work')  # noqa: PTH100 (as in `output_folder`)
 
 
 def _check(options: argparse.Namespace) -> None:
-    """Check options that only make sense together, or not together."""
+    """Check combinations of options."""
     if options.workers is not None and options.workers < 1:
         raise ParameterError('--workers must be a positive number')
     if options.workers is not None and options.workers > (most := max(WORKERS_A_CORE * cores(), 8)):
@@ -176,14 +176,14 @@ def _check(options: argparse.Namespace) -> None:
 
 
 def _for_worker(parameters: Parameters, memory: int) -> Parameters:
-    """Return parameters with one thread, and with so much memory for pairs that the rest of a tile fits beside them."""
+    """Return parameters with one thread, and memory for pairs that leaves enough for the rest of a tile."""
     pairs = int(max(memory - RESERVED, 0.1e9) / 2e6)
     of_search = dataclasses.replace(parameters.search, threads=1, max_memory=min(parameters.search.max_memory, pairs))
     return dataclasses.replace(parameters, search=of_search)
 
 
 def _described(recordings: Any, parameters: Parameters, size: float, made_by: Mapping[str, str]) -> dict[str, Any]:
-    """Return what makes a job another one."""
+    """Return the data that distinguish a job from others."""
     files = []
     for name in recordings.paths:
         path = Path(name)

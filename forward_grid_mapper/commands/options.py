@@ -24,9 +24,9 @@ from ..recordings.given_poses import GivenPoses, read_given_poses
 
 
 def output_name(text: str) -> str:
-    """Return the name of what is to be written, for argparse.
+    """Return the name of an output, for argparse.
 
-    A shell's variable may have been empty, and bash leaves the `~` of `--output=~/maps` as it is.
+    An empty name may be that of an unset shell variable; bash does not expand the `~` of `--output=~/maps`.
     """
     if not text.strip():
         raise argparse.ArgumentTypeError('the name is empty')
@@ -44,7 +44,7 @@ def add_json_option(parser: argparse.ArgumentParser) -> None:
 
 
 def print_json(data: Mapping[str, Any]) -> None:
-    """Print the result as JSON, which is UTF-8; where the output has another encoding, as ASCII, which is both."""
+    """Print the result as JSON: in UTF-8, or escaped to ASCII if the output has another encoding."""
     encoding = getattr(sys.stdout, 'encoding', None) or 'ascii'
     print(json_text(data, ascii=codecs.lookup(encoding).name != 'utf-8'), end='')
 
@@ -55,9 +55,9 @@ def add_show_option(parser: argparse.ArgumentParser, what: str) -> None:
 
 
 class BagParser(argparse.ArgumentParser):
-    """A parser of commands that read a bag, which may also stand behind an option that takes several words.
+    """A parser for commands that read a bag, which may also be behind an option with several words.
 
-    `--range-topics A BAG` would leave nothing for the bag: then the last of such an option's words is the bag.
+    `--range-topics A BAG` would leave no word for the bag: then the last word of such an option is the bag.
     """
 
     _several: tuple[str, ...] = ('range_topics', 'remap')
@@ -65,11 +65,11 @@ class BagParser(argparse.ArgumentParser):
 
     def add_bag(self, help: str) -> None:
         """Add the argument `bag`."""
-        # required all the same, see below
+        # required nevertheless, see below
         self.add_argument('bag', help=help).required = False
 
     def add_bags(self, help: str) -> None:
-        """Add the argument `bags`, of which there is at least one; they may stand on both sides of options."""
+        """Add the argument `bags`, at least one; they may be on both sides of options."""
         self.add_argument('bags', nargs='*', metavar='bag', help=help)
         self.usage = f'{self.prog} bag [bag ...] [options]'
         self._takes_bags = True
@@ -77,18 +77,20 @@ class BagParser(argparse.ArgumentParser):
     def parse_args(  # type: ignore[override]
         self, args: Sequence[str] | None = None, namespace: argparse.Namespace | None = None
     ) -> argparse.Namespace:
-        """Return the options; leaves with a usage message if they are wrong."""
+        """Return the options; exit with a usage message if they are wrong."""
         options: argparse.Namespace
         if self._takes_bags:
             options = super().parse_intermixed_args(args, namespace)
         else:
             options = super().parse_args(args, namespace)
-        found = [] if getattr(options, 'bags', None) or getattr(options, 'bag', None) else self._behind_options(options)
+        found = (
+            [] if getattr(options, 'bags', None) or getattr(options, 'bag', None) else self._bags_in_options(options)
+        )
         if found and self._takes_bags:
             options.bags = found
         elif found:
             options.bag = found[-1]
-        # the parameters are shown without reading anything
+        # parameters are printed without a bag
         shown = getattr(options, 'dump_config', False)
         if not shown and not (options.bags if self._takes_bags else options.bag):
             taken = next((name for name in self._several if getattr(options, name, None)), None)
@@ -98,18 +100,18 @@ class BagParser(argparse.ArgumentParser):
                 hint = f'; {option} took all of: {words}. Give the bag first: {self.prog} BAG {option} {words}'
             self.error(f'no bag is given, or it does not exist; a bag is a folder, or a .mcap, .db3 or .bag file{hint}')
         if getattr(options, 'range_topics', None) is not None:
-            # a comma cannot be part of a topic's name
+            # names of topics have no commas
             options.range_topics = [t for word in options.range_topics for t in word.split(',') if t.strip()]
             if not options.range_topics:
                 self.error('argument --range-topics: the name of a topic is expected, not an empty one')
         return options
 
-    def _behind_options(self, options: argparse.Namespace) -> list[str]:
-        """Return what the last words of an option that takes several can only be: bags, of which one may be meant."""
+    def _bags_in_options(self, options: argparse.Namespace) -> list[str]:
+        """Return the last words of an option with several words that can only be bags; one if only one is allowed."""
         for name in self._several:
             words: list[str] | None = getattr(options, name, None)
             found: list[str] = []
-            # what names a file and does not name a topic's new name can only be a bag
+            # a word that is the path of a file, and not a rule of remapping, can only be a bag
             while words and ':=' not in words[-1] and os.path.lexists(words[-1]):
                 found.insert(0, words.pop())
                 if not self._takes_bags:
@@ -162,7 +164,7 @@ def chosen_sensors(options: argparse.Namespace) -> dict[str, Pose2]:
     Raises
     ------
     ParameterError
-        If one is wrong, or a sensor has two different ones.
+        If one is wrong, or a sensor has two different poses.
     """
     found: dict[str, Pose2] = {}
     for text in options.sensor:
@@ -173,12 +175,12 @@ def chosen_sensors(options: argparse.Namespace) -> dict[str, Pose2]:
 
 
 def chosen_poses(options: argparse.Namespace) -> GivenPoses | None:
-    """Return the poses of `--poses`, if there is one.
+    """Return the poses of `--poses`, if given.
 
     Raises
     ------
     ParameterError
-        If an odometry topic is chosen, too.
+        If an odometry topic is given as well.
     InputError
         If the file cannot be read.
     """
@@ -208,12 +210,12 @@ def add_part_options(parser: argparse.ArgumentParser) -> None:
 
 
 def chosen_part(options: argparse.Namespace) -> Part:
-    """Return which part of the drives `--start` and `--duration` choose.
+    """Return the part of the drives that `--start` and `--duration` select.
 
     Raises
     ------
     ParameterError
-        If one of them is no number of seconds that can be.
+        If one of them is not a possible number of seconds.
     """
     if not (math.isfinite(options.start) and options.start >= 0):
         raise ParameterError(f'--start {options.start:g}: give seconds from the beginning, 0 or more')
@@ -253,7 +255,7 @@ class ListParameters(argparse.Action):
 
 
 class Chosen(NamedTuple):
-    """Parameters and sensor poses of `--params` and `--set`, and what to warn of."""
+    """Parameters and sensor poses of `--params` and `--set`, and warnings."""
 
     parameters: Parameters
     extrinsics: dict[str, Pose2]
@@ -267,13 +269,13 @@ INSTEAD = {
     'refine_poses': 'give --refine-poses',
     'save_directory': 'give --output',
 }
-"""What to do offline in place of a parameter of the node."""
+"""Offline replacements of parameters of the node."""
 
 
 def chosen_parameters(options: argparse.Namespace) -> Chosen:
     """Return the parameters and the sensor poses of `--params` and `--set`.
 
-    With `--dump-config` it prints the parameters and leaves.
+    With `--dump-config`, print the parameters and exit.
 
     Raises
     ------
@@ -296,7 +298,7 @@ def chosen_parameters(options: argparse.Namespace) -> Chosen:
 
 
 def _ignored(values: Mapping[str, Any], source: str) -> str:
-    """Return what a parameter file sets in vain where the node does not run; empty if nothing."""
+    """Return a warning about parameters of a file that have no effect offline; otherwise ''."""
     known = {name: value for name, value in values.items() if name not in DEPRECATED}
     names = [name for name, value in known.items() if find(name).group == 'node' and value != find(name).default]
     if not names:

@@ -49,7 +49,7 @@ from .options import (
 )
 
 SMALLEST_TILE = 1.0
-"""Metres: below, a tile is little more than its margin."""
+"""Smallest tile, metres: smaller ones consist mostly of their margins."""
 
 COMMAND = 'process_bag'
 
@@ -109,7 +109,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def process(options: argparse.Namespace) -> int:
-    """Do what the command line asks for."""
+    """Run the command with its options."""
     parameters, extrinsics, ignored = chosen_parameters(options)
     extrinsics |= chosen_sensors(options)
     if options.learn < 0:
@@ -131,7 +131,7 @@ def process(options: argparse.Namespace) -> int:
     given = _given(options.odometry_calibration)
     output = Path(options.output) if options.output else free_name(Path.cwd(), f'{_stem(options.bags)}_maps')
     begin = time.perf_counter()
-    # the folder first: if it cannot be written, that should be known before the work
+    # first the folder, so that an error is found before the work
     with Ticker(options.quiet) as ticker, output_folder(output) as folder:
         drives = read_drives(
             options.bags,
@@ -190,12 +190,12 @@ def process(options: argparse.Namespace) -> int:
 
 
 def _given(file: str | None) -> Given | None:
-    """Return the calibration of a file, if one is given."""
+    """Return the calibration of a file, if given."""
     return None if file is None else Given(load_calibration(file), readable(file))
 
 
 def tell(options: argparse.Namespace, report: Mapping[str, Any], output: Path) -> None:
-    """Print what came out, as the options want it."""
+    """Print the result in the format of the options."""
     if options.json:
         print_json({'folder': readable(output), **report})
         return
@@ -210,17 +210,17 @@ def tell(options: argparse.Namespace, report: Mapping[str, Any], output: Path) -
 
 
 def _stem(words: Sequence[str]) -> str:
-    """Return what the results of these bags are called."""
+    """Return the name of the results of these bags."""
     path = Path(words[0]).resolve()
     path = path.parent if path.name == 'metadata.yaml' else path
-    # a dot is part of a folder's name
+    # dots are part of a folder's name
     first = (path.name if path.is_dir() else path.stem).replace('*', '').replace('?', '') or 'bags'
     return first if len(words) == 1 else f'{first}_and_{len(words) - 1}_more'
 
 
 def _title(drives: Drives) -> str:
     path = Path(drives.drives[0].source['bag'])
-    # a text to be shown, with letters that the names of files need not have in this locale
+    # text for display, with characters that file names of this locale may not have
     with suppress(UnicodeEncodeError):
         path = path.resolve()
     first = readable(Path(*path.parts[-2:]))
@@ -245,7 +245,7 @@ def _write_bag(path: Path, maps: MapSet, drives: Drives) -> None:
     with BagWriter(path, 'mcap') as writer:
         for name, values in (('live_map', maps.live), ('ml_map', maps.ml), ('uncertainty_map', maps.uncertainty)):
             topic = f'/forward_grid_mapper/{name}'
-            # the log has no time before 0
+            # log times are not negative
             writer.write_grid(topic, maps.grid, occupancy_values(values), frame, stamp, max(stamp, 0))
 
 

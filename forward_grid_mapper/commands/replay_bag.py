@@ -1,4 +1,4 @@
-"""`replay_bag`: plays a bag's ranges, odometry and static transforms over DDS, where `ros2 bag` is not installed."""
+"""`replay_bag`: publishes a bag's ranges, odometry and static transforms, if `ros2 bag` is not installed."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def replay(options: argparse.Namespace, ros_arguments: Sequence[str]) -> int:
-    """Do what the command line asks for."""
+    """Run the command with its options."""
     with StopSignal() as stop, Bag(options.bag) as bag, Ticker(options.quiet) as ticker:
         topics = bag.choose_topics(options.range_topics, options.odom_topic)
         for note in topics.notes():
@@ -117,7 +117,7 @@ def replay(options: argparse.Namespace, ros_arguments: Sequence[str]) -> int:
 
 
 def _static(messages: Mapping[str, Iterable[Any]], quiet: bool) -> dict[str, list[Any]]:
-    """Return the transforms of each tf_static topic as ROS messages; if that cannot be, none, and say so."""
+    """Return the transforms of each tf_static topic as ROS messages; if conversion fails, none, with a warning."""
     try:
         if messages:
             message_class(TF_MESSAGE)
@@ -132,7 +132,7 @@ def _static(messages: Mapping[str, Iterable[Any]], quiet: bool) -> dict[str, lis
 
 
 def _warn(bag: Bag, player: Player) -> None:
-    """Report what of the bag was not played as it is."""
+    """Print warnings about messages that were not played unchanged."""
     if bag.truncated:
         _print_warning(bag.truncated)
     for topic, count in (player.unusable + Counter(bag.undecodable)).items():
@@ -169,7 +169,7 @@ def _times(text: str) -> int:
 
 
 def split_ros_arguments(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
-    """Part our own arguments from ROS's, which go from each `--ros-args` to the next `--` or the end."""
+    """Separate our own arguments from ROS's, which are those from each `--ros-args` to the next `--` or the end."""
     own: list[str] = []
     ros: list[str] = []
     for argument in arguments:

@@ -1,6 +1,6 @@
 """Ctrl-C, SIGTERM and SIGHUP, from the first import to the last line: one line and an exit code, never a traceback.
 
-This module imports little, since it is to be ready before anything that takes long to import.
+This module imports little, since it is needed before slow imports.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ from typing import Any, NoReturn
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 GRACE = 5.0
-"""Seconds after a first signal in which further ones are ignored, so that nothing interrupts the clean-up: a terminal
-and `ros2 launch` send Ctrl-C more than once."""
+"""Seconds after a first signal in which further ones are ignored, so that the clean-up is not interrupted: terminals
+and `ros2 launch` send Ctrl-C repeatedly."""
 
 AGAIN = 0.1
-"""Seconds until a signal is sent once more whose `Cancelled` got lost."""
+"""Seconds before a signal is sent again if its `Cancelled` was lost."""
 
 ENDS_WITH_STDIN = 'FORWARD_GRID_MAPPER_ENDS_WITH_STDIN'
-"""Environment variable: with the value 1 the process ends when its standard input does, which its parent holds open."""
+"""Environment variable: with the value 1 the process ends at the end of its standard input, which its parent holds."""
 
 
 class Cancelled(KeyboardInterrupt):
@@ -34,9 +34,9 @@ class Cancelled(KeyboardInterrupt):
     Attributes
     ----------
     code : int
-        The exit code, 128 plus the signal's number as shells have it.
+        The exit code, 128 plus the signal's number, as in shells.
     left : str
-        What was left behind; whoever leaves something says so here.
+        Description of what remains after the signal, set by the code that leaves it.
     """
 
     def __init__(self, number: int) -> None:
@@ -46,14 +46,14 @@ class Cancelled(KeyboardInterrupt):
 
 
 def cancelled_line(command: str, left: str = 'nothing was written') -> str:
-    """Return the line about a command that a signal ended."""
+    """Return the message of a command that was ended by a signal."""
     return f'{command}: cancelled; {left}'
 
 
 def _install(handler: Any) -> dict[signal.Signals, Any]:
-    """Set the handler of the signals that are not ignored; return the handlers before."""
+    """Set the handler of the signals that are not ignored; return the previous handlers."""
     before = {number: signal.getsignal(number) for number in SIGNALS}
-    # a shell without job control lets background commands ignore Ctrl-C, and `nohup` does the like
+    # shells without job control ignore Ctrl-C for background commands, and `nohup` ignores SIGHUP
     replaced = {number: old for number, old in before.items() if old is not signal.SIG_IGN}
     for number in replaced:
         signal.signal(number, handler)
@@ -61,13 +61,13 @@ def _install(handler: Any) -> dict[signal.Signals, Any]:
 
 
 def leave_at_once(command: str) -> None:
-    """Let a signal end the process at once, with one line: for imports, while there is nothing to clean up.
+    """Let a signal end the process at once, with one line: for imports, before there is anything to clean up.
 
-    A `KeyboardInterrupt` in an import would be swallowed by some libraries, and shown with a traceback by others.
+    Some libraries would ignore a `KeyboardInterrupt` in an import, and others would print a traceback.
     """
 
     def leave(number: int, frame: FrameType | None) -> NoReturn:
-        # with SIGHUP the terminal is gone
+        # after SIGHUP there is no terminal
         with suppress(OSError):
             os.write(2, f'{cancelled_line(command)}\n'.encode())
         os._exit(128 + number)
@@ -76,11 +76,11 @@ def leave_at_once(command: str) -> None:
 
 
 def leave_silently() -> None:
-    """Let a signal end the process without a word: for the interpreter's own end, when all is done and reported."""
+    """Let a signal end the process without a message: for the interpreter's shutdown, after all work was reported."""
     _install(signal.SIG_DFL)
 
 
-def nobody_reads() -> bool:
+def output_closed() -> bool:
     """Return whether standard output is a pipe, or a socket, whose other end is closed."""
     try:
         output = sys.stdout.fileno()
@@ -92,10 +92,10 @@ def nobody_reads() -> bool:
 
 
 class Interruptible:
-    """Lets a signal raise `Cancelled` in a `with` block, once within `GRACE`; for the main thread, elsewhere idle.
+    """Lets a signal raise `Cancelled` in a `with` block, once within `GRACE`; for the main thread, no effect elsewhere.
 
-    Where C code calls Python, as the compiler of kernels does, an exception gets lost, or makes that code raise another
-    one. Then `Cancelled` is raised a little later, or takes the place of the other.
+    If C code calls Python, as the compiler of kernels does, an exception may be lost, or replaced by another one. Then
+    `Cancelled` is raised a little later, or instead of the other one.
     """
 
     def __init__(self) -> None:
@@ -106,7 +106,7 @@ class Interruptible:
         self._again: threading.Timer | None = None
 
     def __enter__(self) -> Interruptible:
-        """Begin to take signals."""
+        """Set the handlers."""
         if threading.current_thread() is threading.main_thread():
             self._before = _install(self._raise)
             self._hook, sys.unraisablehook = sys.unraisablehook, self._raise_later
@@ -115,13 +115,13 @@ class Interruptible:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Leave signals to who had them before."""
+        """Restore the previous handlers."""
         if sys.unraisablehook == self._raise_later:
             sys.unraisablehook = self._hook
         if self._again is not None:
             self._again.cancel()
         for number, handler in self._before.items():
-            # what took the signal in the block may have silenced it for good
+            # code that handled the signal in the block may have set it to be ignored
             if signal.getsignal(number) is not signal.SIG_IGN:
                 signal.signal(number, handler)
         if self._lost is not None and error is not None and not isinstance(error, Cancelled):
@@ -145,10 +145,10 @@ class Interruptible:
 
 
 def end_with_parent() -> None:
-    """End this process as by SIGTERM when its parent has ended, if the parent asked for it by `ENDS_WITH_STDIN`.
+    """End this process as by SIGTERM when its parent has ended, if the parent requested it by `ENDS_WITH_STDIN`.
 
-    The parent holds the other end of standard input. The system closes it whatever ends the parent, SIGKILL included,
-    on every system with pipes.
+    The parent holds the other end of standard input. The system closes it at any end of the parent, even by SIGKILL, on
+    every system with pipes.
     """
     if os.environ.pop(ENDS_WITH_STDIN, '') != '1':
         return
@@ -158,13 +158,13 @@ def end_with_parent() -> None:
             while os.read(0, 4096):
                 pass
         except OSError:
-            # no standard input at all: nobody holds the other end
+            # there is no standard input
             pass
         os.kill(os.getpid(), signal.SIGTERM)
         time.sleep(GRACE)
         os._exit(128 + signal.SIGTERM)
 
-    # a thread inherits the mask; signals are for the threads that know what to do
+    # threads inherit the mask; signals are for threads with handlers
     before = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
     threading.Thread(target=watch, daemon=True, name='parent').start()
     signal.pthread_sigmask(signal.SIG_SETMASK, before)

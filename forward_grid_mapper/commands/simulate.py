@@ -42,10 +42,10 @@ WORLD_OPTIONS = {
     'corridor': {'passes': 1},
     'campus': {'drives': 4, 'buildings': 4, 'readings': 40_000, 'jobs': cores()},
 }
-"""Options that one world alone has, and their defaults."""
+"""Options of single worlds, and their defaults."""
 
 MOST = 10_000_000
-"""The largest number that these options take; beyond, no machine has the memory or the time."""
+"""The largest value of these options; more would need too much memory and time."""
 
 FORMATS = {'mcap': 'bag', 'sqlite3': 'bag', 'ros1': 'drive.bag'}
 SONARS: dict[str, Callable[[], SonarArray]] = {'ring': sonar_ring, 'front': front_array}
@@ -93,7 +93,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def fill_in(options: argparse.Namespace, known: Mapping[str, Mapping[str, int]]) -> None:
-    """Give the options that one world alone has their defaults; `known` is a table such as `WORLD_OPTIONS`.
+    """Set defaults of options of single worlds; `known` is a table such as `WORLD_OPTIONS`.
 
     Raises
     ------
@@ -115,12 +115,12 @@ def fill_in(options: argparse.Namespace, known: Mapping[str, Mapping[str, int]])
 
 
 def record(world: str, seen: int, passes: int, noise_free: bool, seed: int, sonars: SonarArray) -> Recording:
-    """Simulate the drive that the options ask for.
+    """Simulate the drive of the options.
 
     Raises
     ------
     MapperError
-        If the memory is not enough; names the option to lower.
+        If there is not enough memory; names the option to lower.
     """
     noise = NOISE_FREE if noise_free else NOISY
     try:
@@ -133,9 +133,9 @@ def record(world: str, seen: int, passes: int, noise_free: bool, seed: int, sona
 
 
 def write_bag(path: Path, recording: Recording, format: str, each: bool) -> None:
-    """Write the bag of a recording, whose messages are logged by stamp, as a robot would.
+    """Write the bag of a recording, with log times equal to stamps.
 
-    A Range follows the odometry of its stamp; with `each`, every sonar has a topic of its own.
+    A Range follows the odometry with its stamp; with `each`, every sonar has its own topic.
     """
     with BagWriter(path, format) as writer:
         first = recording.odometry[0].stamp
@@ -150,7 +150,7 @@ def write_bag(path: Path, recording: Recording, format: str, each: bool) -> None
 
 
 def write_path(path: Path, recording: Recording) -> None:
-    """Write where the robot drove: x, y in metres, a row for each sweep."""
+    """Write the path of the robot: x, y in metres, a row for each sweep."""
     with output_errors(path):
         np.savetxt(path, recording.robot[:, :2], fmt='%.4f', delimiter=',')
 
@@ -175,7 +175,7 @@ def write_reference(folder: Path, recording: Recording) -> None:
 
 @dataclass(frozen=True)
 class Campus:
-    """What the drives through a campus have in common; the fields are options of the command."""
+    """Common data of the drives through a campus; the fields are options of the command."""
 
     folder: Path
     buildings: int
@@ -187,7 +187,7 @@ class Campus:
     each: bool
 
     def write(self, number: int) -> tuple[int, int]:
-        """Make and write one drive; return how many readings and odometry messages it has."""
+        """Simulate and write one drive; return the numbers of its readings and odometry messages."""
         noise = NOISE_FREE if self.noise_free else NOISY
         made = campus_drive(number, self.buildings, self.readings, noise, self.seed, SONARS[self.sonars]())
         name = f'drive_{number:04d}'
@@ -199,7 +199,7 @@ class Campus:
 
 
 def simulate_campus(options: argparse.Namespace, ticker: Ticker) -> None:
-    """Make many drives, several at once, and the true map that they share."""
+    """Simulate many drives, several in parallel, and write the true map that they share."""
     if options.drift:
         raise ParameterError('campus: drives that drift are not in one map frame; leave out --drift')
     with _enough_memory(), output_folder(options.output) as folder:
@@ -232,7 +232,7 @@ def simulate_campus(options: argparse.Namespace, ticker: Ticker) -> None:
 
 @contextmanager
 def _enough_memory() -> Iterator[None]:
-    """Say what to do where the memory is not enough for a campus or its drives."""
+    """Raise an error with a remedy if there is not enough memory for a campus or its drives."""
     try:
         yield
     except MemoryError as error:
@@ -243,14 +243,14 @@ def _enough_memory() -> Iterator[None]:
 
 
 def at_once(work: Callable[[int], T], numbers: Iterable[int], jobs: int) -> Iterator[T]:
-    """Yield what `work` returns for each number, in any order, from so many processes."""
+    """Yield the results of `work` for each number, in any order, from so many processes."""
     if jobs == 1:
         yield from map(work, numbers)
         return
-    # a fork would copy locks that threads of this process hold
+    # a fork would copy locks held by threads of this process
     with ProcessPoolExecutor(jobs, get_context('spawn')) as pool:
         try:
-            # a terminal sends Ctrl-C to all of its processes; ours are ended here, where it is told in one line
+            # a terminal sends Ctrl-C to all of its processes; children are ended here, with one message
             with signals_later():
                 begun = [pool.submit(work, number) for number in numbers]
             for future in as_completed(begun):
@@ -261,7 +261,7 @@ def at_once(work: Callable[[int], T], numbers: Iterable[int], jobs: int) -> Iter
                 'drives in parallel (--jobs), or shorter ones (--readings)'
             ) from error
         except BaseException:
-            # nobody wants the drives that are being made
+            # unfinished drives are not needed
             for process in active_children():
                 process.terminate()
             raise
@@ -270,13 +270,13 @@ def at_once(work: Callable[[int], T], numbers: Iterable[int], jobs: int) -> Iter
 
 
 def simulate(options: argparse.Namespace) -> int:
-    """Do what the command line asks for."""
+    """Run the command with its options."""
     with Ticker(options.quiet) as ticker:
         fill_in(options, WORLD_OPTIONS)
         if options.world == 'campus':
             simulate_campus(options, ticker)
             return 0
-        # the folder first: if it cannot be written, that should be known before the work
+        # first the folder, so that an error is found before the work
         with output_folder(options.output) as folder:
             check_bag_path(folder / FORMATS[options.format], options.format)
             ticker.say('simulating')

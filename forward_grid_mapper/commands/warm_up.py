@@ -1,4 +1,4 @@
-"""`warm_up`: compiles the kernels that the cache lacks, so that the first start of the node need not."""
+"""`warm_up`: compiles the kernels that are not in the cache, to save time at the first start of the node."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def compile_kernels(options: argparse.Namespace) -> int:
-    """Do what the command line asks for."""
+    """Run the command with its options."""
     begin = time.monotonic()
     for name, compile_all in STEPS.items():
         print(f'kernels of the {name} …', flush=True)

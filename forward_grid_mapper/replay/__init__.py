@@ -1,1 +1,1 @@
-"""Playing a recorded drive to the node."""
+"""Plays a recorded drive for the node."""

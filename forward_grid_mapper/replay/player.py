@@ -1,4 +1,4 @@
-"""The recorded messages in turn, each at its time."""
+"""Plays recorded messages at their times."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ class Player:
     Parameters
     ----------
     names : mapping
-        Name to publish under by the bag's topic.
+        Published name by the bag's topic.
     clock : float or None
         Rate of `/clock` in Hz.
     tell : callable
-        Takes how far the replay is.
+        Receives the progress of the replay.
 
     Attributes
     ----------
@@ -38,7 +38,7 @@ class Player:
     unusable : Counter
         Messages of another definition that were skipped, by topic.
     jumps : int
-        Gaps and steps back of the stamps that were not waited for.
+        Gaps and steps back of the stamps that were skipped.
     """
 
     def __init__(
@@ -69,7 +69,7 @@ class Player:
         return {**dict.fromkeys(self._topics.range_topics, RANGE), self._topics.odom_topic: ODOMETRY}
 
     def play(self, rate: float, label: str) -> None:
-        """Play the bag once; returns early when it is to stop.
+        """Play the bag once; return early on a request to stop.
 
         Raises
         ------
@@ -95,7 +95,7 @@ class Player:
             raise BagError(f'{self._bag.path}: no message of the chosen topics can be read')
 
     def _wait(self, timeline: Timeline, due: float) -> None:
-        """Wait until a message is due, and let the clock tick meanwhile; it ticks at every message too."""
+        """Wait until a message is due, and publish the clock meanwhile; it is also published at every message."""
         while (now := time.monotonic()) < due and not self._stop.is_set():
             if now >= self._next_tick:
                 self._tick(timeline)

@@ -1,4 +1,4 @@
-"""The replay's end of DDS: its publishers, who listens to them, and what has arrived."""
+"""DDS for the replay: publishers, checks for subscribers, and acknowledgements."""
 
 from __future__ import annotations
 
@@ -14,24 +14,24 @@ from .stop_signal import StopSignal
 
 NODE = 'replay_bag'
 SETTLING = 0.5
-"""Seconds between meeting a subscriber and the first message: it has yet to meet us, and best effort sends once."""
+"""Seconds from the discovery of subscribers to the first message: they must discover us too, for best effort."""
 
 LINGER = 0.5
-"""Seconds between the last message and the end, for what a best-effort subscriber has not taken yet."""
+"""Seconds from the last message to the end, so that best-effort subscribers receive it."""
 
 PATIENCE = 30.0
-"""Seconds that subscribers have to acknowledge; one that died is forgotten by DDS after 20."""
+"""Seconds in which subscribers must acknowledge; DDS forgets one that died after 20."""
 
 
 class Publishers:
-    """A node with one publisher a topic; used in a `with` block.
+    """A node with one publisher for each topic; used in a `with` block.
 
     Parameters
     ----------
     ros_arguments : sequence of str
-        From `--ros-args` on, for rclpy.
+        Arguments for rclpy, from `--ros-args` on.
     reliable : bool
-        Whether ranges and odometry are sent until they are acknowledged; best-effort subscribers receive both kinds.
+        Whether ranges and odometry are reliable; best-effort subscribers receive them in both cases.
     stop : StopSignal
         Ends every wait.
     """
@@ -51,7 +51,7 @@ class Publishers:
         Raises
         ------
         MapperError
-            If ROS is not installed, or does not take its arguments.
+            If ROS is not installed, or refuses its arguments.
         """
         try:
             import rclpy
@@ -79,18 +79,18 @@ class Publishers:
         self._ros.try_shutdown()
 
     def add(self, topic: str, msgtype: str, latched: bool = False) -> None:
-        """Create the publisher of a topic, known by this name from here on, whatever remapping makes of it.
+        """Create the publisher of a topic, which keeps this name here even if it is remapped.
 
         Raises
         ------
         ParameterError
-            If the name is not one of a topic.
+            If the name is not a valid topic name.
         """
         from rclpy.exceptions import InvalidTopicNameException
         from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 
         quality = QoSProfile(
-            # what a reliable subscriber has not acknowledged is kept, and fills up until publishing has to wait for it
+            # messages without acknowledgement are kept until the history is full; then publishing waits
             history=HistoryPolicy.KEEP_LAST if latched else HistoryPolicy.KEEP_ALL,
             depth=1,
             reliability=ReliabilityPolicy.RELIABLE if self._reliable or latched else ReliabilityPolicy.BEST_EFFORT,
@@ -104,14 +104,14 @@ class Publishers:
         self._types[topic] = msgtype
 
     def publish(self, topic: str, source: Any) -> None:
-        """Publish a copy of a message as rosbags decodes it.
+        """Publish a copy of a message decoded by rosbags.
 
         Raises
         ------
         *MISFITS
-            If it is of another definition.
+            If it has another definition.
         InputError
-            If a reliable subscriber does not take it.
+            If a reliable subscriber does not acknowledge.
         """
         from rclpy._rclpy_pybind11 import RCLError
 
@@ -122,14 +122,14 @@ class Publishers:
                 self._publishers[topic].publish(message)
                 break
             except RCLError as error:
-                # DDS waits for space in the history for a tenth of a second only
+                # DDS waits only a tenth of a second for space in the history
                 if time.monotonic() > deadline:
                     raise InputError(
                         f'subscribers of {topic} have received nothing for {PATIENCE:.0f} s ({error})'
                     ) from error
 
     def publish_latched(self, topic: str, **fields: Any) -> None:
-        """Publish a message of these fields, which late subscribers get too."""
+        """Publish a message with these fields, which late subscribers receive too."""
         self._publishers[topic].publish(message_class(self._types[topic])(**fields))
 
     def publish_clock(self, topic: str, stamp: int) -> None:
@@ -144,18 +144,18 @@ class Publishers:
         Raises
         ------
         InputError
-            Naming those that have none after so many seconds, and what to do.
+            Naming those without one after so many seconds, and a remedy.
         """
         deadline = time.monotonic() + seconds
         while unheard := [topic for topic in topics if not self._publishers[topic].get_subscription_count()]:
             if time.monotonic() > deadline:
-                raise InputError(self._nobody(unheard, seconds))
+                raise InputError(self._no_subscribers(unheard, seconds))
             if self._stop.wait(0.05):
                 return
         self._stop.wait(SETTLING)
 
     def wait_until_acknowledged(self) -> None:
-        """Wait until every reliable subscriber has what was published.
+        """Wait until every reliable subscriber has acknowledged all messages.
 
         Raises
         ------
@@ -167,7 +167,7 @@ class Publishers:
         deadline = time.monotonic() + PATIENCE
         waiting = list(self._publishers)
         while not self._stop.is_set():
-            # a short wait each, since rclpy lets no other thread run meanwhile
+            # short waits, since rclpy blocks other threads meanwhile
             moment = Duration(nanoseconds=NANOSECONDS // 20)
             waiting = [topic for topic in waiting if not self._publishers[topic].wait_for_all_acked(moment)]
             if not waiting:
@@ -177,7 +177,7 @@ class Publishers:
             self._stop.wait(0.05)
 
     def finish(self) -> None:
-        """Wait until what was published has arrived.
+        """Wait until all messages have arrived.
 
         Raises
         ------
@@ -187,7 +187,7 @@ class Publishers:
         self.wait_until_acknowledged()
         self._stop.wait(LINGER)
 
-    def _nobody(self, unheard: Sequence[str], seconds: float) -> str:
+    def _no_subscribers(self, unheard: Sequence[str], seconds: float) -> str:
         lines = [f'\n  {self._publishers[topic].topic_name}: {self._reason(topic)}' for topic in unheard]
         return (
             f'no subscriber after {seconds:g} s{"".join(lines)}\nStart it with the same ROS_DOMAIN_ID, rename topics '
@@ -195,7 +195,7 @@ class Publishers:
         )
 
     def _reason(self, topic: str) -> str:
-        """Say why a topic may have no subscriber that fits, or where others of its type listen."""
+        """Return a reason why a topic has no compatible subscriber, or topics of its type that have one."""
         name, msgtype = self._publishers[topic].topic_name, self._types[topic]
         found = self._node.get_subscriptions_info_by_topic(name)
         for other in found:
@@ -215,19 +215,19 @@ class Publishers:
 
 
 def renamed(topics: Mapping[str, str], remaps: Sequence[str]) -> dict[str, str]:
-    """Return the name under which each topic is to be published.
+    """Return the name under which each topic is published.
 
     Parameters
     ----------
     topics : mapping
-        Message type by topic, as the bag names it.
+        Message type by topic, with the bag's names.
     remaps : sequence of str
         Each 'old:=new'; a leading slash makes no difference.
 
     Raises
     ------
     ParameterError
-        If one has another form or an unknown topic, or joins topics of different types.
+        If one has another form or an unknown topic, or merges topics of different types.
     """
     names = {topic: f'/{topic.strip("/")}' for topic in topics}
     by_name = {name: topic for topic, name in names.items()}

@@ -1,4 +1,4 @@
-"""From messages as rosbags decodes them, of ROS 1 or ROS 2, to those that rclpy publishes."""
+"""Converts messages decoded by rosbags, of ROS 1 or ROS 2, to those that rclpy publishes."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from typing import Any
 from ..core.common.errors import MapperError
 
 NEWER = frozenset({'variance'})
-"""Fields that a recording may lack because it is older than Jazzy; they keep their defaults."""
+"""Fields that recordings older than Jazzy lack; they keep their defaults."""
 
 
 MISFITS = (AttributeError, TypeError, ValueError, AssertionError)
-"""What a message of another definition raises when it is copied."""
+"""Exceptions when a message with another definition is copied."""
 
 
 @lru_cache
@@ -34,15 +34,15 @@ def message_class(msgtype: str) -> Any:
 
 
 def filled(message: Any, source: Any) -> Any:
-    """Copy every field of `message` from `source`, at any depth; return `message`.
+    """Copy every field of `message` from `source`, recursively; return `message`.
 
-    What only `source` has, as ROS 1's `header.seq`, is left out. Fields must be numbers, text, fixed arrays of numbers,
-    or messages of such.
+    Fields that only `source` has, such as ROS 1's `header.seq`, are ignored. Fields must be numbers, text, fixed arrays
+    of numbers, or messages of such.
 
     Raises
     ------
     *MISFITS
-        If `source` lacks a field, or has something else in it.
+        If `source` lacks a field, or it has another type.
     """
     for name in message.get_fields_and_field_types():
         if name in NEWER and not hasattr(source, name):
@@ -59,7 +59,7 @@ def filled(message: Any, source: Any) -> Any:
 
 
 def static_transforms(messages: Iterable[Any]) -> list[Any]:
-    """Return all transforms of several `tf2_msgs/TFMessage`, the last one of each child frame, as tf2 would keep them.
+    """Return the transforms of several `tf2_msgs/TFMessage`, the last one of each child frame, as in tf2.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM as a request to stop that every wait notices, however often they come."""
+"""Ctrl-C and SIGTERM as a request to stop, which ends every wait."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 class StopSignal:
-    """Takes the signals in a `with` block; used in the main thread.
+    """Handles the signals in a `with` block; used in the main thread.
 
-    The signals wake `wait` through a pipe: setting a `threading.Event` in a handler may meet the wait inside the
-    event's own lock, and blocking the signals would not reach the threads that numpy has started.
+    The signals wake `wait` through a pipe: setting a `threading.Event` in a handler may find the event's own lock held
+    by the wait, and blocking the signals would not affect the threads that numpy has started.
     """
 
     def __init__(self) -> None:
@@ -25,7 +25,7 @@ class StopSignal:
         self._pipe = (-1, -1)
 
     def __enter__(self) -> StopSignal:
-        """Begin to take signals."""
+        """Set the handlers."""
         self._pipe = os.pipe()
         for end in self._pipe:
             os.set_blocking(end, False)
@@ -36,7 +36,7 @@ class StopSignal:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Leave signals to who had them before; a second one of those that stopped us means nothing any more."""
+        """Restore the previous handlers; a signal that stopped us is ignored from now on."""
         for number, handler in self._handlers.items():
             signal.signal(number, signal.SIG_IGN if self._requested else handler)
         signal.set_wakeup_fd(-1)
@@ -48,14 +48,14 @@ class StopSignal:
         return self._requested
 
     def wait(self, seconds: float) -> bool:
-        """Wait, but not after a signal; return whether to stop."""
+        """Wait, unless there was a signal; return whether to stop."""
         deadline = time.monotonic() + seconds
         while not self._requested:
             left = deadline - time.monotonic()
             if left <= 0:
                 break
             if select.select([self._pipe[0]], [], [], left)[0]:
-                # a signal of another kind wakes us too; ours has run its handler by now
+                # signals of other kinds wake it too; the handler of ours has run by now
                 os.read(self._pipe[0], 512)
         return self._requested
 

@@ -1,4 +1,4 @@
-"""When a recorded message is due: the stamps of a bag against the wall clock."""
+"""The times at which recorded messages are published: the stamps of a bag against the wall clock."""
 
 from __future__ import annotations
 
@@ -8,32 +8,32 @@ from collections.abc import Callable
 from ..core.messages.message_types import NANOSECONDS
 
 LONGEST_GAP = 60 * NANOSECONDS
-"""A longer gap between stamps is not waited for: a clock was set, or a driver does not stamp."""
+"""A longer gap between stamps is skipped: a clock was set, or a driver does not set stamps."""
 
 STEP_BACK = NANOSECONDS
-"""A topic whose stamps go back by more begins anew: the recording spans two runs of a clock."""
+"""If the stamps of a topic go back by more, its time begins again: the recording spans two runs of a clock."""
 
 LATE = 0.5
-"""Seconds by which messages may be late before the rest is shifted, so that they do not come in a burst."""
+"""Delay of messages, seconds, from which the rest is shifted, so that they are not sent in a burst."""
 
 
 class Timeline:
-    """The time of a bag, in nanoseconds, that runs at a rate of the wall clock's.
+    """The time of a bag, in nanoseconds, at a rate relative to the wall clock.
 
-    Messages keep the order in which they were recorded. One that is stamped earlier than its forerunner, as sensors
-    with a latency are, is due at once.
+    Messages keep the order of the recording. A message with an earlier stamp than the one before, as of sensors with a
+    latency, is due at once.
 
     Parameters
     ----------
     rate : float
-        Bag seconds in a second.
+        Bag seconds for each second.
     now : callable
         Returns monotonic seconds.
 
     Attributes
     ----------
     jumps : int
-        How often the stamps went back or left a gap that was not waited for.
+        Number of times that the stamps went back or left a gap that was skipped.
     """
 
     def __init__(self, rate: float, now: Callable[[], float] = time.monotonic) -> None:
@@ -45,7 +45,7 @@ class Timeline:
         self._anchor = 0.0, 0
 
     def due(self, topic: str, stamp: int) -> float:
-        """Return when the next message is to be published, in monotonic seconds; not after now if it is late."""
+        """Return the time at which to publish the next message, monotonic seconds; not after now if it is late."""
         now = self._now()
         back = stamp < self._own.get(topic, stamp) - STEP_BACK
         self._own[topic] = stamp
@@ -65,7 +65,7 @@ class Timeline:
         return due
 
     def time(self) -> int:
-        """Return the bag's time, which waits at the last message that `due` was asked for."""
+        """Return the bag's time, at most that of the last message for which `due` was called."""
         if self._latest is None:
             return 0
         wall, begin = self._anchor

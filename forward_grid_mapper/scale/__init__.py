@@ -1,5 +1,5 @@
-"""Maps of more than one process holds: readings on disk by tile, and tiles worked on by Dask's workers.
+"""Maps larger than the memory of one process: readings on disk by tile, and tiles processed by workers of Dask.
 
-It needs the extra *scale*; nothing else of the package imports it but the command that asks for it. `starting` alone is
-for all commands that start processes, and needs nothing.
+It requires the extra *scale*, and is imported only by the command that needs it. Only `starting` is for all commands
+that start processes, and requires nothing.
 """

@@ -1,4 +1,4 @@
-"""Dask does the distribution: a cluster of processes on this machine, or one that exists, and tasks given to it."""
+"""Distribution by Dask: a cluster of processes on this machine, or an existing one, and tasks for it."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from .job import Job, check_versions, versions
 from .starting import signals_later
 
 PATIENCE = 10.0
-"""Seconds in which a scheduler has to answer."""
+"""Seconds in which a scheduler must answer."""
 
-COME = 60.0
-"""Seconds in which the first worker of a scheduler has to be there."""
+FIRST_WORKER = 60.0
+"""Seconds in which the first worker of a scheduler must appear."""
 
 SETTINGS = {
-    # what workers hold is on disk already: none of it need be spilled, and none waits for memory
+    # the data of workers are on disk already: nothing needs to be spilled, and no worker waits for memory
     'distributed.worker.memory.target': False,
     'distributed.worker.memory.spill': False,
     'distributed.worker.memory.pause': False,
@@ -34,12 +34,12 @@ Work = Callable[..., dict[str, Any]]
 
 
 def _memory_of(dask_worker: Any) -> int:
-    """Return the bytes that a worker may take, 0 if it has no bound; Dask gives it the worker."""
+    """Return the memory limit of a worker, bytes, 0 if none; Dask passes the worker."""
     return int(dask_worker.memory_manager.memory_limit or 0)
 
 
 def _leave_interrupts() -> None:
-    """Leave Ctrl-C, which a terminal sends to the workers as well, to the client: it ends them without a word."""
+    """Ignore Ctrl-C in workers, to which a terminal sends it as well: the client ends them without messages."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
@@ -51,9 +51,9 @@ class Cluster:
     dashboard : str
         The address of Dask's dashboard.
     workers : int
-        How many there were at the beginning.
+        Their number at the begin.
     memory : int
-        Bytes that the smallest of them may take; 0 if they do not say.
+        Memory limit of the smallest one, bytes; 0 if there is none.
     """
 
     def __init__(self, workers: int, scheduler: str | None, memory: int) -> None:
@@ -62,32 +62,32 @@ class Cluster:
         Parameters
         ----------
         workers : int
-            How many processes to start on this machine, without a scheduler.
+            Number of processes to start on this machine, without a scheduler.
         scheduler : str, optional
-            Address of one that exists, with workers of its own.
+            Address of an existing one, with its own workers.
         memory : int
-            Bytes that a worker started here may take; one that takes more is ended, and its task begun anew.
+            Memory limit of a worker started here, bytes; one that exceeds it is ended, and its task is repeated.
         """
         self.workers, self._scheduler, self.memory = workers, scheduler, memory
-        # several jobs may be with one scheduler
+        # several jobs may use one scheduler
         self._token = uuid.uuid4().hex
         self._open = contextlib.ExitStack()
         self.dashboard = ''
 
     def __enter__(self) -> Cluster:
-        """Start workers, or find them.
+        """Start workers, or connect to existing ones.
 
         Raises
         ------
         ClusterError
-            If the scheduler cannot be reached, has no workers, or one of them has other versions.
+            If the scheduler cannot be reached or has no workers, or one of them has other versions.
         """
         import dask
         from distributed import Client, LocalCluster
 
         try:
             self._open.enter_context(dask.config.set(SETTINGS))
-            # what workers meet is told by the tasks' errors
+            # errors of tasks are reported by the client
             for name in ('distributed', 'tornado.application'):
                 logging.getLogger(name).setLevel(logging.CRITICAL)
             address: Any = self._scheduler
@@ -111,7 +111,7 @@ class Cluster:
                     '(tcp://HOST:8786), and does "dask scheduler" run there?'
                 ) from error
             if self._scheduler is None:
-                # for workers that come later, too
+                # also for workers that start later
                 self._client.register_worker_callbacks(_leave_interrupts)
             self._check()
         except BaseException:
@@ -120,13 +120,13 @@ class Cluster:
         return self
 
     def __exit__(self, *unused: object) -> None:
-        """End the workers that were started here; tasks of this job are dropped."""
+        """End the workers that were started here, and drop all tasks of this job."""
         self._open.close()
 
     def _check(self) -> None:
-        """Look at the workers that there are."""
+        """Check the current workers."""
         try:
-            self._client.wait_for_workers(1, timeout=COME)
+            self._client.wait_for_workers(1, timeout=FIRST_WORKER)
         except TimeoutError as error:
             raise ClusterError(f'the scheduler at {self._scheduler} has no workers; start some') from error
         self.dashboard = str(self._client.dashboard_link)
@@ -141,16 +141,16 @@ class Cluster:
         self.workers, self.memory = len(limits), min(filter(None, limits), default=0)
 
     def each(self, name: str, work: Work, job: Job, numbers: Iterable[int], *more: Any) -> Iterator[tuple[int, Any]]:
-        """Have a task done for each number; yield numbers with what was returned, in the order in which they end.
+        """Run a task for each number; yield numbers and results, in the order of completion.
 
-        A worker that dies costs the tasks that it was at: they are done by others.
+        If a worker dies, others repeat its tasks.
 
         Raises
         ------
         ClusterError
-            If a task ended its worker again and again, or the scheduler is gone.
+            If workers died repeatedly during a task, or the scheduler has ended.
         MapperError
-            That of a task.
+            The error of a task.
         """
         from distributed import as_completed
         from distributed.scheduler import KilledWorker

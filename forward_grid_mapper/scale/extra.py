@@ -1,4 +1,4 @@
-"""What this room needs beside the rest of the package, and what to install where it is missing."""
+"""The packages that `scale` requires, and how to install them."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def need() -> None:
     Raises
     ------
     ParameterError
-        If not; says what to install.
+        Otherwise; the message is how to install it.
     """
     for name in PACKAGES:
         try:

@@ -1,4 +1,4 @@
-"""What every worker is told of a job, and what it checks before it begins."""
+"""A job's description for workers, and the checks before they begin."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from .work_folder import WorkFolder, read_json
 
 @dataclass(frozen=True)
 class Recordings:
-    """What `read_drive` is to be given for every drive."""
+    """Arguments of `read_drive` for all drives."""
 
     paths: tuple[str, ...]
     extrinsics: Mapping[str, Pose2]
@@ -39,18 +39,18 @@ class Recordings:
 
 @dataclass(frozen=True)
 class Job:
-    """A job as workers know it.
+    """A job's description for workers.
 
     Attributes
     ----------
     folder : WorkFolder
-        On a file system that all of them share.
+        On a file system that all workers share.
     parameters : Parameters
-        With one thread, and memory for pairs that a worker can give.
+        With one thread, and a worker's memory for pairs.
     size : float
         Edge of a tile, metres.
     versions : dict of str
-        Those of who began the job.
+        Versions of the packages of the client that began the job.
     """
 
     folder: WorkFolder
@@ -60,16 +60,16 @@ class Job:
 
 
 class Plan(NamedTuple):
-    """What is known once all drives are placed.
+    """The order of drives and the tiles, once all drives are placed.
 
     Attributes
     ----------
     tiling : Tiling
     sensor_names : tuple of str
     order : dict of int
-        The number that a drive has in the map, by the number that it has among the arguments.
+        Number of a drive in the map, by its number among the arguments.
     sensors : dict of list of int
-        By the same number, the sensors of a drive as indices into `sensor_names`.
+        For the same numbers, the sensors of a drive as indices into `sensor_names`.
     """
 
     tiling: Tiling
@@ -80,7 +80,7 @@ class Plan(NamedTuple):
 
 def plan_of(job_folder: WorkFolder, size: float) -> Plan:
     """Return the plan of a job."""
-    # workers may outlive a job, and another one may have its folder
+    # workers may outlive a job, and another job may use its folder
     written = job_folder.plan.stat()
     return _plan_of(job_folder, size, (written.st_mtime_ns, written.st_size, written.st_ino))
 
@@ -97,7 +97,7 @@ def _plan_of(job_folder: WorkFolder, size: float, written: tuple[int, int, int])
 
 
 def versions() -> dict[str, str]:
-    """Return the versions that have to be the same everywhere, if the maps are to be."""
+    """Return the versions that must be equal on all machines for equal maps."""
     return {
         'forward_grid_mapper': f'{__version__} ({Path(jit.CACHE).name.removeprefix(jit.PREFIX)})',
         'Python': '.'.join(map(str, sys.version_info[:2])),
@@ -107,12 +107,12 @@ def versions() -> dict[str, str]:
 
 
 def check_versions(wanted: Mapping[str, str]) -> None:
-    """Check that this process has the versions of who began the job.
+    """Check that this process has the versions of the client that began the job.
 
     Raises
     ------
     ClusterError
-        If not; names the machine and what differs.
+        Otherwise; names the machine and the differences.
     """
     mine = versions()
     wrong = [f'{name} {mine.get(name)}, not {value}' for name, value in wanted.items() if mine.get(name) != value]
@@ -124,7 +124,7 @@ def check_versions(wanted: Mapping[str, str]) -> None:
 
 
 def task(work: Callable[..., dict[str, Any]]) -> Callable[..., dict[str, Any]]:
-    """Make a function of a job and a number a task: it checks versions, and tells CPU seconds and peak memory."""
+    """Make a function of a job and a number a task: it checks versions, and returns CPU seconds and peak memory too."""
 
     def run(job: Job, number: int, *arguments: Any) -> dict[str, Any]:
         check_versions(job.versions)

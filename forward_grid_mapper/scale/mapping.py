@@ -1,14 +1,14 @@
-"""From drives to maps by workers: the same steps as `core.tiled_mapping`, on readings and maps that are on disk.
+"""From drives to maps by workers: the same steps as `core.tiled_mapping`, with readings and maps on disk.
 
-    place      every drive, by itself
-    gather     every tile, what the drives have for it; its box
-    normals    of every core
-    search     every tile by itself; then colour by colour the stale ones, until no tile changes
-    finish     the maps of every core
-    judge      the readings of every tile
+place      every drive separately
+gather     the readings of the drives for every tile; its box
+normals    of every core
+search     every tile separately; then colour by colour the stale ones, until no tile changes
+finish     the maps of every core
+judge      the readings of every tile
 
-The client knows drives, tiles and counts; readings and maps are read and written by workers. All that the maps depend
-on is what a tile has in its box, so they are those of one process, cell for cell, however many workers there are.
+The client knows drives, tiles and counts; workers read and write readings and maps. The maps depend only on the
+contents of the boxes of tiles, so they are those of one process, cell for cell, for any number of workers.
 """
 
 from __future__ import annotations
@@ -43,16 +43,16 @@ Say = Callable[[str], None]
 
 @dataclass
 class Found:
-    """What the client knows at the end; readings and maps are in the work folder.
+    """The client's results; readings and maps are in the work folder.
 
     Attributes
     ----------
     tiling : Tiling
     source : dict
-        What was read and rejected, for the report.
+        Data for the report.
     sensor_names : tuple of str
     path_xy : float64, shape (P, 2)
-        Where the robots drove, metres; a row of NaN parts two drives.
+        Paths of the robots, metres; separated by rows of NaN.
     log_likelihood, objective : float
     counts : int64, shape (drives, sensors, 3)
         Readings, those without echo, and those that the map does not explain.
@@ -63,9 +63,9 @@ class Found:
     statistics : dict
         As in `MapSet`.
     tasks : list of (str, int, float, int)
-        Stage, number, CPU seconds, and bytes that the worker had taken, of every task, stage by stage.
+        Stage, number, CPU seconds, and memory of the worker in bytes, of every task, stage by stage.
     peak : int
-        Bytes that the largest worker took.
+        Memory of the largest worker, bytes.
     """
 
     tiling: Tiling
@@ -83,7 +83,7 @@ class Found:
 
 
 class ScaledMapper:
-    """Has a job done by a cluster."""
+    """Runs a job on a cluster."""
 
     def __init__(self, cluster: Cluster, job: Job, say: Say = lambda text: None) -> None:
         self._cluster, self._job, self._say = cluster, job, say
@@ -92,38 +92,38 @@ class ScaledMapper:
         self._peak = 0
 
     def run(self, recordings: Recordings, repeated: Sequence[str] = ()) -> Found:
-        """Map drives; `repeated` are warnings about the choice of them.
+        """Map drives; `repeated` are warnings about repeated ones.
 
         Raises
         ------
         BagError, InputError
             If drives cannot be mapped, or not together.
         ClusterError, OutputError
-            If workers end, or cannot write.
+            If workers die repeatedly, or cannot write.
         """
         found = self._plan(self._place(recordings), list(repeated))
         tiles = range(len(found.tiling.tiles))
         gathered = self._each('gathering readings', gather, tiles)
-        evaluated, own = (sum(told[name] for _, told in gathered) for name in ('readings', 'own'))
-        # the largest first, so that no worker is left alone with one of them at the end of a stage
+        evaluated, own = (sum(result[name] for _, result in gathered) for name in ('readings', 'own'))
+        # the largest first, so that no worker is left with a large one at the end of a stage
         gathered.sort(key=lambda one: -one[1]['readings'])
-        boxes = {number: Grid(*told['box']) for number, told in gathered if told['readings']}
+        boxes = {number: Grid(*result['box']) for number, result in gathered if result['readings']}
         self._each('normals', normals, boxes)
         searches = self._search(found.tiling, boxes)
         finished = self._each('maps of tiles', finish, [number for number, _ in gathered])
         judged = self._each('uncertainty', judge, boxes)
         exponent = self._job.parameters.model.likelihood_exponent
-        searched = sum(told['log_likelihood'] for _, told in finished)
-        found.log_likelihood = sum(told['log_likelihood'] for _, told in judged)
-        found.objective = exponent * found.log_likelihood + sum(told['prior'] for _, told in judged)
-        self._count(found, [told for _, told in judged])
-        pairs = sum(told['pairs'] for _, told in finished)
+        searched = sum(result['log_likelihood'] for _, result in finished)
+        found.log_likelihood = sum(result['log_likelihood'] for _, result in judged)
+        found.objective = exponent * found.log_likelihood + sum(result['prior'] for _, result in judged)
+        self._count(found, [result for _, result in judged])
+        pairs = sum(result['pairs'] for _, result in finished)
         found.statistics = {
             'pairs': pairs,
-            'bytes_per_pair': sum(told['bytes'] for _, told in finished) / max(pairs, 1),
-            'readings_not_stored': sum(told['unstored'] for _, told in finished),
+            'bytes_per_pair': sum(result['bytes'] for _, result in finished) / max(pairs, 1),
+            'readings_not_stored': sum(result['unstored'] for _, result in finished),
             'searched_log_likelihood': searched,
-            'searched_objective': exponent * searched + sum(told['prior'] for _, told in finished),
+            'searched_objective': exponent * searched + sum(result['prior'] for _, result in finished),
             **searches,
             'tiles': len(boxes),
             'evaluations_of_a_reading': evaluated / max(own, 1),
@@ -138,75 +138,75 @@ class ScaledMapper:
         return found
 
     def _each(self, stage: str, work: Work, numbers: Iterable[int], *more: Any, name: str = '') -> list[Any]:
-        """Have a stage done; return numbers with what came out, by number."""
+        """Run a stage; return numbers and results, by number."""
         begun, numbers = time.perf_counter(), list(numbers)
         found = []
-        for number, told in self._cluster.each(name or stage, work, self._job, numbers, *more):
-            found.append((number, told))
-            self._peak = max(self._peak, told['peak'])
-            self._tasks.append((name or stage, number, told['cpu'], told['peak']))
+        for number, result in self._cluster.each(name or stage, work, self._job, numbers, *more):
+            found.append((number, result))
+            self._peak = max(self._peak, result['peak'])
+            self._tasks.append((name or stage, number, result['cpu'], result['peak']))
             self._say(f'{name or stage}: {len(found):,} of {len(numbers):,}, {self._peak / 1e9:.1f} GB a worker')
         self._seconds[stage] = self._seconds.get(stage, 0.0) + time.perf_counter() - begun
         return sorted(found, key=lambda one: one[0])
 
     def _place(self, recordings: Recordings) -> dict[int, dict[str, Any]]:
-        """Place all drives; return what is known of each."""
-        told = dict(self._each('placing drives', place, range(len(recordings.paths)), recordings))
+        """Place all drives; return the data of each."""
+        result = dict(self._each('placing drives', place, range(len(recordings.paths)), recordings))
         errors: list[tuple[Path, MapperError]] = []
-        for number, known in told.items():
+        for number, known in result.items():
             if 'error' in known:
                 kind = BagError if known['kind'] == 'BagError' else InputError
                 errors.append((Path(recordings.paths[number]), kind(known['error'])))
-        if len(told) == 1 and errors:
+        if len(result) == 1 and errors:
             raise errors[0][1]
         if errors:
-            raise unreadable(errors, len(told))
-        for known in told.values():
+            raise unreadable(errors, len(result))
+        for known in result.values():
             poses = known['source'].get('extrinsics') or {}
             known['source']['extrinsics'] = {frame: Pose2(*pose) for frame, pose in poses.items()}
-        return told
+        return result
 
-    def _plan(self, told: dict[int, dict[str, Any]], warnings: list[str]) -> Found:
-        """Put drives in their order, leave out copies, and write the plan for the workers."""
-        order = sorted(told, key=lambda k: (told[k]['first'], told[k]['digest'], told[k]['source']['bag']))
-        described = {k: _described(told[k]) for k in order}
+    def _plan(self, result: dict[int, dict[str, Any]], warnings: list[str]) -> Found:
+        """Order the drives, leave out copies, and write the plan for the workers."""
+        order = sorted(result, key=lambda k: (result[k]['first'], result[k]['digest'], result[k]['source']['bag']))
+        described = {k: _described(result[k]) for k in order}
         check_frames(list(described.values()))
         by_echoes: dict[str, list[int]] = {}
         for k in order:
-            by_echoes.setdefault(told[k]['echoes'], []).append(k)
+            by_echoes.setdefault(result[k]['echoes'], []).append(k)
         kept = [same[0] for same in by_echoes.values()]
         for first, *others in by_echoes.values():
             if others:
                 warnings.append(same_drive([described[k].name for k in others], described[first].name))
         warnings += contradictions([described[k] for k in kept])
-        sources = [told[k]['source'] for k in kept]
+        sources = [result[k]['source'] for k in kept]
         for source in sources if len(sources) > 1 else ():
             warnings += [f'{source["bag"]}: {text}' for text in source['warnings']]
         if len(sources) == 1:
             source = {**sources[0], 'warnings': [*sources[0]['warnings'], *warnings]}
         else:
             source = source_of_all(sources, warnings)
-        grid = Grid(*told[kept[0]]['grid'])
+        grid = Grid(*result[kept[0]]['grid'])
         for k in kept[1:]:
-            grid = grid.union(Grid(*told[k]['grid']))
+            grid = grid.union(Grid(*result[k]['grid']))
         check_size(grid, self._job.parameters.grid)
-        names = sorted({name for k in kept for name in told[k]['sensors']})
+        names = sorted({name for k in kept for name in result[k]['sensors']})
         plan = {
             'grid': [grid.resolution, grid.column, grid.row, grid.width, grid.height],
-            'widest': max(told[k]['widest'] for k in kept),
+            'widest': max(result[k]['widest'] for k in kept),
             'sensor_names': names,
             'drives': kept,
-            'sensors': {k: [names.index(name) for name in told[k]['sensors']] for k in kept},
+            'sensors': {k: [names.index(name) for name in result[k]['sensors']] for k in kept},
         }
         write_json(self._job.folder.plan, plan)
         tiling = plan_of(self._job.folder, self._job.size).tiling
-        paths = [np.array(told[k]['path'], np.float64).reshape(-1, 2) for k in kept]
+        paths = [np.array(result[k]['path'], np.float64).reshape(-1, 2) for k in kept]
         parted = [part for path in paths for part in (path, np.full((1, 2), np.nan))][:-1]
         return Found(tiling, source, tuple(names), np.concatenate(parted))
 
     def _search(self, tiling: Tiling, boxes: dict[int, Grid]) -> dict[str, Any]:
-        """Search until no tile changes; return counts. `boxes` has the tiles in the order to begin with them."""
-        told = self._each('search', search, boxes, FIRST, name='search, first maps')
+        """Search until no tile changes; return counts. `boxes` has the tiles in the order of the first searches."""
+        result = self._each('search', search, boxes, FIRST, name='search, first maps')
         schedule, step, rounds = Schedule(boxes), FIRST, 0
         colours = [[number for number in boxes if number in set(colour)] for colour in tiling.colours]
         while schedule.stale:
@@ -218,15 +218,15 @@ class ScaledMapper:
                     now = self._each('search', search, numbers, step, name=name)
                     for number, outcome in now:
                         schedule.searched(number, Grid(*outcome['changed']) if outcome['changed'] else None)
-                    told += now
-        progress = [outcome['progress'] for _, outcome in told]
+                    result += now
+        progress = [outcome['progress'] for _, outcome in result]
         iterations, flips, shifts = (int(sum(column)) for column in list(zip(*progress, strict=True))[:3])
         return {
             'flips': flips,
             'shifts': shifts,
             'iterations': iterations,
-            'converged': all(outcome['converged'] for _, outcome in told),
-            'searches_of_tiles': len(told),
+            'converged': all(outcome['converged'] for _, outcome in result),
+            'searches_of_tiles': len(result),
         }
 
     def _count(self, found: Found, judged: Sequence[dict[str, Any]]) -> None:
@@ -234,18 +234,23 @@ class ScaledMapper:
         drives = len(found.source.get('drives') or (0,))
         counts = np.zeros((drives, len(found.sensor_names), 3), np.int64)
         cells = dict.fromkeys(('-1', '0', '1'), 0)
-        for told in judged:
+        for result in judged:
             marks = zip(
-                told['drive'], told['sensor'], told['accepted'], told['no_echo'], told['unexplained'], strict=True
+                result['drive'],
+                result['sensor'],
+                result['accepted'],
+                result['no_echo'],
+                result['unexplained'],
+                strict=True,
             )
             for drive, sensor, *three in marks:
                 counts[drive, sensor] += three
-            cells = {value: cells[value] + told['cells'][value] for value in cells}
+            cells = {value: cells[value] + result['cells'][value] for value in cells}
         cells['-1'] += found.tiling.grid.size - sum(cells.values())
         found.counts, found.cells = counts, cells
         sums: dict[str, NDArray[np.int64]] = {}
-        for told in judged:
-            for kind, (*index, numbers) in told['health'].items():
+        for result in judged:
+            for kind, (*index, numbers) in result['health'].items():
                 size = (len(found.sensor_names), BINS)[: len(index)]
                 np.add.at(sums.setdefault(kind, np.zeros(size, np.int64)), tuple(index), numbers)
         found.health = health_of_counts(found.sensor_names, sums) if sums else {}

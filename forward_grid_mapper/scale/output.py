@@ -1,13 +1,13 @@
-"""What a job leaves behind: the files of any run where the map is small enough, and files in parts where it is not.
+"""The results of a job: the usual files if the map is small enough, otherwise files in parts.
 
-Beyond `LARGEST` cells no file holds a whole map:
+Beyond `LARGEST` cells no file contains the whole map:
 
-    maps.zarr       live_map, ml_map, uncertainty_map and dynamic in chunks; 0 is the full resolution, and each level
-                    after it has half as many cells a side, the largest of four, down to `OVERVIEW`
-    tiles/          each map of `REGION` x `REGION` cells at a time as map_server reads it, and index.json
-    maps.png        the coarsest level
+maps.zarr       live_map, ml_map, uncertainty_map and dynamic in chunks; 0 is the full resolution, and each further
+                level has half as many cells a side, the largest of four, down to `OVERVIEW`
+tiles/          each map in parts of `REGION` x `REGION` cells for map_server, and index.json
+maps.png        the coarsest level
 
-Whatever the size, tasks.csv has what every task took.
+For any size, tasks.csv contains the time and memory of every task.
 """
 
 from __future__ import annotations
@@ -41,20 +41,20 @@ from .mapping import Found, Say
 from .work_folder import outcome_in, read_arrays
 
 LARGEST = 16_000_000
-"""Cells up to which maps are written whole: 4000 x 4000, which is 400 m with cells of 0.1 m."""
+"""Most cells of maps in one file: 4000 x 4000, which is 400 m with cells of 0.1 m."""
 
 REGION = 1024
-"""Cells along the side of a chunk, and of a tile for map_server."""
+"""Cells along the side of a chunk, and of a part for map_server."""
 
 OVERVIEW = 2400
-"""Cells along the longer side of the coarsest level, at most: more cannot be told apart in a picture."""
+"""Most cells along the longer side of the coarsest level: more cannot be distinguished in a picture."""
 
 LAYERS: Mapping[str, tuple[str, Any]] = {
     'live_map': ('live', np.float32),
     'ml_map': ('ml', np.int8),
     'uncertainty_map': ('uncertainty', np.float32),
 }
-"""The maps by their names in files: those of `maps.npz` of a tile, and the type of their values."""
+"""The maps by their names in files: names in a tile's `maps.npz`, and types of their values."""
 
 TITLES = {
     'live_map': 'Standard map',
@@ -71,7 +71,7 @@ def write_output(
     Raises
     ------
     OutputError
-        If something cannot be written.
+        If a file cannot be written.
     """
     grid = found.tiling.grid
     large = grid.size > LARGEST
@@ -114,7 +114,7 @@ def _write_whole(folder: Path, job: Job, found: Found, parameters: Parameters) -
 
 
 def _map_set(found: Found, parameters: Parameters, layers: Mapping[str, NDArray[Any]]) -> MapSet:
-    """Return maps without the readings, which nobody holds."""
+    """Return maps without readings, which are not in memory."""
     nothing = np.zeros(0)
     none = Readings.from_columns(x=nothing, y=nothing, yaw=nothing, z=nothing, z_max=nothing, half_angle=nothing)
     return MapSet(
@@ -149,13 +149,13 @@ def layers_in(job: Job, box: Grid) -> dict[str, NDArray[Any]]:
 
 
 def _dynamic(job: Job, tiling: Tiling, box: Grid) -> NDArray[np.float32]:
-    """Return the sum of what tiles counted in their boxes, which reach into those of others."""
+    """Return the sum of the counts of tiles in their boxes, which overlap."""
     out = np.zeros(box.shape, np.float32)
     for tile in tiling.tiles:
-        told = outcome_in(job.folder.tile(tile.row, tile.column, 'ground.npz'))
-        if told is None or not told['readings']:
+        result = outcome_in(job.folder.tile(tile.row, tile.column, 'ground.npz'))
+        if result is None or not result['readings']:
             continue
-        of = Grid(*told['box'])
+        of = Grid(*result['box'])
         part = common_part(of, box)
         if part.size:
             (values,) = read_arrays(job.folder.tile(tile.row, tile.column, 'judged.npz'), 'dynamic')
@@ -193,7 +193,7 @@ def _regions(shape: tuple[int, int]) -> range:
 def _write_parts(
     folder: Path, job: Job, found: Found, cluster: Cluster, say: Say
 ) -> tuple[dict[str, NDArray[Any]], int]:
-    """Have workers write the parts; return the coarsest maps, and how many cells along a side one of theirs is."""
+    """Let workers write the parts; return the coarsest maps, and how many cells a side one of theirs has."""
     import zarr
 
     grid, levels = found.tiling.grid, levels_of(found.tiling.grid)
@@ -204,8 +204,8 @@ def _write_parts(
     for level in range(levels + 1):
         regions = _regions(shape_of(grid, level))
         work, name = (write_region, 'writing') if level == 0 else (write_overview_of, f'writing overview {level}')
-        for done, (_, told) in enumerate(cluster.each(name, work, job, regions, str(folder), level), 1):
-            index += told.get('files', [])
+        for done, (_, result) in enumerate(cluster.each(name, work, job, regions, str(folder), level), 1):
+            index += result.get('files', [])
             say(f'{name}: {done:,} of {len(regions):,}')
     index.sort(key=lambda entry: (entry['map'], entry['origin'][1], entry['origin'][0]))
     with output_errors(folder):
@@ -221,7 +221,7 @@ def _array(folder: Path, level: int, name: str) -> Path:
 
 
 def _create(path: Path, grid: Grid, levels: int) -> None:
-    """Make empty arrays of all levels, in version 2 of the format, which all versions of zarr read."""
+    """Create empty arrays of all levels, in version 2 of the format, which all versions of zarr read."""
     import zarr
 
     version: dict[str, Any] = {} if zarr.__version__.startswith('2.') else {'zarr_format': 2}
@@ -248,7 +248,7 @@ def _create(path: Path, grid: Grid, levels: int) -> None:
 
 @task
 def write_region(job: Job, number: int, folder: str, level: int) -> dict[str, Any]:
-    """Write a region of full resolution: chunks, and tiles for map_server where anything is known."""
+    """Write a region at full resolution: chunks, and parts for map_server unless all cells are unknown."""
     import zarr
 
     grid, target = plan_of(job.folder, job.size).tiling.grid, Path(folder)

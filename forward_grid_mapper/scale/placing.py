@@ -1,4 +1,4 @@
-"""The first step, drive by drive: readings get their poses, and go to the tiles that they touch."""
+"""The first step, drive by drive: readings get their poses, and are written to the tiles that they touch."""
 
 from __future__ import annotations
 
@@ -24,18 +24,19 @@ from .tables import columns_of, write_table
 from .work_folder import read_json, write_json
 
 MOST_POINTS = 2000
-"""Points of a drive's path that are kept for the picture."""
+"""Most points of a drive's path in the picture."""
 
 
 @task
 def place(job: Job, number: int, recordings: Recordings) -> dict[str, Any]:
-    """Place the readings of a drive and part them by tile; return what is known of the drive.
+    """Place the readings of a drive and divide them by tile; return the data of the drive.
 
-    A drive that cannot be mapped is no error of the job yet: it is returned with `error`, so that all such are named.
+    If a drive cannot be mapped, this is not yet an error of the job: `error` is returned, so that all such drives are
+    reported.
     """
-    told = job.folder.drive(number)
-    if told.exists():
-        return read_json(told)
+    file = job.folder.drive(number)
+    if file.exists():
+        return read_json(file)
     path, p = Path(recordings.paths[number]), job.parameters
     topics = list(recordings.range_topics) if recordings.range_topics else None
     try:
@@ -63,13 +64,13 @@ def place(job: Job, number: int, recordings: Recordings) -> dict[str, Any]:
     _part_readings(job, number, readings, boxes)
     rows, columns = np.nonzero(traversed_cells(readings, grid))
     _part_cells(job, number, rows + grid.row, columns + grid.column)
-    # last, so that whoever finds it finds all the rest
-    write_json(told, known)
-    return read_json(told)
+    # last, so that all other files exist if it does
+    write_json(file, known)
+    return read_json(file)
 
 
 def _part_readings(job: Job, number: int, readings: Readings, boxes: Any) -> None:
-    """Write the readings that touch each tile or come as near as its first map looks."""
+    """Write the readings that touch each tile, or are within the surroundings that its first map uses."""
     cell = job.parameters.grid.resolution
     for (row, column), which in by_tile(boxes, cell, edge_of(job.size, cell), FIRST_AROUND).items():
         columns = columns_of(readings.select(which))

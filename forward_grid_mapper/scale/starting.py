@@ -1,4 +1,4 @@
-"""Processes are started whole: no signal comes between."""
+"""Starts processes without interruption by signals."""
 
 from __future__ import annotations
 
@@ -12,12 +12,11 @@ from typing import Any
 
 @contextmanager
 def signals_later() -> Iterator[None]:
-    """Keep signals until the block is done: processes whose start is interrupted show tracebacks of their own.
+    """Defer signals until the end of the block: processes that are interrupted at their start print tracebacks.
 
-    Processes that are started in the block never hear of Ctrl-C, which a terminal sends to them as well; they inherit
-    the mask.
+    Processes that are started in the block inherit the mask, and so ignore Ctrl-C, which terminals send to them too.
     """
-    # with its first process multiprocessing starts this one, and unmasks Ctrl-C
+    # multiprocessing would start it with its first process, and unmask Ctrl-C
     resource_tracker.ensure_running()
     kept: list[int] = []
     before: dict[signal.Signals, Any] = {}

@@ -18,11 +18,11 @@ from .work_folder import whole
 COLUMNS = tuple(field.name for field in fields(Readings) if field.name != 'sensor_names')
 
 FEW_VALUES = ['z_max', 'half_angle', 'sigma', 'sensor', 'drive']
-"""Columns that repeat themselves, so that a dictionary of values makes them small."""
+"""Columns with few different values, for which a dictionary saves space."""
 
 
 def write_table(path: Path, columns: Mapping[str, NDArray[Any]]) -> None:
-    """Write columns of one length.
+    """Write columns of equal lengths.
 
     Raises
     ------
@@ -37,7 +37,7 @@ def write_table(path: Path, columns: Mapping[str, NDArray[Any]]) -> None:
 
 def read_table(path: Path) -> dict[str, NDArray[Any]]:
     """Read columns."""
-    # not through a data set, which would take columns from the names of folders
+    # not as a data set, which would take columns from names of folders
     with path.open('rb') as file:
         table = pq.read_table(file)
     return {name: table.column(name).to_numpy() for name in table.column_names}

@@ -1,14 +1,14 @@
-"""What is done with a tile by a worker, which holds it with its halo: tasks of a job and the number of a tile.
+"""Tasks for a tile, which a worker loads with its halo: functions of a job and the number of a tile.
 
-What a task makes is a file of the tile, and what it returns is small. If the file is there already, it only returns
-what it did then: so a task may be run again whenever a worker died or the client was interrupted.
+A task writes a file of the tile, and returns little data. If the file exists already, the task only returns its
+earlier result: so tasks can be repeated after a worker died or the client was interrupted.
 
-    readings.parquet    its readings and those near it, in canonical order
-    ground.npz          which cells of the core were traversed
-    normals.npz         surface normals of the core
-    search_0007.npz     the window as a search left it; the number says which came first
-    maps.npz            the maps of the core
-    judged.npz          echoes from nothing, in the box
+readings.parquet    its readings and those near it, in canonical order
+ground.npz          the traversed cells of the core
+normals.npz         surface normals of the core
+search_0007.npz     the window after a search; searches are numbered in their order
+maps.npz            the maps of the core
+judged.npz          echoes that no object explains, in the box
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ FIRST = 0
 
 
 class TileFiles:
-    """A tile of a job, with the files of it and of its neighbours."""
+    """A tile of a job, with its files and those of its neighbours."""
 
     def __init__(self, job: Job, number: int) -> None:
         self.job, self.number = job, number
@@ -55,20 +55,20 @@ class TileFiles:
 
     @property
     def readings(self) -> Readings:
-        """All that is kept of the tile, in canonical order."""
+        """All stored readings of the tile, in canonical order."""
         return readings_of(read_table(self.path('readings.parquet')), self.plan.sensor_names)
 
     def given(self, step: int | None = None, around: float = 0.0, ml: bool = False) -> Given:
-        """Return what is known around the tile, as `Mosaic.given` does.
+        """Return readings and maps around the tile, as `Mosaic.given` does.
 
         Parameters
         ----------
         step : int, optional
-            The map as it was before that search; by default as it is.
+            The map before that search; by default the current one.
         around : float
-            Metres around the core whose readings are given.
+            Metres around the core within which readings are used.
         ml : bool
-            Whether the map that is handed out is needed.
+            Whether the final ML map is needed.
         """
         kept, p = self.readings, self.job.parameters
         boxes = boxes_of(kept, p)
@@ -76,7 +76,7 @@ class TileFiles:
         box = self.tiling.box(self.number, readings, p)
         own = self.tiling.owners(readings) == self.number
         traversed = self._cores('ground.npz', 'traversed', box, np.zeros(box.shape, np.bool_))
-        # the first map is made without its neighbours
+        # the first map does not depend on the neighbours
         occupied = np.zeros(box.shape, np.uint8) if step == FIRST else self._occupied(box, step)
         normals = self._cores('normals.npz', 'normals', box, np.zeros((2, *box.shape), np.float32))
         shown = np.full(box.shape, UNKNOWN, np.int8)
@@ -85,7 +85,7 @@ class TileFiles:
         return Given(self.tile, box, readings, own, traversed, occupied, normals, shown)
 
     def _cores(self, file: str, name: str, box: Grid, out: NDArray[Any]) -> NDArray[Any]:
-        """Fill an array of a box with what the tiles in it have."""
+        """Fill an array of a box with the data of the tiles in it."""
         for number in self.tiling.meeting(box):
             core = self.tiling.tiles[number].core
             part = common_part(core, box)
@@ -98,12 +98,12 @@ class TileFiles:
         return out
 
     def _occupied(self, box: Grid, step: int | None) -> NDArray[np.uint8]:
-        """Return the map in a box: the windows of all searches in their order, of which those of one step are apart."""
+        """Return the map in a box: the windows of all searches in order; those of the same step do not overlap."""
         out = np.zeros(box.shape, np.uint8)
         found = []
         for number in self.tiling.meeting(box, window=True):
             steps = [s for s in self._steps(number) if step is None or s < step]
-            # what a first search says beyond its core is not kept, so the first one is always shown below
+            # the result of a first search outside of its core is not used, so the first one is always below the others
             found += [(s, number) for s in {min(steps), max(steps)}] if steps else []
         for s, number in sorted(found):
             of = self.tiling.tiles[number]
@@ -126,7 +126,7 @@ def searched(step: int) -> str:
 
 
 def prior_of_core(given: Given, occupied: NDArray[np.bool_], job: Job) -> float:
-    """Return the part of a map's log prior, shape `box.shape`, that the cells of the core have."""
+    """Return the sum of a map's log prior, shape `box.shape`, over the cells of the core."""
     prior = wall_prior(job.parameters.search, given.traversed.ravel(), given.box.resolution)
     mine = np.zeros(given.box.shape, np.uint8)
     core = given.box.window(given.tile.core)
@@ -136,7 +136,7 @@ def prior_of_core(given: Given, occupied: NDArray[np.bool_], job: Job) -> float:
 
 @task
 def gather(job: Job, number: int) -> dict[str, Any]:
-    """Put together what the drives have for a tile; return its box and how many readings touch it."""
+    """Combine the data of the drives for a tile; return its box and the number of readings that touch it."""
     files = TileFiles(job, number)
     target = files.path('ground.npz')
     if (before := outcome_in(target)) is not None:
@@ -157,7 +157,7 @@ def gather(job: Job, number: int) -> dict[str, Any]:
         cells = read_table(path)
         inside = cells['row'] - tile.core.row, cells['column'] - tile.core.column
         traversed[inside] = True
-    # the drives' parts are kept: an interrupted job may be asked for them again
+    # the files of the drives are kept, since an interrupted job may need them again
     given = files.given()
     box = given.box
     outcome = {
@@ -170,7 +170,7 @@ def gather(job: Job, number: int) -> dict[str, Any]:
 
 
 def _parts(job: Job, kind: str, tile: Tile, plan: Plan) -> Iterator[tuple[Path, int]]:
-    """Yield the files that drives of the map have for a tile, with the numbers of the drives."""
+    """Yield the files of drives for a tile, with the numbers of the drives in the map."""
     for path in sorted(job.folder.parts(kind, tile.row, tile.column).glob('drive_*.parquet')):
         if _number(path) in plan.order:
             yield path, plan.order[_number(path)]
@@ -192,7 +192,7 @@ def normals(job: Job, number: int) -> dict[str, Any]:
 
 @task
 def search(job: Job, number: int, step: int) -> dict[str, Any]:
-    """Search a tile: at first by itself, later with all others held; return where its map changed."""
+    """Search a tile: first separately, later with all others fixed; return where its map changed."""
     files = TileFiles(job, number)
     target = files.path(searched(step))
     if (before := outcome_in(target)) is not None:
@@ -241,7 +241,7 @@ def finish(job: Job, number: int) -> dict[str, Any]:
 
 @task
 def judge(job: Job, number: int) -> dict[str, Any]:
-    """Ask what the map says of the readings whose sensors were in the core; return counts by drive and sensor."""
+    """Judge the readings whose sensors were in the core by the map; return counts by drive and sensor."""
     files = TileFiles(job, number)
     target = files.path('judged.npz')
     if (before := outcome_in(target)) is not None:
@@ -267,5 +267,5 @@ def judge(job: Job, number: int) -> dict[str, Any]:
 
 
 def _sparse(counts: Mapping[str, NDArray[np.int64]]) -> dict[str, list[list[int]]]:
-    """Return where counts are not 0, and what they are."""
+    """Return the indices and values of counts that are not 0."""
     return {kind: [index.tolist() for index in (*np.nonzero(of), of[of != 0])] for kind, of in counts.items()}

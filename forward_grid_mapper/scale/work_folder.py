@@ -1,14 +1,14 @@
-"""The folder of a job: all that workers tell each other, in files that are whole or not there.
+"""The folder of a job: all data that workers exchange, in files that are complete or do not exist.
 
-    manifest.json                                   what the job is; another one is refused
-    drives/0007.json                                what is known of a drive, once it is placed
-    readings/row=3/column=-1/drive_0007.parquet     readings of a drive that touch a tile or come near it
-    ground/row=3/column=-1/drive_0007.parquet       cells of a tile that the drive traversed
-    plan.json                                       the grid and the order of drives, once all are placed
-    tiles/3_-1/                                     what is known of a tile: see `tile_work`
+manifest.json                                   description of the job; the folder of another job is refused
+drives/0007.json                                data of a drive, once it is placed
+readings/row=3/column=-1/drive_0007.parquet     readings of a drive that touch a tile or come near it
+ground/row=3/column=-1/drive_0007.parquet       cells of a tile that the drive traversed
+plan.json                                       the grid and the order of drives, once all are placed
+tiles/3_-1/                                     data of a tile: see `tile_work`
 
-A file is written beside its place and renamed. So a worker that dies leaves nothing half written, and what is there
-need not be made again: whoever is to make a file looks for it first.
+A file is written under another name and renamed. So a worker that dies leaves no incomplete file, and an existing one
+need not be made again: tasks check for it first.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ Arrays = Mapping[str, NDArray[Any]]
 
 @dataclass(frozen=True)
 class WorkFolder:
-    """Where the files of a job are."""
+    """The paths of the files of a job."""
 
     path: str
 
@@ -46,7 +46,7 @@ class WorkFolder:
 
     @property
     def manifest(self) -> Path:
-        """What the job is."""
+        """The description of the job."""
         return self.root / 'manifest.json'
 
     @property
@@ -60,24 +60,24 @@ class WorkFolder:
         return any((self.root / 'drives').glob('*.json'))
 
     def drive(self, number: int) -> Path:
-        """Return where it says what is known of a drive."""
+        """Return the path of a drive's data."""
         return self.root / 'drives' / f'{number:04d}.json'
 
     def parts(self, kind: str, row: int, column: int) -> Path:
-        """Return the folder of what drives have for a tile; `kind` is readings or ground."""
+        """Return the folder of the drives' data for a tile; `kind` is readings or ground."""
         return self.root / kind / f'row={row}' / f'column={column}'
 
     def tile(self, row: int, column: int, name: str) -> Path:
-        """Return where a file of a tile is."""
+        """Return the path of a file of a tile."""
         return self.root / 'tiles' / f'{row}_{column}' / name
 
     def begin(self, job: Mapping[str, Any]) -> bool:
-        """Make the folder for a job, or go on in it; return whether it was begun before.
+        """Create the folder for a job, or continue in it; return whether it existed before.
 
         Raises
         ------
         OutputError
-            If the folder holds another job, or something else, or cannot be written.
+            If the folder belongs to another job, contains anything else, or cannot be written.
         """
         described = json.loads(json_text(job))
         if self.manifest.exists():
@@ -102,12 +102,12 @@ PARTIAL = '.partial'
 
 @contextlib.contextmanager
 def whole(path: Path) -> Iterator[Path]:
-    """Give a name to write to, which becomes `path` when the block succeeds; nothing is left if it fails.
+    """Yield a name to write to, which is renamed to `path` when the block succeeds; if it fails, no file remains.
 
     Raises
     ------
     OutputError
-        If it cannot be written.
+        If the file cannot be written.
     """
     partial = path.with_name(f'.{path.name}.{uuid.uuid4().hex[:8]}{PARTIAL}')
     with output_errors(path):
@@ -121,7 +121,7 @@ def whole(path: Path) -> Iterator[Path]:
 
 
 def write_json(path: Path, data: Mapping[str, Any]) -> None:
-    """Write a mapping; what is there stays until the new file is on the disk."""
+    """Write a mapping; an existing file is kept until the new one is on the disk."""
     with whole(path) as partial, partial.open('w', encoding='utf-8') as file:
         file.write(json_text(data))
         file.flush()
@@ -129,7 +129,7 @@ def write_json(path: Path, data: Mapping[str, Any]) -> None:
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """Read what `write_json` wrote.
+    """Read a file of `write_json`.
 
     Raises
     ------
@@ -144,7 +144,7 @@ def read_json(path: Path) -> dict[str, Any]:
 
 
 def write_arrays(path: Path, arrays: Arrays, outcome: Mapping[str, Any]) -> None:
-    """Write arrays, and a mapping of plain values that goes with them."""
+    """Write arrays, and a mapping of plain values."""
     packed = io.BytesIO()
     np.savez(packed, outcome=np.array(json_text(outcome)), **arrays)  # type: ignore[arg-type]
     with whole(path) as partial:

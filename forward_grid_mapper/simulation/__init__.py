@@ -1,1 +1,1 @@
-"""Small worlds with known ground truth, sonars that measure them, drives through them, and scores of their maps."""
+"""Small worlds with ground truth, simulated sonars, drives through them, and scores of their maps."""

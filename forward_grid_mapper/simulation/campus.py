@@ -1,8 +1,8 @@
-"""A campus: many buildings beside streets, and drives from building to building, each by a seed of its own.
+"""A campus: many buildings along streets, and drives from building to building, each with its own seed.
 
-The buildings are those of `building_world` with an entrance in the west, in rows, as many in a row as there are rows or
-one more. A robot goes through all rooms of a building, out of its entrance, by the street to the next one, and so on;
-at the last building it turns back. So drives meet in buildings, and together they see the streets.
+The buildings are those of `building_world` with an entrance in the west, in rows; a row has as many buildings as there
+are rows, or one more. A robot drives through all rooms of a building, out of its entrance, along the street to the next
+one, and so on; at the last building it turns back. So drives meet in buildings, and together they map the streets.
 """
 
 from __future__ import annotations
@@ -27,20 +27,20 @@ ENTRANCE = 8.85
 """Metres from the lower edge of a building's plot to the middle of its entrance."""
 
 BESIDE, STREET = 2.0, -3.0
-"""Metres from a plot's corner to the way along the entrances (to the west), and to the street (in y)."""
+"""Metres from a plot's corner to the lane along the entrances (to the west), and to the street (in y)."""
 
 SPACING = 0.18
 """Metres between sweeps."""
 
 RATE = 10.0
-"""Odometry between the sweeps, Hz: a tenth of what a bag of 50 Hz holds, in which odometry takes the most room."""
+"""Rate of odometry between the sweeps, Hz: a fifth of `ODOMETRY_RATE`, since odometry fills most of a bag."""
 
-LATER = 600 * NANOSECONDS
-"""From the start of a drive to that of the next one."""
+START_INTERVAL = 600 * NANOSECONDS
+"""Nanoseconds from the start of a drive to that of the next one."""
 
 
 def campus_world(buildings: int) -> World:
-    """Return a campus; with 100 buildings it has 600 x 420 m. All that lies outdoors is free in the true map."""
+    """Return a campus; with 100 buildings it has 600 x 420 m. All cells outdoors are free in the true map."""
     across = math.ceil(math.sqrt(buildings))
     up = math.ceil(buildings / across)
     one = building_world(entrance=True)
@@ -59,12 +59,12 @@ def campus_world(buildings: int) -> World:
 
 
 def corner(number: int, buildings: int) -> tuple[float, float]:
-    """Return where the plot of a building begins, metres; successive ones are neighbours."""
+    """Return the corner of a building's plot, metres; successive buildings are neighbours."""
     across = math.ceil(math.sqrt(buildings))
     row, column = divmod(number, across)
     # every second row backwards
     column = across - 1 - column if row % 2 else column
-    # a way leads past the plots in the west, and a street past those in the south
+    # a lane leads past the plots in the west, and a street past those in the south
     return column * PITCH[0] * 0.1 + 10.0, row * PITCH[1] * 0.1 + 15.0
 
 
@@ -76,7 +76,7 @@ def _visited(first: int, buildings: int) -> Iterator[int]:
 
 
 def _way(one: tuple[float, float], other: tuple[float, float]) -> Floats:
-    """Return the way from the entrance of a building to that of another, shape (P, 2), metres."""
+    """Return the path from the entrance of a building to that of another, shape (P, 2), metres."""
     points = [
         (one[0] - BESIDE, one[1] + ENTRANCE),
         (one[0] - BESIDE, one[1] + STREET),
@@ -87,7 +87,7 @@ def _way(one: tuple[float, float], other: tuple[float, float]) -> Floats:
 
 
 def campus_path(length: float, first: int, buildings: int, rng: np.random.Generator) -> Floats:
-    """Return a way of `length` metres that begins in building `first`, shape (P, 2), no two tours quite alike."""
+    """Return a path of `length` metres that begins in building `first`, shape (P, 2); its tours of a building vary."""
     tour = building_tour()
     path, last = np.zeros((0, 2)), None
     visited = _visited(first, buildings)
@@ -103,7 +103,7 @@ def campus_path(length: float, first: int, buildings: int, rng: np.random.Genera
 
 
 def _along(path: Floats) -> Floats:
-    """Return how far along a path each of its points is, metres."""
+    """Return the distance along a path to each of its points, metres."""
     return np.concatenate([np.zeros(min(len(path), 1)), np.cumsum(np.hypot(*np.diff(path, axis=0).T))])
 
 
@@ -120,15 +120,15 @@ def campus_drive(
     seed: int = 0,
     sonars: SonarArray | None = None,
 ) -> Recording:
-    """Return one of the drives through a campus; it depends on its number and on nothing that other drives do.
+    """Return a drive through a campus; it depends on its number, but not on other drives.
 
     Parameters
     ----------
     number : int
-        Of the drive, from 0; it begins in building `number` modulo `buildings`, `LATER` after the one before.
+        Of the drive, from 0; it begins in building `number` modulo `buildings`, `START_INTERVAL` after the one before.
     buildings : int
     readings : int
-        How many it takes at the least: a sweep is taken whole.
+        Smallest number of readings: the last sweep is complete.
     noise : NoiseModel
     seed : int
         Of all drives together.
@@ -141,5 +141,5 @@ def campus_drive(
     path = campus_path(count * SPACING, number % buildings, buildings, rng)
     sweeps = np.array((np.arange(count) + 0.5) * SPACING, np.float64)
     of_noise = int(rng.integers(2**62))
-    start = START + number * LATER
+    start = START + number * START_INTERVAL
     return drive_sweeps(_world(buildings), path, sweeps, sonars, noise, of_noise, start=start, rate=RATE)

@@ -1,13 +1,12 @@
-"""Drift of wheel odometry: what makes the exact odometry of a simulated drive like a robot's.
+"""Drift of wheel odometry: adds errors to the exact odometry of a simulated drive.
 
 Each small motion is measured in the robot's frame, travel and turn, and summed up with errors:
 
     travel' = travel · (1 + scale) + noise · √travel
-    turn' = turn · (1 + turn_scale) + bias · travel + noise · √travel
+    turn'   = turn · (1 + turn_scale) + bias · travel + noise · √travel
 
-`scale`, `turn_scale`, `bias` and `heading` (the direction in which the robot really drives when odometry says straight
-on) are drawn once for a drive, as wheels and mounts are; noise is drawn for every 5 cm, with the heavy tails of wheels
-that slip.
+`scale`, `turn_scale`, `bias` and `heading` (the direction of driving in the frame of odometry) are drawn once for a
+drive, since they depend on wheels and mounts; noise is drawn for every 5 cm, with the heavy tails of wheel slip.
 """
 
 from __future__ import annotations
@@ -25,15 +24,15 @@ from .drive import Recording
 Floats = NDArray[np.float64]
 
 STEP = 0.05
-"""Metres of one draw of noise; 0.15 rad of turning count as much."""
+"""Metres of driving for each draw of noise; 0.15 rad of turning count as much."""
 
 TAIL = 5.0
-"""Degrees of freedom of Student's t that noise of yaw is drawn from; it has the stated variance."""
+"""Degrees of freedom of Student's t for the noise of yaw; it has the stated variance."""
 
 
 @dataclass(frozen=True)
 class Drift:
-    """How far odometry drifts. What a drive has of `bias`, `scale`, `turn_scale` and `heading` is drawn with these σ.
+    """Standard deviations of the errors of odometry: of noise, and of the values that are drawn once for a drive.
 
     Attributes
     ----------
@@ -67,7 +66,7 @@ LEVELS = {
 
 
 def drifted(poses: Floats, drift: Drift, seed: int) -> Floats:
-    """Return what odometry makes of exact poses.
+    """Return the drifting odometry for exact poses.
 
     Parameters
     ----------
@@ -79,7 +78,7 @@ def drifted(poses: Floats, drift: Drift, seed: int) -> Floats:
     Returns
     -------
     float64, shape (M, 3)
-        From the same first pose on.
+        It begins with the same pose.
     """
     rng = np.random.default_rng([seed, 77])
     bias, scale, turn_scale, heading = rng.standard_normal(4) * (
@@ -111,7 +110,7 @@ def drifted(poses: Floats, drift: Drift, seed: int) -> Floats:
 
 
 def with_drift(recording: Recording, drift: Drift, seed: int) -> Recording:
-    """Return a recording whose odometry drifts, and whose readings are placed by it; `robot` stays the truth."""
+    """Return a recording with drifting odometry, and readings placed by it; `robot` keeps the true poses."""
     true = np.array([message.pose for message in recording.odometry], np.float64)
     true[:, 2] = np.unwrap(true[:, 2])
     measured = drifted(true, drift, seed)

@@ -1,4 +1,4 @@
-"""Drives through a world, recorded as a robot would: odometry and range messages, and the truth beside them."""
+"""Drives through a world, recorded like those of a robot: odometry and range messages, with ground truth."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _PERSON_DISTANCE = 1.0  # metres behind the robot
 
 @dataclass(frozen=True)
 class Recording:
-    """What a robot recorded on one drive. The odometry is exact: its frame is the world's.
+    """The recording of a drive. The odometry is exact: its frame is that of the world.
 
     Attributes
     ----------
@@ -60,7 +60,7 @@ def drive(
     seed: int = 0,
     person: bool = False,
 ) -> Recording:
-    """Drive straight from waypoint to waypoint and take a sweep of all sonars every `sweep_spacing` metres.
+    """Drive straight from waypoint to waypoint, with a sweep of all sonars every `sweep_spacing` metres.
 
     Parameters
     ----------
@@ -69,7 +69,7 @@ def drive(
     sonars : SonarArray, optional
         Default: a ring of 24.
     person : bool
-        Whether someone walks about a metre behind the robot, who is no part of the true map.
+        Whether a person walks about a metre behind the robot; people are not on the true map.
 
     Raises
     ------
@@ -92,10 +92,10 @@ def drive_sweeps(
     start: int = START,
     rate: float = ODOMETRY_RATE,
 ) -> Recording:
-    """Drive as `drive` does, with a sweep at each of the increasing distances `sweeps` along the path, in metres.
+    """Drive as in `drive`, with a sweep at each of the increasing distances `sweeps` along the path, metres.
 
-    `walker`, shape (T, 2), is where somebody else walks at each sweep, metres; NaN for nowhere. `start` is the stamp at
-    which the robot sets out, nanoseconds, and `rate` that of odometry between the sweeps, Hz.
+    `walker`, shape (T, 2), is the position of another person at each sweep, metres; NaN for none. `start` is the stamp
+    at the begin, nanoseconds, and `rate` that of odometry between the sweeps, Hz.
     """
     waypoints = np.asarray(waypoints, np.float64)
     if blocked(waypoints, world.segments):
@@ -121,9 +121,9 @@ def drive_sweeps(
 def door_drive(
     n: int = 1, noise: NoiseModel = NOISE_FREE, seed: int = 0, sonars: SonarArray | None = None
 ) -> Recording:
-    """Pass the door of `door_world` with exactly `n` sweeps taken in front of it, as in the paper's Fig. 4.
+    """Pass the door of `door_world` with exactly `n` sweeps in front of it, as in the paper's Fig. 4.
 
-    These sweeps lie within 0.1 m of the door's axis; the others are 0.27 m apart and keep 1 m away from it.
+    These sweeps are within 0.1 m of the door's axis; the others are 0.27 m apart, and at least 1 m away from it.
     """
     world = door_world()
     door = world.doors[0]
@@ -136,9 +136,9 @@ def door_drive(
 
 
 def passing_drive(seed: int = 0, noise: NoiseModel = NOISY, sonars: SonarArray | None = None) -> Recording:
-    """Drive along `doors_world` while a person comes the other way and walks by, as in the paper's Fig. 5.
+    """Drive along `doors_world` while a person comes from the other end and walks by, as in the paper's Fig. 5.
 
-    The person walks twice as fast as the robot, along the other side of the corridor, and leaves at the robot's start.
+    The person walks twice as fast as the robot, on the other side of the corridor, and leaves where the robot started.
     """
     world = doors_world()
     start, end, y = 1.05, 10.35, 5.85
@@ -171,9 +171,9 @@ def building_drive(
     person: bool = False,
     sonars: SonarArray | None = None,
 ) -> Recording:
-    """Drive `laps` times through every room of `building_world`, none quite like the other: 1750 sweeps each.
+    """Drive `laps` times through every room of `building_world`, on varying paths: 1750 sweeps each.
 
-    By default 16 sonars with cones of 30 degrees, which makes 28 000 readings a lap.
+    By default 16 sonars with cones of 30 degrees, which gives 28 000 readings a lap.
     """
     world, tour = building_world(), building_tour()
     rng = np.random.default_rng([seed, laps])
@@ -186,7 +186,7 @@ def building_drive(
 
 
 def _people(world: World, robot: Floats, rng: np.random.Generator) -> Floats:
-    """Return where the person stands at each sweep, shape (T, 2), NaN where there is no space behind the robot."""
+    """Return the person's position at each sweep, shape (T, 2), NaN if there is no space behind the robot."""
     distance = np.clip(rng.normal(_PERSON_DISTANCE, 0.1, len(robot)), 0.7, 1.3)
     behind = robot[:, 2] + np.pi + rng.normal(0.0, 0.1, len(robot))
     free, _ = cast(robot[:, :2], behind[:, None], world.segments, 3.0)
@@ -197,7 +197,7 @@ def _people(world: World, robot: Floats, rng: np.random.Generator) -> Floats:
 
 def _odometry(trajectory: Trajectory, sweeps: NDArray[np.int64], start: int, rate: float) -> list[OdometryMessage]:
     regular = np.arange(0.0, trajectory.time[-1], 1.0 / rate)
-    # motion is linear between corners: with these among the messages, interpolating the rest makes no error
+    # motion is linear between corners: with messages at corners, interpolation is exact
     seconds = np.concatenate([regular, trajectory.time])
     ticks = np.union1d(np.round(seconds * NANOSECONDS).astype(np.int64), sweeps)
     poses = trajectory.pose_at(ticks / NANOSECONDS)

@@ -12,12 +12,12 @@ _SLACK = 1e-9  # so that no ray slips through where two walls meet
 
 
 def cast(origins: Floats, angles: Floats, segments: Floats, reach: float) -> tuple[Floats, NDArray[np.int64]]:
-    """Return how far each ray gets, and what it hits.
+    """Return the length of each ray, and the wall that it hits.
 
     Parameters
     ----------
     origins : float64, shape (N, 2)
-        Where the rays start, metres in the map frame.
+        Origins of the rays, metres in the map frame.
     angles : float64, shape (N, R)
         Directions of the R rays from each origin, radians.
     segments : float64, shape (S, 4)
@@ -28,9 +28,9 @@ def cast(origins: Floats, angles: Floats, segments: Floats, reach: float) -> tup
     Returns
     -------
     distance : float64, shape (N, R)
-        Metres; +inf where nothing is hit within reach.
+        Metres; +inf if no wall is within `reach`.
     hit : int64, shape (N, R)
-        Index of the segment that is hit, `NOTHING` where none is.
+        Index of the segment that is hit, `NOTHING` if none.
     """
     distance = np.full(angles.shape, np.inf)
     hit = np.full(angles.shape, NOTHING, np.int64)
@@ -40,7 +40,7 @@ def cast(origins: Floats, angles: Floats, segments: Floats, reach: float) -> tup
     for start in range(0, len(origins), step):
         part = slice(start, start + step)
         here = origins[part]
-        # successive readings are taken close together: most walls are out of reach of the whole chunk
+        # origins of a chunk are close together, so most walls are out of its reach
         near = np.flatnonzero(np.all((low <= here.max(0)) & (high >= here.min(0)), axis=1))
         if not len(near):
             continue
@@ -68,7 +68,7 @@ def _along_rays(origins: Floats, angles: Floats, segments: Floats) -> Floats:
 
 
 def cast_discs(origins: Floats, angles: Floats, centers: Floats, radius: float) -> Floats:
-    """Return the distance of each ray to the disc of its origin, +inf where it misses; NaN centres are no disc.
+    """Return the distance of each ray to the disc of its origin, +inf without intersection; NaN centres are no discs.
 
     Parameters
     ----------

@@ -1,7 +1,7 @@
-"""Scores of a map against the world it was made in, as in the paper's experiments.
+"""Scores of a map against its simulated world, as in the paper's experiments.
 
-A map is scored at the cells of the world's lattice, whatever its own: a cell is occupied if any part of it is. Unless
-said otherwise a wall counts as found where an occupied cell lies at most one cell away, diagonally too.
+A map with any grid is scored at the cells of the world's lattice: a cell is occupied if any part of it is. Unless
+stated otherwise, a wall is found if an occupied cell is at most one cell away, also diagonally.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ Mask = NDArray[np.bool_]
 VISIBLE_RAYS = 31
 
 SURFACE_DEPTH = 0.2
-"""A wall cell counts as visible if a ray meets it at most so many metres beyond the nearest one of its cone."""
+"""A wall cell is visible if a ray hits it at most so many metres beyond the nearest hit of its cone."""
 
 
 @dataclass(frozen=True)
 class Scores:
-    """How well a map shows a world; shares lie in [0, 1] and are NaN where there is nothing to count.
+    """Scores of a map; fractions are in [0, 1], and NaN if there is nothing to count.
 
     Attributes
     ----------
@@ -50,9 +50,9 @@ class Scores:
         Recall on all other walls.
     column_coverage : float
         Fraction of the visible cells of the other walls with an occupied cell at most one cell *across* the wall. Dots
-        on every second or third cell, which recall forgives, lower it.
+        on every second or third cell lower it, but not recall.
     longest_gap : int
-        Longest run along such a wall, in cells, without coverage in that sense.
+        Longest run of cells along such a wall that are not covered in this sense.
     """
 
     precision: float
@@ -76,17 +76,17 @@ def threshold(probability: NDArray[np.floating]) -> Map:
 
 
 def visible_surface(world: World, readings: Readings, depth: float = math.inf) -> Mask:
-    """Return the wall cells that rays within the readings' cones meet within z_max, smooth ones too.
+    """Return the wall cells that rays within the readings' cones hit within z_max, including smooth ones.
 
-    Nothing but walls stops a ray: what a person hid from a sweep counts as visible.
+    Only walls stop a ray: cells that a person hid from a sweep are visible.
 
     Parameters
     ----------
     world : World
     readings : Readings
     depth : float
-        Leave out what lies more than this many metres behind the nearest wall of the same cone. A sonar answers for the
-        nearest wall alone, so without a bound the surface holds walls that no reading could show.
+        Leave out cells more than this many metres behind the nearest wall of the same cone. A sonar measures only the
+        nearest wall, so without a bound the surface contains walls that no reading could show.
 
     Returns
     -------
@@ -105,7 +105,7 @@ def visible_surface(world: World, readings: Readings, depth: float = math.inf) -
         x = part.x[reading] + distance[met] * np.cos(angles[met])
         y = part.y[reading] + distance[met] * np.sin(angles[met])
         visible[world.grid.cells_of(x, y)] = True
-    # an end of a wall lies on a face, where rounding may tip a hit into the free cell beside it
+    # the end of a wall is on a face of its cell, so rounding may put a hit into the adjacent free cell
     visible &= world.reference == 1
     return visible
 
@@ -118,10 +118,10 @@ def score_map(ml: Map, grid: Grid, world: World, visible: Mask) -> Scores:
     ml : int8, shape `grid.shape`
         1 occupied, 0 free, -1 unknown.
     grid : Grid
-        Where the map lies, in the world's frame; any origin, size and resolution.
+        Grid of the map, in the world's frame; any origin, size and resolution.
     world : World
     visible : bool, shape `world.grid.shape`
-        The cells that recall asks for, from `visible_surface`.
+        The cells for recall, from `visible_surface`.
     """
     whole, inner, reference = _around(world, grid)
     sampled = _sample(ml, grid, whole)
@@ -164,7 +164,7 @@ def _around(world: World, grid: Grid) -> tuple[Grid, tuple[slice, slice], Map]:
 
 
 def _sample(ml: Map, grid: Grid, target: Grid) -> Map:
-    """Return the map on the cells of `target`: the largest value in each, so that small walls survive."""
+    """Return the map at the cells of `target`: the largest value in each, so that thin walls are kept."""
     best = np.full(target.shape, UNKNOWN, np.int8)
     if not grid.size:
         return best
@@ -189,8 +189,8 @@ def _grow(cells: Mask) -> Mask:
     return grown
 
 
-def _coverage(world: World, occupied: Mask, asked: Mask) -> tuple[float, int]:
-    """Return the fraction of `asked` wall cells with an occupied cell across the wall, and the longest run without."""
+def _coverage(world: World, occupied: Mask, wanted: Mask) -> tuple[float, int]:
+    """Return the fraction of `wanted` wall cells with an occupied cell across the wall, and the longest run without."""
     padded = np.pad(occupied, 1)
     covered: list[Mask] = []
     longest = 0
@@ -199,20 +199,20 @@ def _coverage(world: World, occupied: Mask, asked: Mask) -> tuple[float, int]:
         up, right = (1, 0) if abs(segment[2] - segment[0]) >= abs(segment[3] - segment[1]) else (0, 1)
         across = [padded[rows + 1 + step * up, columns + 1 + step * right] for step in (-1, 0, 1)]
         hit = np.logical_or.reduce(across)
-        longest = max(longest, _longest_run(asked[rows, columns] & ~hit))
-        covered.append(hit[asked[rows, columns]])
+        longest = max(longest, _longest_run(wanted[rows, columns] & ~hit))
+        covered.append(hit[wanted[rows, columns]])
     return _share(np.concatenate(covered)), longest
 
 
 def _open_width(sampled: Map, grid: Grid, door: Door) -> float:
-    """Return the widest run, in metres, of ways through the door that are free for two cells before and behind."""
+    """Return the width of the widest passage through the door that is free for two cells on both sides, metres."""
     field = sampled if door.axis == 'x' else sampled.T
     along, across = (door.x, door.y) if door.axis == 'x' else (door.y, door.x)
     first_along, first_across = (grid.column, grid.row) if door.axis == 'x' else (grid.row, grid.column)
     wall = math.floor(across / grid.resolution) - first_across
     low = round((along - door.width / 2) / grid.resolution) - first_along
     count = round(door.width / grid.resolution)
-    # a map that shows the door one cell aside still shows a door
+    # a door that is shifted by one cell still counts
     opening = field[max(wall - 2, 0) : wall + 3, max(low - 1, 0) : low + count + 1]
     run = _longest_run(np.all(opening == 0, axis=0))
     return round(min(run, count) * grid.resolution, 6)

@@ -1,11 +1,11 @@
-"""Sonars on a robot, and what they measure in a world.
+"""Simulated sonars on a robot.
 
-A cone is a fan of rays, and the reading is the shortest ray that comes back. Rough walls and people send every ray
-back. A smooth wall sends back only rays within 20° of its normal and swallows the others, though neighbouring rays of
-the same cone that miss it may still bring an echo. Where the *axis* of the cone meets a smooth wall too obliquely,
-the sound that is mirrored away comes back by the same path in 30 % of the readings, if what it meets within range
-sends it back: a ghost, as far away as the mirrored path is long. The first echo to arrive counts. So of the readings
-without any direct echo, 70 % and those whose mirrored path leads nowhere report none.
+A cone is a fan of rays, and the reading is the shortest ray that returns. Rough walls and people reflect every ray. A
+smooth wall reflects only rays within 20° of its normal and absorbs the others; neighbouring rays of the same cone that
+miss it may still return. If the *axis* of the cone hits a smooth wall at a larger angle, sound that is reflected
+specularly returns on the same path in 30 % of the readings, if an object within range reflects it: a ghost, at the
+length of this path. The first echo counts. So of the readings without a direct echo, 70 % have none, and also those
+without an object on the specular path.
 """
 
 from __future__ import annotations
@@ -87,7 +87,7 @@ def sonar_ring(
     max_range: float = 6.0,
     min_range: float = 0.1,
 ) -> SonarArray:
-    """Return `count` evenly spaced sonars, the first looking ahead; units as in `SonarArray`."""
+    """Return `count` evenly spaced sonars, the first pointing ahead; units as in `SonarArray`."""
     yaws = (math.remainder(math.tau * k / count, math.tau) for k in range(count))
     return SonarArray(tuple(yaws), radius, field_of_view, max_range, min_range)
 
@@ -105,7 +105,7 @@ def front_array(
 
 @dataclass(frozen=True)
 class NoiseModel:
-    """What goes wrong with a reading, whatever the world.
+    """Errors of a reading that do not depend on the world.
 
     Attributes
     ----------
@@ -123,7 +123,7 @@ class NoiseModel:
 
 
 NOISE_FREE = NoiseModel()
-#: The causes of the paper's sensor model, no more: Gaussian noise and one random reading in twenty.
+#: The causes of the paper's sensor model: Gaussian noise and 5 % random readings.
 NOISY = NoiseModel(sigma=0.05, p_random=0.05)
 
 
@@ -142,7 +142,7 @@ def measure(
     robot : float64, shape (T, 3)
         Poses in the map frame, metres and radians.
     people : float64, shape (T, 2), optional
-        Where a person stands during each sweep, metres in the map frame; NaN for nowhere.
+        Position of a person during each sweep, metres in the map frame; NaN for none.
 
     Returns
     -------
@@ -163,7 +163,7 @@ def measure(
 def _true_ranges(
     world: World, sonars: SonarArray, poses: Floats, discs: Floats | None, may_ghost: NDArray[np.bool_]
 ) -> Floats:
-    """Return the first echo of each cone, direct or mirrored, +inf where none comes back; shape (N,)."""
+    """Return the range of the first echo of each cone, direct or by reflection, +inf if there is none; shape (N,)."""
     half = sonars.field_of_view / 2
     angles = poses[:, 2:] + np.linspace(-half, half, RAYS)
     distance, hit, echo = _echoes(world, poses[:, :2], angles, discs, sonars.max_range)
@@ -175,7 +175,7 @@ def _true_ranges(
         heading, leg = angles[ghost, axis], distance[ghost, axis]
         x0, y0, x1, y1 = world.segments[hit[ghost, axis]].T
         mirrored = (2.0 * np.arctan2(y1 - y0, x1 - x0) - heading)[:, None]
-        # a hair short of the wall, so that the mirrored ray does not meet the same wall again
+        # slightly before the wall, so that the reflected ray does not hit the same wall again
         along = np.stack([np.cos(heading), np.sin(heading)], axis=1)
         start = poses[ghost, :2] + (leg - 1e-6)[:, None] * along
         rest, _, back = _echoes(world, start, mirrored, None if discs is None else discs[ghost], sonars.max_range)
@@ -187,7 +187,7 @@ def _true_ranges(
 def _echoes(
     world: World, origins: Floats, angles: Floats, discs: Floats | None, reach: float
 ) -> tuple[Floats, NDArray[np.int64], NDArray[np.bool_]]:
-    """Return each ray's length, the wall it hits (`NOTHING` for a person or none), and whether it comes back."""
+    """Return each ray's length, the wall it hits (`NOTHING` for a person or none), and whether it returns."""
     distance, hit = cast(origins, angles, world.segments, reach)
     x0, y0, x1, y1 = world.segments.T
     wall = np.arctan2(y1 - y0, x1 - x0)

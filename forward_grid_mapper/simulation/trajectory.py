@@ -1,4 +1,4 @@
-"""Motion along waypoints at constant speed, turning on the spot where two legs meet."""
+"""Motion along waypoints at constant speed, with turns on the spot."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ Floats = NDArray[np.float64]
 
 SPEED = 0.5  # m/s
 TURN_RATE = 1.0  # rad/s
-REST = 0.2  # seconds of standing still before and after, so that odometry brackets every sweep
+REST = 0.2  # seconds without motion before and after, so that odometry brackets every sweep
 
 
 @dataclass(frozen=True)
@@ -26,7 +26,7 @@ class Trajectory:
     pose : float64, shape (K, 3)
         x, y, yaw in the map frame, metres and radians.
     leg_time, leg_start : float64, shape (L,)
-        When each straight leg begins, and how far along the path, in seconds and metres.
+        Begin of each straight leg, seconds, and its distance along the path, metres.
     length : float
         Of the whole path, metres.
     """
@@ -39,7 +39,7 @@ class Trajectory:
 
     @classmethod
     def through(cls, waypoints: Floats) -> Trajectory:
-        """Return the motion through waypoints, shape (P, 2), P > 1, metres, no two successive ones equal."""
+        """Return the motion through waypoints, shape (P, 2), P > 1, metres; successive ones must differ."""
         steps = np.diff(waypoints, axis=0)
         lengths = np.hypot(*steps.T)
         if not len(lengths) or lengths.min() <= 0.0:
@@ -61,7 +61,7 @@ class Trajectory:
         return cls(table[:, 0], table[:, 1:], np.array(leg_time), starts[:-1], float(starts[-1]))
 
     def time_at(self, distance: Floats) -> Floats:
-        """Return when the robot has come `distance` metres along its path, in seconds; before any turn there."""
+        """Return the time at a distance along the path, metres, in seconds; before the turn, if there is one."""
         leg = np.clip(np.searchsorted(self.leg_start, distance) - 1, 0, None)
         time: Floats = self.leg_time[leg] + (distance - self.leg_start[leg]) / SPEED
         return time

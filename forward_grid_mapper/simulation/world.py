@@ -1,7 +1,7 @@
-"""Worlds of thin walls with their true maps: the paper's corridors, and a floor plan to draw more of them.
+"""Worlds of thin walls with their true maps: the paper's corridors, and a floor plan to draw further ones.
 
-Walls run along the centres of the cells that represent them. So the distance to a wall is the distance to its cells'
-centres, and a map made from exact readings shows no half-cell bias.
+Walls run along the centres of their cells. So the distance to a wall is the distance to the centres of its cells, and
+a map of exact readings has no bias of half a cell.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class Door:
 
 @dataclass(frozen=True)
 class World:
-    """Walls and the map that a perfect mapper would make of them, both in the map frame.
+    """Walls, and the true map, both in the map frame.
 
     Attributes
     ----------
@@ -44,7 +44,7 @@ class World:
     grid : Grid
         The lattice of `reference`.
     reference : int8, shape `grid.shape`
-        1 where a wall runs, 0 where a robot could get to, -1 elsewhere.
+        1 at walls, 0 where a robot could drive, -1 elsewhere.
     doors : tuple of Door
     smooth_cells : bool, shape `grid.shape`
         The occupied cells that smooth walls run through.
@@ -60,10 +60,10 @@ class World:
 
 
 def cells_along(segment: NDArray[np.float64], grid: Grid) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return (rows, columns) in `grid` that a segment (x0, y0, x1, y1 in metres) runs through, in its order."""
+    """Return the cells, (rows, columns) in `grid`, on a segment (x0, y0, x1, y1 in metres), in its order."""
     start, end = segment[:2], segment[2:]
     length = float(np.hypot(*(end - start)))
-    # walls may end on a cell's face; kept off the very ends, samples do not fall into the next cell
+    # walls may end on a cell's face; a small margin keeps samples out of the next cell
     margin = 1e-6 / max(length, 1e-6)
     at = np.linspace(margin, 1.0 - margin, 2 + math.ceil(8.0 * length / grid.resolution))
     points = start + at[:, None] * (end - start)
@@ -127,7 +127,7 @@ class Floorplan:
         for piece in np.split(np.arange(len(along)), cuts):
             if kind[piece[0]] < 0:
                 continue
-            # a doorway is as wide as its free cells, so walls end at faces there, at centres elsewhere
+            # a doorway is as wide as its free cells, so walls end at faces there, and at centres elsewhere
             low = along[piece[0]] + (0.5 if piece[0] == 0 else 0.0)
             high = along[piece[-1]] + (0.5 if piece[-1] == len(along) - 1 else 1.0)
             ends = (low, across + 0.5, high, across + 0.5) if axis == 'x' else (across + 0.5, low, across + 0.5, high)
@@ -143,13 +143,13 @@ class Floorplan:
             self.wall('y', column, (low[1], high[1]))
 
     def alcove(self, columns: Cell, row: int, end_row: int) -> None:
-        """Draw the side and back walls of a room whose front wall, in `row`, is another's; `end_row` is its back."""
+        """Draw the side and back walls of a room with an existing front wall, in `row`; its back is in `end_row`."""
         for column in columns:
             self.wall('y', column, (min(row, end_row), max(row, end_row)))
         self.wall('x', end_row, columns)
 
     def world(self, inside: Cell) -> World:
-        """Return the world; what cannot be reached from cell `inside` is unknown to its reference map."""
+        """Return the world; cells that cannot be reached from cell `inside` are unknown in its reference map."""
         grid = Grid(self.resolution, 0, 0, self.width, self.height)
         segments = np.array(self._segments)
         smooth = np.array(self._smooth)
@@ -165,7 +165,7 @@ class Floorplan:
 
 
 def _reachable(free: NDArray[np.bool_], seed: Cell) -> NDArray[np.bool_]:
-    """Return the cells of `free` that are connected with `seed` by their sides."""
+    """Return the cells of `free` that are connected with `seed` by faces."""
     reached = np.zeros_like(free)
     reached[seed[1], seed[0]] = True
     count = 0
@@ -192,7 +192,7 @@ def door_world() -> World:
 
 
 def doors_world() -> World:
-    """Return a world like the paper's Fig. 5: a corridor, 2.1 m wide, with two doors of 0.6 m on either side."""
+    """Return a world like the paper's Fig. 5: a corridor, 2.1 m wide, with two doors of 0.6 m on each side."""
     plan = Floorplan('doors', 114, 120)
     plan.wall('x', 48, (4, 109), doors=((28, 33), (79, 84)))
     plan.wall('x', 70, (4, 109), doors=((33, 38), (74, 79)))
@@ -227,8 +227,8 @@ def rooms_world() -> World:
     return plan.world(inside=(30, 30))
 
 
-# The rooms of `building_world` on each side of its corridor: first and last column, free cells of the door, and what
-# stands inside: boxes as two opposite corners.
+# The rooms of `building_world` on each side of its corridor: first and last column, free cells of the door, and boxes
+# in the room as two opposite corners.
 _SOUTH = (
     (10, 76, (37, 43), (((38, 34), (48, 50)), ((20, 10), (66, 14)))),
     (76, 142, (106, 114), (((98, 38), (120, 44)), ((138, 30), (142, 56)))),
@@ -271,7 +271,7 @@ def building_world(entrance: bool = False) -> World:
 
 
 def building_tour() -> NDArray[np.float64]:
-    """Return a round through the corridor, all rooms and the hall of `building_world`, shape (P, 2), metres."""
+    """Return a tour through the corridor, all rooms and the hall of `building_world`, shape (P, 2), metres."""
     cells: list[Cell] = [(20, 88)]
     south = [(left, right, door, 62, 24) for left, right, door, _ in _SOUTH]
     north = [(left, right, door, 114, 156) for left, right, door, _ in _NORTH]

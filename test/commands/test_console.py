@@ -16,7 +16,7 @@ from drive_samples import FILES, tape, write_tape
 from numba.core import event
 
 from forward_grid_mapper import __version__
-from forward_grid_mapper.__main__ import COMMANDS, _to_a_pipe
+from forward_grid_mapper.__main__ import COMMANDS, _with_output
 from forward_grid_mapper.commands import console, process_bag
 from forward_grid_mapper.commands.console import Ticker
 from forward_grid_mapper.core.search.search import Progress
@@ -80,8 +80,8 @@ def test_a_pipe_that_broke_elsewhere_is_no_reader_who_went() -> None:
         raise BrokenPipeError('somewhere else')
 
     with pytest.raises(BrokenPipeError, match='somewhere else'):
-        _to_a_pipe(fail)
-    assert _to_a_pipe(lambda: 3) == 3
+        _with_output(fail)
+    assert _with_output(lambda: 3) == 3
 
 
 @pytest.mark.parametrize('command', ['process_bag', 'learn', 'replay_bag', 'simulate', 'demo'])

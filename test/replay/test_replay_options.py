@@ -88,7 +88,7 @@ def test_topics_are_renamed_with_or_without_slash() -> None:
         (':=/sonar', 'OLD:=NEW'),
         ('/sonar:=', 'OLD:=NEW'),
         ('/other:=/sonar', '/odom, /sonar'),
-        ('/sonar:=/odom', 'both'),
+        ('/sonar:=/odom', 'two types'),
     ],
 )
 def test_a_wrong_renaming_is_reported(remap: str, reported: str) -> None:

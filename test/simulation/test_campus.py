@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from forward_grid_mapper.simulation.campus import LATER, campus_drive, campus_path, campus_world, corner
+from forward_grid_mapper.simulation.campus import START_INTERVAL, campus_drive, campus_path, campus_world, corner
 from forward_grid_mapper.simulation.rays import blocked
 from forward_grid_mapper.simulation.sonar import front_array
 from forward_grid_mapper.simulation.world import building_world, cells_along
@@ -48,7 +48,7 @@ def test_a_drive_depends_on_its_number_and_the_seed_alone() -> None:
     one, again, other, seeded = made(3), made(3), made(1), made(3, 1)
     assert one.ranges == again.ranges and one.odometry == again.odometry
     assert len(one.readings) == 400
-    assert other.ranges[0].stamp == one.ranges[0].stamp - 2 * LATER
+    assert other.ranges[0].stamp == one.ranges[0].stamp - 2 * START_INTERVAL
     for different in (other, seeded):
         assert [m.range for m in different.ranges] != [m.range for m in one.ranges]
     np.testing.assert_allclose(one.robot[0, :2], other.robot[0, :2], atol=0.2)
