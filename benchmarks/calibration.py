@@ -47,7 +47,7 @@ class Cells(NamedTuple):
 
     Attributes
     ----------
-    said : float64, shape (N,)
+    nats : float64, shape (N,)
         Evidence of the readings, nats.
     features : float64, shape (N, 9)
         Features of the weights `NAMES`.
