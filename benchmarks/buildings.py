@@ -1,14 +1,14 @@
 #!/usr/bin/env python3
-"""How good maps of real places are: sonars simulated in buildings that a laser measured, and recordings of a robot.
+"""Quality of maps of real places: sonars simulated in buildings that a laser measured, and recordings of a robot.
 
 usage: buildings.py [NAME ...] [--drawn] [--set NAME=VALUE ...]
 
-Of the drives under ../shared/data, or those named, with their right poses: the default's maximum likelihood map and its
-live map, the paper's plain maximum likelihood map, and the standard map with the best of 216 gains for that very drive,
-once for F1 and once for nav_iou, which nobody could know. Figures are those of ../shared/tools/score_map.py.
+For the drives under ../shared/data, or those named, with corrected poses: the default's maximum likelihood map and
+its live map, the paper's plain maximum likelihood map, and the standard map with the best of 216 gains for each drive,
+once for F1 and once for nav_iou, which users could not know. Figures are those of ../shared/tools/score_map.py.
 
---drawn takes twelve buildings drawn at random instead (`material_worlds.py`), on which nothing was chosen, and prints
-means; --set changes the default.
+--drawn uses twelve random buildings instead (`material_worlds.py`), which were not used for tuning, and prints means;
+--set changes the default.
 """
 
 from __future__ import annotations
@@ -37,13 +37,13 @@ from forward_grid_mapper.files.parameter_file import load_parameters
 PAPER = Path(__file__).resolve().parents[1] / 'config' / 'paper.yaml'
 NAMES = ('building_a', 'building_b', 'building_c', 'office_a', 'office_b')
 DRAWN = range(24, 36)
-"""Seeds of buildings on which nothing was chosen."""
+"""Seeds of buildings that were not used for tuning."""
 
 FIGURES = ('f1', 'precision', 'recall', 'nav_iou', 'leak', 'blocked', 'beyond')
 
 
 class Map(NamedTuple):
-    """Values are probabilities, NaN where unknown; `probability` is what the log loss is of, if there is one."""
+    """Values are probabilities, NaN where unknown; `probability` is that for the log loss, if there is one."""
 
     title: str
     grid: Grid
@@ -52,7 +52,7 @@ class Map(NamedTuple):
 
 
 def maps_of(case: Case, changes: dict[str, Any], tool: ModuleType) -> Iterator[Map]:
-    """Yield each way's map; `changes` are those of the default."""
+    """Yield the map of each method; `changes` are parameters of the default."""
     maps = Mapper(Parameters().varied(changes)).run(case.readings)
     yield Map('maximum likelihood map', maps.grid, np.where(maps.ml < 0, np.nan, maps.ml), maps.uncertainty)
     yield Map('live map', maps.grid, maps.live, maps.live)
@@ -65,7 +65,7 @@ def maps_of(case: Case, changes: dict[str, Any], tool: ModuleType) -> Iterator[M
 
 
 def scored(case: Case, changes: dict[str, Any], tool: ModuleType) -> dict[str, list[float]]:
-    """Return `FIGURES` and the log loss of each way's map, by its title."""
+    """Return `FIGURES` and the log loss of each method's map, by its title."""
     path, out = tool.path_cells(case.path_xy, np.array(case.origin), case.resolution, case.truth.shape), {}
 
     def figures(grid: Grid, values: NDArray[Any]) -> dict[str, float]:

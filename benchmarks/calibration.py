@@ -1,12 +1,12 @@
 #!/usr/bin/env python3
-"""The weights of the uncertainty map, fitted anew, and the log loss with them.
+"""Fits the weights of the uncertainty map again, and prints the log loss with them.
 
 usage: calibration.py [--buildings 24]
 
-A logistic regression on three parts: every other drive of quality_worlds.py, buildings of material_worlds.py, and these
-again where walls are what most rays of the laser say. Held out: the other drives, and twelve more buildings by both
-truths. What the readings say has the weight one. Prints the constants of
-`core/maps/uncertainty.py` beside those that are there, and log losses in nats a cell with either.
+A logistic regression on three parts: every other drive of quality_worlds.py, buildings of material_worlds.py, and
+these again with a truth where walls end most rays of the laser. Held out: the other drives, and twelve more buildings
+with both truths. The evidence of the readings has the weight 1. Prints the constants of `core/maps/uncertainty.py`
+beside the current ones, and log losses in nats a cell with both.
 """
 
 from __future__ import annotations
@@ -26,36 +26,36 @@ from forward_grid_mapper.core.common.parameters import Parameters
 from forward_grid_mapper.core.evidence.evidence import Evidence
 from forward_grid_mapper.core.evidence.neighbourhood import patterns
 from forward_grid_mapper.core.mapping import Mapper
-from forward_grid_mapper.core.maps import uncertainty as told
+from forward_grid_mapper.core.maps import uncertainty as weighting
 from forward_grid_mapper.core.maps.free_space import expected_passes
 
 Floats = NDArray[np.float64]
 
 NAMES = ('HOLE', 'INSIDE', 'STEP', 'END', 'BESIDE', 'ALONE', 'OCCUPIED', 'LEAST_AROUND', 'MEAN_AROUND')
 CLIP = 0.02
-"""Probabilities are clipped to this and one less it, as score_map.py does."""
+"""Probabilities are clipped to this value and 1 minus it, as in score_map.py."""
 
 SHARES = (0.57, 0.215, 0.215)
-"""What each of the three parts counts for: with less for the worlds, which have thin walls along the lattice, gaps of
-their walls are taken for walls."""
+"""Weights of the three parts: with less for the worlds, which have thin walls along the lattice, gaps in their walls
+would become walls."""
 
 HELD = 12
 
 
 class Cells(NamedTuple):
-    """The cells of a drive that its uncertainty map and the truth know.
+    """The cells of a drive that are known in its uncertainty map and in the truth.
 
     Attributes
     ----------
-    said : float64, shape (N,)
-        What the readings say, nats.
+    nats : float64, shape (N,)
+        Evidence of the readings, nats.
     features : float64, shape (N, 9)
-        What `NAMES` weigh.
+        Features of the weights `NAMES`.
     occupied : bool, shape (N,)
-        In truth.
+        In the truth.
     """
 
-    said: Floats
+    nats: Floats
     features: Floats
     occupied: NDArray[np.bool_]
 
@@ -68,26 +68,26 @@ def cells_of(case: Case) -> Cells:
     evidence.extend(maps.readings)
     passed = expected_passes(evidence, evidence.state.maps.occupied).all.reshape(maps.grid.shape)
     occupied = (maps.ml == 1).astype(np.uint8)
-    kinds = told.KINDS[patterns(occupied.ravel(), maps.grid.shape)].reshape(maps.grid.shape)
-    layers = [(kinds == getattr(told, name)).astype(float) for name in NAMES[:6]]
-    layers += [occupied.astype(float), *(np.log1p(part) for part in told.around(passed))]
-    said = told.discounted(evidence.of_occupancy().reshape(maps.grid.shape))
+    kinds = weighting.KINDS[patterns(occupied.ravel(), maps.grid.shape)].reshape(maps.grid.shape)
+    layers = [(kinds == getattr(weighting, name)).astype(float) for name in NAMES[:6]]
+    layers += [occupied.astype(float), *(np.log1p(part) for part in weighting.around(passed))]
+    nats = weighting.discounted(evidence.of_occupancy().reshape(maps.grid.shape))
     known = np.isfinite(on_truth(maps.uncertainty, maps.grid, case, tool)) & np.isfinite(case.truth)
-    columns = [on_truth(layer, maps.grid, case, tool)[known] for layer in (said, *layers)]
+    columns = [on_truth(layer, maps.grid, case, tool)[known] for layer in (nats, *layers)]
     return Cells(columns[0], np.stack(columns[1:], axis=1), case.truth[known] > 0.5)
 
 
 def fitted(parts: Iterable[list[Cells]]) -> Floats:
-    """Return the weights with the least log loss; all drives of a part count alike."""
+    """Return the weights with the smallest log loss; all drives of a part have equal weights."""
     shares = zip(SHARES, parts, strict=True)
-    drives = [(cells, share / len(part) / len(cells.said)) for share, part in shares for cells in part]
-    said = np.concatenate([cells.said for cells, _ in drives])
+    drives = [(cells, share / len(part) / len(cells.nats)) for share, part in shares for cells in part]
+    nats = np.concatenate([cells.nats for cells, _ in drives])
     features = np.concatenate([cells.features for cells, _ in drives])
     occupied = np.concatenate([cells.occupied for cells, _ in drives]).astype(float)
-    weight = np.concatenate([np.full(len(cells.said), each) for cells, each in drives])
+    weight = np.concatenate([np.full(len(cells.nats), each) for cells, each in drives])
 
     def loss(weights: Floats) -> tuple[float, Floats]:
-        logit = said + features @ weights
+        logit = nats + features @ weights
         error = 1 / (1 + np.exp(-logit)) - occupied
         return float(weight @ (np.logaddexp(0, logit) - occupied * logit)), features.T @ (weight * error)
 
@@ -98,7 +98,7 @@ def log_loss(part: list[Cells], weights: Floats) -> float:
     """Return the mean log loss of drives, nats a cell."""
     out = []
     for cells in part:
-        p = np.clip(1 / (1 + np.exp(-cells.said - cells.features @ weights)), CLIP, 1 - CLIP)
+        p = np.clip(1 / (1 + np.exp(-cells.nats - cells.features @ weights)), CLIP, 1 - CLIP)
         out.append(float(-np.log(np.where(cells.occupied, p, 1 - p)).mean()))
     return float(np.mean(out))
 
@@ -113,7 +113,7 @@ def main() -> None:
         [cells_of(building_case(seed, mostly=mostly)) for seed in range(count + HELD)] for mostly in (False, True)
     )
     new = fitted((worlds[::2], any_ray[:count], most_rays[:count]))
-    now = np.array([getattr(told, name) for name in NAMES])
+    now = np.array([getattr(weighting, name) for name in NAMES])
     print(f'{"":32s}{"now":>8s}{"fitted":>8s}')
     for name, a, b in zip(NAMES, now, new, strict=True):
         print(f'{name:32s}{a:8.2f}{b:8.2f}')

@@ -1,16 +1,16 @@
 #!/usr/bin/env python3
-"""A campus by workers: time, memory a worker, and how well work is shared, as drives become more.
+"""A campus mapped by workers: time, memory of a worker, and balance of work, for increasing numbers of drives.
 
 usage: campus.py [--drives 1,10] [--readings 100000] [--workers 2] [--tiles 30] [--compare] [--whole]
                  [--folder DIR] [--plot FILE]
 
-For each number of drives: a campus with as many buildings is simulated (kept in DIR, and taken from there if it is
-there), and `process_bag --workers` maps it, in a process of its own. Printed are readings, area, seconds of the wall
-clock, CPU seconds of all tasks, the memory of the largest worker, how often a reading is evaluated, and what would come
-of 1 to 8 workers: the CPU seconds of all tasks, by those that the busiest worker would have if each worker took the
-next task as soon as it is free, and waited at the end of each stage. That is counted work, which other processes on the
-machine do not change. With --compare one worker is timed as well; with --whole the map is made by one process without
-tiles, too, and what differs is printed.
+For each number of drives, a campus with as many buildings is simulated (stored in DIR, and reused if it exists), and
+`process_bag --workers` maps it, in its own process. Prints readings, area, seconds of the wall clock, CPU seconds of
+all tasks, the memory of the largest worker, how often a reading is evaluated, and the efficiency of 1 to 8 workers: the
+CPU seconds of all tasks, relative to those of the busiest worker if each worker took the next task as soon as it is
+free, and waited at the end of each stage. This is computed from CPU time, which other processes do not change. With
+--compare one worker is timed as well; with --whole the map is also made by one process without tiles, and the
+differences are printed.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ ACROSS = range(1, 9)
 
 
 def campus_of(folder: Path, drives: int, readings: int) -> Path:
-    """Return the folder of a campus, which is made if it is not there."""
+    """Return the folder of a campus, which is simulated if it does not exist."""
     target = folder / f'campus_{drives}_{readings}'
     if not target.exists():
         begun = time.perf_counter()
@@ -50,13 +50,13 @@ def campus_of(folder: Path, drives: int, readings: int) -> Path:
 
 
 def run(*words: object) -> str:
-    """Return what a command prints."""
+    """Return the output of a command."""
     command = [sys.executable, '-m', 'forward_grid_mapper', *map(str, words)]
     return subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True).stdout
 
 
 class Job(NamedTuple):
-    """A job that is done: its seconds, report, and maps, and the stage and CPU seconds of each task."""
+    """A finished job: its seconds, report, and maps, and the stage and CPU seconds of each task."""
 
     seconds: float
     report: dict[str, Any]
@@ -79,7 +79,7 @@ def mapped(campus: Path, *options: object) -> Job:
 
 
 def print_differences(whole: Job, tiled: Job) -> None:
-    """Print what the map of one process has that the map in tiles has not."""
+    """Print the differences between the map of one process and the map in tiles."""
     a, b = (job.report['statistics']['searched_objective'] for job in (whole, tiled))
     differ = np.count_nonzero(whole.maps.ml != tiled.maps.ml)
     known = np.count_nonzero(whole.maps.ml != UNKNOWN)
@@ -91,7 +91,7 @@ def print_differences(whole: Job, tiled: Job) -> None:
 
 
 def efficiency(costs: Sequence[tuple[str, float]], workers: int) -> float:
-    """Return how much of so many workers' time would be work, where stages follow one another."""
+    """Return the fraction of the workers' time that would be work, with stages one after the other."""
     total = busy = 0.0
     for _, stage in itertools.groupby(costs, key=lambda one: one[0]):
         free = [0.0] * workers
@@ -148,7 +148,7 @@ def main() -> None:
 
 
 def by_stage(costs: Sequence[tuple[str, float]]) -> dict[str, float]:
-    """Return the CPU seconds of each stage; all rounds of the search are one."""
+    """Return the CPU seconds of each stage; all rounds of the search are one stage."""
     out: dict[str, float] = {}
     for name, seconds in costs:
         stage = name.partition(',')[0]
@@ -157,7 +157,7 @@ def by_stage(costs: Sequence[tuple[str, float]]) -> dict[str, float]:
 
 
 def draw(path: Path, rows: Sequence[tuple[int, float]]) -> None:
-    """Draw CPU seconds against readings, with the line through the largest."""
+    """Draw CPU seconds against readings, with the line through the origin and the largest point."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 

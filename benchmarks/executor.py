@@ -1,16 +1,16 @@
 #!/usr/bin/env python3
-"""How long the node's executor is ever busy, or kept waiting, with one thing.
+"""Longest times for which the node's executor is busy, or delayed.
 
 usage: executor.py [--readings 500000] [--rate 500] [--seconds 30] [--cold] [--max-readings 500000]
        executor.py --messages
 
-Starts a node in a process of its own, with the online map on and a journal of so many readings of the simulated
-corridor to restart from, publishes Range and odometry to it all the while, and calls every service: EM runs, maps are
-fetched and saved, parameters change, and at last everything is forgotten. A timer of 2 ms in the node's own executor
-measures how late it is called: `late` is the longest delay, of which the executor's own thread computed for `own` ms.
-`most own` is the longest that it computed between two calls. The rest of a delay is other threads that held the GIL,
-and the machine: `machine` is how late a process that does nothing else was woken at the worst. With --cold, the kernels
-are compiled first. With --messages, only what a map of a million cells costs as a message is measured. Needs rclpy.
+Starts a node in its own process, with the online map and a journal of so many readings of the simulated corridor to
+restore, publishes Range and odometry meanwhile, and calls every service: EM runs, maps are requested and saved,
+parameters change, and at last all is reset. A timer of 2 ms in the node's own executor measures the delay of its calls:
+`late` is the longest delay, of which the executor's own thread computed for `own` ms. `most own` is its longest
+computation between two calls. The rest of a delay is due to other threads that held the GIL, and to the machine:
+`machine` is the longest delay of a process that does nothing else. With --cold, the kernels are compiled first. With
+--messages, only the cost of making a message of a map with a million cells is measured. Needs rclpy.
 """
 
 from __future__ import annotations
@@ -36,19 +36,19 @@ import numpy as np
 
 PERIOD = 0.002
 SAMPLE = 0.1
-"""Seconds that a line of the node's account is about."""
+"""Seconds of each line of the probe's output."""
 
 
 class Probe:
-    """A timer in the node's executor that notes how late it is called."""
+    """A timer in the node's executor that records the delay of its calls."""
 
     def __init__(self, node: Any, clock: Any) -> None:
         self._last, self._cpu = time.monotonic(), time.thread_time()
         self._late = self._own = 0.0
         self._begin = self._last
-        node.create_timer(PERIOD, self._turn, clock=clock)
+        node.create_timer(PERIOD, self._tick, clock=clock)
 
-    def _turn(self) -> None:
+    def _tick(self) -> None:
         now, cpu = time.monotonic(), time.thread_time()
         if now - self._last - PERIOD > self._late:
             self._late, self._own = now - self._last - PERIOD, cpu - self._cpu
@@ -59,7 +59,7 @@ class Probe:
 
 
 def run_control() -> None:
-    """Measure how late a process is woken that does nothing else."""
+    """Measure the delay of a process that does nothing else."""
     late, begin = 0.0, time.monotonic()
     while True:
         last = time.monotonic()
@@ -86,7 +86,7 @@ def run_node(arguments: list[str]) -> int:
 
 
 def readings_of(count: int) -> Any:
-    """Return so many readings: tours of the corridor, one after the other, each with noise of its own."""
+    """Return so many readings: tours of the corridor, one after the other, each with its own noise."""
     from forward_grid_mapper.core.common.readings import Readings
     from forward_grid_mapper.simulation.drive import corridor_drive
 
@@ -105,8 +105,8 @@ def readings_of(count: int) -> Any:
     return Readings(**columns, sensor_names=parts[0].sensor_names).select(slice(count))
 
 
-class Account:
-    """What a process says, read in threads: log lines in the same stream would get into those of the probe."""
+class Output:
+    """The output of a process, read in threads: the log has its own stream, so as not to mix with the probe's."""
 
     def __init__(self, process: subprocess.Popen[str]) -> None:
         self.samples: list[tuple[float, float, float]] = []
@@ -123,12 +123,12 @@ class Account:
             else:
                 self.lines.append(line)
 
-    def says(self, text: str) -> bool:
-        """Return whether the node has said so."""
+    def has_logged(self, text: str) -> bool:
+        """Return whether the node has logged a text."""
         return any(text in line for line in self.lines)
 
     def row(self, begin: float, end: float) -> str:
-        """Return what was measured in this time: the longest delay, the executor's own part of it, the most, 99 %."""
+        """Return measurements of a time span: longest delay, the executor's part of it, longest computation, 99 %."""
         within = [(late, own) for now, late, own in self.samples if begin < now <= end + SAMPLE]
         late, own = max(within, default=(math.nan, math.nan))
         usual = np.percentile([late for late, _ in within], 99) if within else math.nan
@@ -137,7 +137,7 @@ class Account:
 
 
 class Load:
-    """A robot that goes on driving to and fro, and calls services."""
+    """A robot that drives back and forth, and calls services."""
 
     def __init__(self, process: subprocess.Popen[str], rate: float, first: int) -> None:
         import rclpy
@@ -157,12 +157,12 @@ class Load:
         self._rate, self._first, self._begin = rate, first, time.monotonic()
         self.sent = self._moved = 0
 
-    def met(self) -> bool:
-        """Return whether the node listens."""
+    def subscribed(self) -> bool:
+        """Return whether the node has subscribed."""
         return bool(self._ranges.get_subscription_count() and self._odometry.get_subscription_count())
 
     def send(self) -> None:
-        """Publish what is due by now."""
+        """Publish the messages that are due."""
         now = time.monotonic() - self._begin
         while self._moved < now * 50:
             at = self._moved / 50
@@ -183,7 +183,7 @@ class Load:
         header.stamp.sec, header.stamp.nanosec = divmod(self._first + round(at * 1e9), 1_000_000_000)
 
     def until(self, condition: Callable[[], Any], seconds: float = 600.0) -> None:
-        """Go on until something is so."""
+        """Publish until a condition holds."""
         import rclpy
 
         end = time.monotonic() + seconds
@@ -192,12 +192,12 @@ class Load:
                 raise TimeoutError('the node does not answer')
             if self._process.poll() is not None:
                 raise RuntimeError(f'the node ended with {self._process.returncode}')
-            if self.met():
+            if self.subscribed():
                 self.send()
             rclpy.spin_once(self.node, timeout_sec=0.001)
 
     def call(self, kind: Any, name: str, **fields: Any) -> Any:
-        """Call a service, sending meanwhile; return the answer."""
+        """Call a service, publishing meanwhile; return the answer."""
         from rclpy.qos import QoSProfile
 
         client = self.node.create_client(kind, f'/forward_grid_mapper/{name}', qos_profile=QoSProfile(depth=5000))
@@ -239,7 +239,7 @@ def measure(options: argparse.Namespace, folder: Path) -> None:
         command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, bufsize=1, env=environment
     )
     control = subprocess.Popen([sys.executable, __file__, '--control'], stdout=subprocess.PIPE, text=True, bufsize=1)
-    account, machine, begin = Account(process), Account(control), time.monotonic()
+    account, machine, begin = Output(process), Output(control), time.monotonic()
     load = Load(process, options.rate, int(readings.stamp.max()) + 10_000_000_000)
     print(
         f'{"":42s}{"s":>8s}{"late ms":>10s}{"own ms":>10s}{"most own":>10s}{"99 % late":>10s}{"machine":>10s}',
@@ -264,7 +264,10 @@ def measure(options: argparse.Namespace, folder: Path) -> None:
 
     answers: list[str] = []
     try:
-        phase(f'start with {len(readings)} readings', lambda: load.until(lambda: load.met() and account.says('ready:')))
+        phase(
+            f'start with {len(readings)} readings',
+            lambda: load.until(lambda: load.subscribed() and account.has_logged('ready:')),
+        )
         phase('online map catches up', wait(options.seconds))
         phase('EM', lambda: answers.append(load.call(Trigger, 'run_em').message))
         phase('50 maps', lambda: [load.call(GetMap, f'get_{name}') for name in ['live_map', 'ml_map'] * 25])
@@ -283,7 +286,7 @@ def measure(options: argparse.Namespace, folder: Path) -> None:
 
 
 def measure_messages(side: int = 1000, times: int = 20) -> None:
-    """Print what the thread that sends maps computes for one of a million cells; it holds the GIL for most of it."""
+    """Print the time that the thread of map messages needs for a million cells; it holds the GIL for most of it."""
     import rclpy
     from builtin_interfaces.msg import Time
     from nav_msgs.msg import OccupancyGrid

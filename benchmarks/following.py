@@ -1,13 +1,13 @@
 #!/usr/bin/env python3
-"""How far the robot is from where it is said to be on the map, while it drives on after a trajectory was found.
+"""Error of the robot's pose on the map while it drives on after a refinement of the trajectory.
 
     python benchmarks/following.py                                # the rows of the docs
     python benchmarks/following.py --robot ring --level high --seeds 2
 
-The simulated drives are those of `trajectories.py`. The trajectory is found as a whole every 20 m, as the node does
-with `refine_every`; in between it is kept as it was, or followed. `nothing` is odometry as it is. Printed are the rms
-distances from the true place, metres, over the way after the first trajectory that was taken; the map in force is
-aligned with the true one by all of its trajectory. `ms a window` is processor time: mean, 95 %, most.
+The simulated drives are those of `trajectories.py`. The whole trajectory is refined every 20 m, as in the node with
+`refine_every`; in between, the correction is kept constant, or followed. `nothing` is odometry without correction.
+Prints the rms of position errors, metres, after the first accepted trajectory; the current map is aligned with the true
+one by its whole trajectory. `ms a window` is processor time: mean, 95 %, maximum.
 """
 
 from __future__ import annotations
@@ -31,14 +31,14 @@ from forward_grid_mapper.simulation.drift import with_drift
 from forward_grid_mapper.simulation.drive import drive
 
 EVERY, MOST = 20.0, 100.0
-"""Metres between two runs, and of a drive."""
+"""Metres between two runs, and length of a drive."""
 
-ASKED = 5
-"""Poses of odometry after which it is followed again."""
+FOLLOW_EVERY = 5
+"""Poses of odometry between two calls of the follower."""
 
 
 def fitted(path: Floats, true: Floats) -> Floats:
-    """Return the motion, shape (3,), that brings a path closest to the true one; shapes (M, 3)."""
+    """Return the rigid transform, shape (3,), that aligns a path with the true one; shapes (M, 3)."""
     a, b = path[:, :2] - path[:, :2].mean(0), true[:, :2] - true[:, :2].mean(0)
     turn = np.arctan2((a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum(), (a * b).sum())
     middle = np.array([*path[:, :2].mean(0), 0.0])
@@ -46,7 +46,7 @@ def fitted(path: Floats, true: Floats) -> Floats:
 
 
 def off(motion: Floats, path: Floats, true: Floats) -> Floats:
-    """Return how far poses on the map are from the true ones, metres, shape (M,)."""
+    """Return the position errors of poses on the map, metres, shape (M,)."""
     return np.asarray(np.hypot(*(compose(motion, path) - true)[:, :2].T))
 
 
@@ -58,12 +58,12 @@ def part_of(path: Odometry, end: int) -> Odometry:
 def followed(
     base: Correction, found: Refinement, readings: Readings, odometry: Odometry, end: int
 ) -> tuple[Floats, list[float]]:
-    """Return where each pose of odometry after the end of `base` is said to be as it comes, and ms of each window."""
+    """Return the online estimate of each pose of odometry after the end of `base`, and ms of each window."""
     first, said, spent = len(base.odometry.stamp), [], []
     follower = Follower(base, found.calibration, Parameters(), found.noise)
     follower.follow(readings.select(readings.stamp <= base.end), base.odometry)
     for k in range(first, end):
-        if k % ASKED == 0:
+        if k % FOLLOW_EVERY == 0:
             so_far = readings.select(slice(0, int(np.searchsorted(readings.stamp, odometry.stamp[k], side='right'))))
             before, began = follower.windows, time.process_time()
             follower.follow(so_far, part_of(odometry, k + 1))
@@ -74,7 +74,7 @@ def followed(
 
 
 def run(name: str, readings: Readings, odometry: Odometry, true: Odometry) -> tuple[list[Floats], list[float]]:
-    """Print a row; return the distances without anything, kept and followed, and ms of windows."""
+    """Print a row; return the errors without correction, with a constant and a followed one, and ms of windows."""
     travel, at = odometry.travel, EVERY
     columns: list[list[Floats]] = [[], [], []]
     spent: list[float] = []
@@ -103,12 +103,12 @@ def run(name: str, readings: Readings, odometry: Odometry, true: Odometry) -> tu
 
 
 def figures(each: list[Floats]) -> str:
-    """Return the rms of each column."""
+    """Return the rms of each column, in words."""
     return ''.join(f'{np.sqrt((column**2).mean()):10.2f}' for column in each)
 
 
 def milliseconds(spent: list[float]) -> str:
-    """Return mean, 95 % and most."""
+    """Return mean, 95 % and maximum, in words."""
     return f'{np.mean(spent):12.0f}{np.percentile(spent, 95):6.0f}{max(spent):6.0f}'
 
 

@@ -1,12 +1,11 @@
 #!/usr/bin/env python3
-"""Feeds the node with hostile messages, transforms and parameters, and checks that it keeps its word.
+"""Feeds the node with hostile messages, transforms and parameters, and checks its invariants.
 
 usage: fuzz.py [--messages 100000] [--seed 1] [--dds 5000]
 
-Range and Odometry go through the node's own callbacks, EM, services and files; every fifth message is wrong in some
-way. Checked all the while: nothing raises, accepted + waiting + rejected = received, no number in a map is out of
-place, memory stays bounded. With --dds, a node in a process of its own gets serialized messages of which half are
-garbled. Needs rclpy.
+Range and Odometry go through the node's own callbacks, EM, services and files; every fifth message is faulty. Checked
+all the time: nothing raises, accepted + waiting + rejected = received, all numbers in a map are valid, memory is
+bounded. With --dds, a node in its own process receives serialized messages, half of them garbled. Needs rclpy.
 """
 
 from __future__ import annotations
@@ -49,7 +48,7 @@ OVERRIDES: dict[str, Any] = {
 
 
 class Broken(Exception):
-    """The node did not keep its word."""
+    """The node violated an invariant."""
 
 
 def resident() -> float:
@@ -59,25 +58,25 @@ def resident() -> float:
 
 
 def require(condition: bool, what: str) -> None:
-    """Raise if a promise is broken."""
+    """Raise if an invariant is violated."""
     if not condition:
         raise Broken(what)
 
 
 class Answer:
-    """What a service is given to answer with, where nobody waits for it."""
+    """A reply of a service without a client."""
 
     def __init__(self, request: Any = None) -> None:
         self.request = request
         self.sent: list[tuple[Any, ...]] = []
 
     def send(self, *fields: Any) -> None:
-        """Take the answer."""
+        """Store the answer."""
         self.sent.append(fields)
 
 
 class Fuzz:
-    """A node in this process, whose callbacks are called as the executor would."""
+    """A node in this process, whose callbacks are called as by the executor."""
 
     def __init__(self, seed: int, folder: Path) -> None:
         self.hostile = Hostile(seed)
@@ -95,11 +94,11 @@ class Fuzz:
 
     @property
     def associator(self) -> Any:
-        """The node's account."""
+        """The node's associator."""
         return self.node.associator
 
     def work(self) -> None:
-        """Do what an executor does where no message comes."""
+        """Do the executor's work between messages."""
         while self.node.intake.busy:
             self.node.intake.work()
         self.node.inbox.work()
@@ -116,7 +115,7 @@ class Fuzz:
         self.work()
 
     def check(self) -> None:
-        """Do what the node's timers do, and look at its account and its live map."""
+        """Run the node's timers, and check its counts and its live map."""
         self.node.publish_live()
         self.node.journal.take()
         self.node.reporter.report()
@@ -145,30 +144,30 @@ class Fuzz:
             require(len(values) == message.info.width * message.info.height, f'{name} has another size than it says')
 
     def change_parameter(self) -> None:
-        """Set a parameter to anything."""
+        """Set a parameter to an arbitrary value."""
         self.parameters_set += 1
         try:
             refused = not self.node.set_parameters([self.hostile.parameter()])[0].successful
         except ParameterNotDeclaredException:
-            # the service turns it into a refusal
+            # the service would answer with a refusal
             refused = True
         self.parameters_refused += refused
 
     def restore_parameters(self) -> None:
-        """Set every parameter that may change back to its default."""
+        """Reset every writable parameter to its default."""
         values = {row.name: row.default for row in TABLE if not row.read_only and row.group != 'node'}
-        # readings of any variance, in a model of any sigma, make EM slow; it is not what is tried here
+        # readings of arbitrary variance, in a model of arbitrary sigma, make EM slow, which is not tested here
         values['max_iterations'] = OVERRIDES['max_iterations']
         defaults = [Parameter(name, value=value) for name, value in values.items()]
         result = self.node.set_parameters_atomically(defaults)
         require(result.successful, f'the defaults were refused: {result.reason}')
 
     def run_em(self) -> None:
-        """Map from what there is."""
+        """Map all readings so far."""
         try:
             maps = Mapper(self.node.parameters).run(self.associator.readings)
         except MapperError as error:
-            # readings were accepted when sigma may have been less
+            # these readings may have been accepted with a smaller sigma
             expected = not len(self.associator.readings) or 'more than max_cells' in str(error)
             require(expected, f'EM failed: {error}')
             return
@@ -180,7 +179,7 @@ class Fuzz:
         require(bool(((known >= 0) & (known <= 1)).all()), 'the live map has a value that is no probability')
 
     def reset(self) -> None:
-        """Forget everything, after an account of it."""
+        """Check the counts, and reset the node."""
         self.rejected += self.associator.rejected
         self.accepted += len(self.associator.buffer)
         self.rejected['(waited at a reset)'] += self.associator.waiting
@@ -195,7 +194,7 @@ class Fuzz:
         self.node.pause(Answer(SetBool.Request(data=value)))
 
     def run(self, messages: int) -> float:
-        """Send so many messages; return by how many MB memory grew after the first third."""
+        """Send so many messages; return the growth of memory after the first third, MB."""
         begun = 0.0
         while self.total < messages:
             for _ in range(min(500, messages - self.total)):
@@ -223,7 +222,7 @@ class Fuzz:
 
 
 def over_dds(messages: int, seed: int) -> str:
-    """Send serialized messages, half of them garbled, to a node in a process of its own; return its account."""
+    """Send serialized messages, half of them garbled, to a node in its own process; return its counts."""
     import subprocess
 
     from diagnostic_msgs.msg import DiagnosticArray
@@ -255,8 +254,8 @@ def over_dds(messages: int, seed: int) -> str:
             rclpy.spin_once(robot, timeout_sec=0.1)
             require(process.poll() is None, 'the node did not start')
         hostile = Hostile(seed)
-        # whatever comes first names the frames
-        publishers[Odometry].publish(Hostile(seed, madness=0.0).odometry())
+        # the first message sets the frames
+        publishers[Odometry].publish(Hostile(seed, fault_rate=0.0).odometry())
         time.sleep(0.1)
         for k in range(messages):
             message = hostile.odometry() if k % 3 == 0 else hostile.range()
@@ -284,7 +283,7 @@ def main() -> None:
     parser.add_argument('--seed', type=int, default=1)
     parser.add_argument('--dds', type=int, default=0, metavar='MESSAGES', help='over DDS as well')
     options = parser.parse_args()
-    # what cannot be interpreted is not worth a line each
+    # without a line for each message that cannot be deserialized
     rclpy.init(args=['fuzz', '--ros-args', '--log-level', 'FATAL'])
     with tempfile.TemporaryDirectory() as folder:
         fuzz = Fuzz(options.seed, Path(folder))

@@ -1,4 +1,4 @@
-"""Messages, transforms and parameters that no robot should send: what `fuzz.py` feeds the node with."""
+"""Messages, transforms and parameters that no robot should send, for `fuzz.py`."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ ODD_SECONDS = (0, -1, -(2**31), 2**31 - 1, 3600)
 
 
 class TransformFailed(Exception):
-    """The base of what the transforms raise."""
+    """Base class of the exceptions of transforms."""
 
 
 class ExtrapolationException(TransformFailed):
@@ -39,44 +39,44 @@ class ExtrapolationException(TransformFailed):
 
 
 class Hostile:
-    """A robot gone mad: most of what it sends is right, and the rest is anything at all."""
+    """A faulty robot: most of its messages are right, and the others are arbitrary."""
 
-    def __init__(self, seed: int, madness: float = 0.2) -> None:
+    def __init__(self, seed: int, fault_rate: float = 0.2) -> None:
         self.random = random.Random(seed)
-        self._madness = madness
+        self._fault_rate = fault_rate
         self._now = 100.0
         self._pose = [0.0, 0.0, 0.0]
 
-    def mad(self) -> bool:
-        """Throw the dice."""
-        return self.random.random() < self._madness
+    def faulty(self) -> bool:
+        """Return whether the next value is arbitrary, at random."""
+        return self.random.random() < self._fault_rate
 
     def single(self) -> float:
-        """Return any float32."""
+        """Return an arbitrary float32."""
         if self.random.random() < 0.5:
             return self.random.choice(ODD_FLOATS)
         return float(struct.unpack('<f', self.random.randbytes(4))[0])
 
     def double(self) -> float:
-        """Return any float64."""
+        """Return an arbitrary float64."""
         if self.random.random() < 0.5:
             return self.random.choice((*ODD_FLOATS, 1e308, -1e308, 2e7, 1e4))
         return float(struct.unpack('<d', self.random.randbytes(8))[0])
 
     def name(self) -> str:
-        """Return any name."""
+        """Return an arbitrary name."""
         kind = self.random.random()
         if kind < 0.6:
             return self.random.choice(ODD_NAMES)
         return ''.join(chr(self.random.randrange(1, 0xD000)) for _ in range(self.random.randrange(40)))
 
     def stamp(self, header: Any) -> None:
-        """Stamp a message with its time, or with any."""
+        """Set the stamp of a message to its time, or to an arbitrary one."""
         seconds = self._now
-        if self.mad() and self.mad():
+        if self.faulty() and self.faulty():
             seconds += self.random.choice((-0.5, 0.5, -2.0, 5.0, 1e4, -1e4))
         header.stamp.sec, header.stamp.nanosec = int(seconds), int(seconds % 1 * 1e9)
-        if self.mad() and self.mad() and self.mad():
+        if self.faulty() and self.faulty() and self.faulty():
             header.stamp.sec = self.random.choice(ODD_SECONDS)
             header.stamp.nanosec = self.random.choice((0, 999_999_999, 2**32 - 1))
 
@@ -85,7 +85,7 @@ class Hostile:
         made = Range(min_range=0.05, max_range=4.0, field_of_view=0.3, range=self.random.uniform(0.0, 5.0))
         made.header.frame_id = self.random.choice(FRAMES)
         self.stamp(made.header)
-        while self.mad():
+        while self.faulty():
             field = self.random.choice(
                 ('range', 'min_range', 'max_range', 'field_of_view', 'variance', 'frame_id', 'radiation_type')
             )
@@ -98,7 +98,7 @@ class Hostile:
         return self._garbled(made)
 
     def odometry(self) -> Odometry:
-        """Return an Odometry; time and robot go on."""
+        """Return an Odometry; time and robot advance."""
         self._now += self.random.choice((0.02, 0.02, 0.05, 0.0))
         for k in range(3):
             self._pose[k] += self.random.uniform(-0.02, 0.021)
@@ -108,7 +108,7 @@ class Hostile:
         position, turn = made.pose.pose.position, made.pose.pose.orientation
         position.x, position.y = self._pose[:2]
         turn.z, turn.w = math.sin(self._pose[2] / 2), math.cos(self._pose[2] / 2)
-        while self.mad():
+        while self.faulty():
             part, field = self.random.choice(
                 [(position, f) for f in 'xyz'] + [(turn, f) for f in 'xyzw'] + [(made, 'names')]
             )
@@ -119,30 +119,30 @@ class Hostile:
         return self._garbled(made)
 
     def _garbled(self, message: Any) -> Any:
-        """Return the message after some of its bytes were changed on the way, where it still decodes."""
-        if not (self.mad() and self.mad()):
+        """Return the message with some of its bytes changed, if it can still be deserialized."""
+        if not (self.faulty() and self.faulty()):
             return message
         try:
             return deserialize_message(self.garbled_bytes(message), type(message))
-        except Exception:  # what does not decode never comes to a callback
+        except Exception:  # such a message would not reach a callback
             return message
 
     def garbled_bytes(self, message: Any) -> bytes:
-        """Return the serialized message, cut, changed, or replaced by noise."""
+        """Return the serialized message, truncated, changed, or replaced by noise."""
         data = bytearray(serialize_message(message))
         kind = self.random.random()
         if kind < 0.2:
-            # an empty one blocks the writer that sends it, inside the middleware, and nobody else
+            # an empty one would block its own writer in the middleware
             return bytes(data[: self.random.randrange(1, len(data))])
         if kind < 0.4:
             return bytes(data[:4]) + self.random.randbytes(self.random.randrange(120))
         for _ in range(self.random.randrange(1, 8)):
-            # after the encapsulation, and most often in the numbers at the end
+            # after the encapsulation header, mostly in the numbers at the end
             data[self.random.randrange(4, len(data))] = self.random.randrange(256)
         return bytes(data)
 
     def parameter(self) -> Parameter:
-        """Return a parameter with a value that it may not take."""
+        """Return a parameter with an invalid value."""
         row = self.random.choice(TABLE)
         values = (
             lambda: self.random.uniform(row.low, row.high) if math.isfinite(row.low + row.high) else 1.0,
@@ -156,10 +156,10 @@ class Hostile:
         return Parameter(name, value=value)
 
     def clear(self) -> None:
-        """Forget transforms, as a buffer of tf2 does; none was kept."""
+        """Do nothing: no transform is stored."""
 
     def lookup_transform(self, target: str, source: str, time: Any) -> Any:
-        """Answer as a `tf2_ros.Buffer` does."""
+        """Return a transform, or raise, as `tf2_ros.Buffer` does."""
         from geometry_msgs.msg import TransformStamped
 
         found = TransformStamped()

@@ -1,9 +1,9 @@
 #!/usr/bin/env python3
-"""Where the time of EM goes: steps of the search, and single kernels on the map that it found.
+"""Time of EM: steps of the search, and single kernels on the resulting map.
 
 usage: kernels.py [--runs 5] [--patience 0]
 
-All on one thread. A kernel's time is also given for the unit that its work is counted in.
+All on one thread. A kernel's time is also given per unit of its work.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from forward_grid_mapper.simulation.drive import building_drive, corridor_drive
 loop = numba.njit(nogil=True, error_model='numpy')
 
 SAMPLE = 1000
-"""Occupied cells that are flipped, and flipped back."""
+"""Occupied cells that are flipped twice."""
 
 
 @loop
@@ -84,7 +84,7 @@ def _flip_all(s: State, cells: Any) -> None:
 
 @loop
 def _touched(s: State, cells: Any, sizes: Any) -> int:
-    """Return the pairs of all readings that see `cells`, each reading counted for each cell."""
+    """Return the number of pairs of all readings whose cones contain `cells`, with a reading counted for each cell."""
     n = 0
     for c in cells:
         for i in range(find_observing(s, c)):
@@ -93,7 +93,7 @@ def _touched(s: State, cells: Any, sizes: Any) -> int:
 
 
 class Steps(Search):
-    """A search that keeps the time of its steps."""
+    """A search that records the time of its steps."""
 
     def __init__(self, *arguments: Any) -> None:
         super().__init__(*arguments)
@@ -190,7 +190,7 @@ def profile(name: str, readings: Readings, runs: int) -> None:
 
 
 def _scanned(s: State, cells: Any) -> int:
-    """Return how many readings are in the lists of the cells' tiles."""
+    """Return the number of readings in the lists of the cells' tiles."""
     total = 0
     for c in cells:
         row, column = divmod(int(c), s.lattice.width)

@@ -1,10 +1,10 @@
 #!/usr/bin/env python3
-"""Kills a node that keeps a journal, again and again, after all sorts of mischief, and counts what was lost.
+"""Kills a node with a journal repeatedly, after various faults, and counts lost readings.
 
 usage: kill.py [--times 50] [--rate 200] [--seed 1]
 
 A robot publishes all the time. The node is started, killed (SIGKILL) at a random moment, and started again with the
-same journal. Before each kill something else goes wrong in turn:
+same journal. Before each kill there is another fault, in turn:
 
     nothing
     reset         ~/reset is called until the kill
@@ -15,11 +15,11 @@ same journal. Before each kill something else goes wrong in turn:
     descriptors   the process has no free file descriptor
     hostile       before the start, the newest file is replaced by a database with an endless view, with readings that
                   are not finite, with a trigger, by random bytes, or by a pipe
-    starting      the kill comes at any moment from the start on
+    starting      the node is killed at a random moment after its start
 
-After each kill, every reading that was published between the first that the node took and one second before the kill
-must be in a file of the journal, and none twice in a file; everything that was in a file before it was deleted, moved
-or cut must be in another. No node may print a traceback. Needs rclpy.
+After each kill, every reading that was published between the first one accepted by the node and one second before the
+kill must be in a file of the journal, and none twice in a file; all readings of a file that was deleted, moved or
+truncated must be in another one. No node may print a traceback. Needs rclpy.
 """
 
 from __future__ import annotations
@@ -54,13 +54,13 @@ from forward_grid_mapper.files.journal_reader import log_of, read
 
 SECOND = 1_000_000_000
 START = 600
-"""Seconds that a node may take to its first reading; the first start compiles kernels."""
+"""Longest time from the start of a node to its first reading, seconds; the first start compiles kernels."""
 
 KINDS = ('nothing', 'reset', 'deleted', 'moved', 'cut', 'full', 'descriptors', 'hostile', 'starting')
 
 
 class Robot:
-    """Publishes a reading and an odometry message at a steady rate, each stamped with now, in a thread."""
+    """Publishes readings and odometry at a steady rate, with the current time as stamps, in a thread."""
 
     def __init__(self, rate: float) -> None:
         rclpy.init()
@@ -76,13 +76,13 @@ class Robot:
         self._thread.start()
 
     def stop(self) -> None:
-        """Publish no more."""
+        """Stop publishing."""
         self._ended.set()
         self._thread.join()
         rclpy.shutdown()
 
     def reset(self) -> None:
-        """Call ~/reset, and go on."""
+        """Call ~/reset repeatedly."""
         self._reset.call_async(Trigger.Request())
 
     def _run(self) -> None:
@@ -102,7 +102,7 @@ class Robot:
 
 
 class Node:
-    """The node with a journal, in a process of its own."""
+    """The node with a journal, in its own process."""
 
     def __init__(self, folder: Path, log: Path) -> None:
         values = {
@@ -119,14 +119,14 @@ class Node:
             self.process = subprocess.Popen(command, stdout=out, stderr=subprocess.STDOUT)
 
     def kill(self) -> str:
-        """Kill it; return what it printed."""
+        """Kill it; return its output."""
         self.process.kill()
         self.process.wait()
         return self.log.read_text()
 
 
 def in_file(path: Path) -> np.ndarray:
-    """Return the stamps of the readings in a journal file; none where it is no journal."""
+    """Return the stamps of the readings in a journal file; none if it is not a journal."""
     found = [np.zeros(0, np.int64)]
     with contextlib.suppress(BagError):
         found += [readings.stamp for readings in read(path, Contents())]
@@ -134,18 +134,18 @@ def in_file(path: Path) -> np.ndarray:
 
 
 def kept(folder: Path) -> np.ndarray:
-    """Return the stamps of the readings in all files of a journal, each once."""
+    """Return the stamps of the readings in all files of a journal, without repetitions."""
     return np.unique(np.concatenate([np.zeros(0, np.int64), *map(in_file, drives(folder))]))
 
 
 def twice(folder: Path) -> int:
-    """Return how many readings are there twice in a file."""
+    """Return the number of readings that are twice in a file."""
     counts = [(len(stamps), len(np.unique(stamps))) for stamps in map(in_file, drives(folder))]
     return sum(count - unique for count, unique in counts)
 
 
 def make_hostile(path: Path, rng: random.Random) -> str:
-    """Replace a file by something that no node wrote; return what."""
+    """Replace a file by one that no node wrote; return its kind."""
     log_of(path).unlink(missing_ok=True)
     path.unlink()
     kind = rng.choice(['view', 'not finite', 'trigger', 'bytes', 'pipe'])
@@ -176,7 +176,7 @@ def make_hostile(path: Path, rng: random.Random) -> str:
 
 
 def keep_from_growing(node: Node, folder: Path) -> None:
-    """Bound the size of files for three seconds, and give the node three more."""
+    """Bound the size of files for three seconds, and wait three more."""
     largest = max(path.stat().st_size for path in folder.iterdir() if path.is_file())
     unbounded = (resource.RLIM_INFINITY, resource.RLIM_INFINITY)
     resource.prlimit(node.process.pid, resource.RLIMIT_FSIZE, (largest, resource.RLIM_INFINITY))
@@ -185,8 +185,8 @@ def keep_from_growing(node: Node, folder: Path) -> None:
     time.sleep(3.0)
 
 
-def mischief(kind: str, node: Node, robot: Robot, folder: Path, rng: random.Random) -> None:
-    """Do what goes wrong before the kill, and leave the node the time to notice."""
+def cause_fault(kind: str, node: Node, robot: Robot, folder: Path, rng: random.Random) -> None:
+    """Cause a fault before the kill, and wait until the node can notice."""
     path = drive_file(folder)
     assert path is not None
     files = [file for file in (path, log_of(path)) if file.exists()]
@@ -205,7 +205,7 @@ def mischief(kind: str, node: Node, robot: Robot, folder: Path, rng: random.Rand
     elif kind == 'full':
         keep_from_growing(node, folder)
     elif kind == 'descriptors':
-        # those that are open stay open
+        # open files remain open
         resource.prlimit(node.process.pid, resource.RLIMIT_NOFILE, (3, 1024))
     if kind in ('deleted', 'moved', 'cut'):
         time.sleep(3.0)
@@ -213,7 +213,7 @@ def mischief(kind: str, node: Node, robot: Robot, folder: Path, rng: random.Rand
 
 
 def main() -> int:
-    """Run the kills; return 1 if anything was lost that should not be."""
+    """Run the kills; return 1 if readings were lost that must not be."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument('--times', type=int, default=50)
     parser.add_argument('--rate', type=float, default=200.0)
@@ -241,7 +241,7 @@ def main() -> int:
                         return 1
                     time.sleep(0.2)
                 before = kept(folder)
-                mischief(kind, node, robot, folder, rng)
+                cause_fault(kind, node, robot, folder, rng)
             died = time.time_ns()
             said = node.kill()
             stamps = kept(folder)

@@ -1,11 +1,11 @@
 #!/usr/bin/env python3
-"""How good the live map is, and how fast: the default, and one sum of all readings as in the paper.
+"""Quality and speed of the live map: the default, and one sum of all readings as in the paper.
 
 usage: live.py [--quick]
 
-On buildings of many materials drawn at random (`material_worlds.py`), of which the first 24 are those that the default
-was tuned on and the others are not; on the worlds of `quality.py`; and on the recordings under ../shared/data where
-they are. Figures are those of ../shared/tools/score_map.py, of all cells with a probability. --quick takes fewer.
+On random buildings of many materials (`material_worlds.py`), of which the first 24 were used to tune the default and
+the others were not; on the worlds of `quality.py`; and on the recordings under ../shared/data, if they exist. Figures
+are those of ../shared/tools/score_map.py, for all cells with a probability. --quick uses fewer drives.
 """
 
 from __future__ import annotations

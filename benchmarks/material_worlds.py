@@ -1,10 +1,10 @@
-"""Drives through buildings drawn at random, whose walls are of many materials, to tune maps on and to judge them.
+"""Drives through random buildings with walls of many materials, for tuning and evaluation of maps.
 
-Floor plans are a corridor or two with rooms on both sides and a hall, turned by any angle, so that no wall runs along
-the lattice. Walls have two faces. Each piece of 3 m is of one material, which returns echoes up to an incidence of its
-own: rough, smooth, or glass. Furniture and thin posts stand about, and posts are heard from near only, or never. Where
-a cone hears nothing directly it may hear by way of the wall that its axis meets. Echoes are lost, come too early
-or from another sensor. The truth is what a laser on the robot would have seen.
+Floor plans are one or two corridors with rooms on both sides and a hall, rotated by any angle, so that no wall is
+parallel to the lattice. Walls have two faces. Each piece of 3 m has one material, which returns echoes up to its own
+largest incidence: rough, smooth, or glass. There are furniture and thin posts; posts return echoes only to near
+sensors, or never. A cone without a direct echo may have one by reflection at the wall that its axis hits. Echoes may
+be lost, too early, or from another sensor. The truth is the map of a laser on the robot.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ Floats = NDArray[np.float64]
 
 CELL = 0.1
 PIECE = 3.0
-"""Metres of wall of one material."""
+"""Length of wall with one material, metres."""
 LASER = 8.0
 CLEARANCE = 0.33
-"""Metres that the robot's centre keeps from everything."""
+"""Smallest distance of the robot's centre from objects, metres."""
 
 SENSORS: tuple[tuple[SonarArray, float], ...] = (
     (front_array(), 0.1),
@@ -43,12 +43,12 @@ SENSORS: tuple[tuple[SonarArray, float], ...] = (
     (sonar_ring(8, field_of_view=math.radians(30.0), max_range=4.0), 0.1),
     (sonar_ring(16, max_range=5.0), 0.12),
 )
-"""Sonars and metres between sweeps, one after the other for the seeds."""
+"""Sonars and metres between sweeps, in turn for the seeds."""
 
 
 @dataclass
 class Plan:
-    """Faces with what they return: segments in metres, largest incidence in radians, and from how far heard."""
+    """Faces and their reflection: segments in metres, largest incidence in radians, and largest range of echoes."""
 
     rng: np.random.Generator
     segments: list[tuple[float, float, float, float]] = field(default_factory=list)
@@ -58,7 +58,7 @@ class Plan:
     rooms: list[tuple[float, float, float, float]] = field(default_factory=list)
 
     def material(self) -> float:
-        """Return the largest incidence of a material: more than half is rough, some of it glass."""
+        """Return a random largest incidence: that of more than half is rough, that of some is glass."""
         kind = self.rng.random()
         low, high = (45, 80) if kind < 0.55 else (20, 45) if kind < 0.85 else (10, 20)
         return math.radians(self.rng.uniform(low, high))
@@ -73,7 +73,7 @@ class Plan:
             self.heard.append(math.inf)
 
     def box(self, x: float, y: float, size: tuple[float, float], heard: float = math.inf) -> None:
-        """Add the four sides of a thing about a point."""
+        """Add the four sides of an object around a point."""
         w, h = size[0] / 2, size[1] / 2
         limit = self.material() if math.isinf(heard) else math.pi / 2
         corners = ((x - w, y - h), (x + w, y - h), (x + w, y + h), (x - w, y + h))
@@ -121,7 +121,7 @@ class Plan:
         self._furnish((low, bottom, high, top), rng.integers(1, 6))
 
     def _hall(self, x: float, width: float) -> None:
-        """Draw a hall as wide as it likes at the end of the corridor."""
+        """Draw a hall of random width at the end of the corridor."""
         rng = self.rng
         below, above, long = rng.uniform(0.5, 4.0), rng.uniform(0.5, 4.0), rng.uniform(3.0, 8.0)
         low, high = -below, width + above
@@ -146,7 +146,7 @@ class Plan:
 
 @dataclass(frozen=True)
 class Physics:
-    """How a building's sonars err: shares of readings, echoes too early per metre, and ghosts of silent cones."""
+    """Errors of a building's sonars: fractions of readings, echoes too early per metre, and ghosts without echoes."""
 
     lost: float
     early: float
@@ -158,7 +158,7 @@ class Physics:
 
 
 def physics_of(rng: np.random.Generator) -> Physics:
-    """Return some physics; `fading` is how much of the largest incidence is lost towards the edge of the beam."""
+    """Return random errors; `fading` is the decrease of the largest incidence towards the edge of the beam."""
     u = rng.uniform
     return Physics(u(0, 0.12), u(0, 0.04), u(0.005, 0.06), u(0.2, 0.8), u(0.003, 0.015), u(0.01, 0.03), u(0, 0.5))
 
@@ -170,7 +170,7 @@ def _rays(plan: Plan, turn: float) -> Floats:
 
 
 def way_through(plan: Plan, rng: np.random.Generator) -> Floats:
-    """Return a way through most rooms, one point each few centimetres, shape (P, 2), in the plan's own frame."""
+    """Return a path through most rooms, a point every few centimetres, shape (P, 2), in the plan's own frame."""
     segments = np.array(plan.segments)
     low = np.minimum(segments[:, :2], segments[:, 2:]).min(0) - 0.5
     high = np.maximum(segments[:, :2], segments[:, 2:]).max(0) + 0.5
@@ -227,7 +227,7 @@ def way_through(plan: Plan, rng: np.random.Generator) -> Floats:
 
 
 def poses_along(points: Floats, spacing: float) -> Floats:
-    """Return poses every `spacing` metres, looking ahead, shape (T, 3)."""
+    """Return poses every `spacing` metres, heading along the path, shape (T, 3)."""
     away = np.r_[0.0, np.cumsum(np.hypot(*np.diff(points, axis=0).T))]
     at = np.arange(0.0, away[-1], spacing)
     x, y = (np.interp(at, away, points[:, k]) for k in range(2))
@@ -238,7 +238,7 @@ def poses_along(points: Floats, spacing: float) -> Floats:
 def sound(
     plan: Plan, segments: Floats, origins: Floats, angles: Floats, off: Floats, reach: float, physics: Physics
 ) -> tuple[Floats, Floats, NDArray[np.int64]]:
-    """Return the length of each ray if it comes back (else inf), its length, and what it hits."""
+    """Return the length of each ray if it returns (else inf), its length, and the index of what it hits."""
     distance, hit = cast(origins, angles, segments, reach)
     normal = np.arctan2(segments[:, 3] - segments[:, 1], segments[:, 2] - segments[:, 0]) + math.pi / 2
     incidence = np.arccos(np.clip(np.abs(np.cos(angles - normal[hit])), 0, 1))
@@ -276,9 +276,9 @@ def measure(
 
 
 def seen_by_laser(segments: Floats, poses: Floats, mostly: bool) -> tuple[Floats, tuple[float, float]]:
-    """Return the truth (1 occupied, 0 free, NaN unknown) that a laser makes on the way, and its lower left corner.
+    """Return the map of a laser along the path (1 occupied, 0 free, NaN unknown), and its lower left corner.
 
-    A cell is occupied where a ray ended, or, with `mostly`, where three did and most of those that came there.
+    A cell is occupied if a ray ended in it, or, with `mostly`, if three rays or more ended in it, and more than passed.
     """
     angles = np.linspace(-math.pi, math.pi, 720, endpoint=False)
     low = np.floor((np.minimum(segments[:, :2], segments[:, 2:]).min(0) - 0.5) / CELL) * CELL
@@ -309,7 +309,7 @@ def seen_by_laser(segments: Floats, poses: Floats, mostly: bool) -> tuple[Floats
 
 
 def _count_passes(pose: Floats, angles: Floats, far: Floats, end: Floats, low: Floats, passed: Any) -> None:
-    """Add to each cell the rays of a scan that passed it: that were in it, and did not end in it."""
+    """Add to each cell the number of rays of a scan that passed it without ending in it."""
     along = np.arange(0.0, LASER, CELL / 2)
 
     def cell_at(length: Floats) -> NDArray[np.int64]:
@@ -321,13 +321,13 @@ def _count_passes(pose: Floats, angles: Floats, far: Floats, end: Floats, low: F
     cells = cell_at(along[None, :])
     last = cell_at(np.where(np.isfinite(end), end, 0.0)[:, None])
     on = (along < far[:, None]) & (cells >= 0) & ((cells != last) | np.isinf(end)[:, None])
-    # once a ray
+    # once for each ray
     on[:, 1:] &= ~(on[:, :-1] & (cells[:, 1:] == cells[:, :-1]))
     passed += np.bincount(cells[on], minlength=passed.size).reshape(passed.shape)
 
 
 class BuildingDrive(NamedTuple):
-    """A drive through a building drawn at random: sensors, faces (world frame), exact poses and readings."""
+    """A drive through a random building: sensors, faces (world frame), exact poses and readings."""
 
     sonars: SonarArray
     segments: Floats
@@ -343,9 +343,9 @@ def building_drive(seed: int, sensors: int | None = None, there_and_back: bool =
     ----------
     seed : int
     sensors : int, optional
-        Which of `SENSORS`; by default, the seed chooses.
+        Index in `SENSORS`; by default, the seed chooses.
     there_and_back : bool
-        Whether the robot drives back as well, and then another way through the building.
+        Whether the robot drives back as well, and then another path through the building.
     """
     rng = np.random.default_rng([seed, 77])
     sonars, spacing = SENSORS[(seed if sensors is None else sensors) % len(SENSORS)]
@@ -376,14 +376,14 @@ def building_drive(seed: int, sensors: int | None = None, there_and_back: bool =
 
 
 def building_case(seed: int, sensors: int | None = None, mostly: bool = False) -> Case:
-    """Return the drive of a seed, and what a laser would have seen.
+    """Return the drive of a seed, and the map of a laser.
 
     Parameters
     ----------
     seed, sensors
         As in `building_drive`.
     mostly : bool
-        What the truth calls a wall, as in `seen_by_laser`.
+        Definition of occupied cells, see `seen_by_laser`.
     """
     driven = building_drive(seed, sensors)
     truth, origin = seen_by_laser(driven.segments, driven.poses, mostly)

@@ -1,4 +1,4 @@
-"""What all benchmarks need: the machine, settings, own processes, memory, medians, and memory read in one stream."""
+"""Common parts of benchmarks: the machine, settings, processes, memory, medians, and the bandwidth of memory."""
 
 from __future__ import annotations
 
@@ -31,14 +31,14 @@ PLAIN: dict[str, float] = {
     'least_passed': 0.0,
     'likelihood_exponent': 1.0,
 }
-"""Parameters with which the search maximises nothing but log p(Z | m) + logit(prior) x (occupied cells), over maps
-without an occupied cell where a sensor was moved."""
+"""Parameters for which the search maximises only log p(Z | m) + logit(prior) x (occupied cells), over maps
+without occupied cells on the paths of sensors."""
 
 LITTLE = 0.1
 """Fraction of the machine that other processes may use during a run."""
 
 PATIENCE = 'BENCHMARK_PATIENCE'
-"""Name of the environment variable that says how many seconds to wait for such runs, for processes of their own too."""
+"""Environment variable with the seconds to wait for undisturbed runs, also for processes started by a benchmark."""
 
 
 def machine() -> str:
@@ -66,13 +66,13 @@ def setting(text: str) -> tuple[str, Any]:
 
 
 def in_own_process(work: Callable[..., T], *arguments: Any) -> T:
-    """Return what `work` returns in a process that did nothing before, so that its memory can be measured."""
+    """Return the result of `work` in a new process, so that its memory can be measured."""
     with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context('spawn')) as pool:
         return pool.submit(work, *arguments).result()
 
 
 class Others:
-    """How much of the machine other processes use, from here on; needs Linux."""
+    """The fraction of the machine that other processes use from now on; needs Linux."""
 
     def __init__(self) -> None:
         self._all, self._own, self._begin = self._busy(), time.process_time(), time.perf_counter()
@@ -91,10 +91,10 @@ class Others:
 
 
 def undisturbed(work: Callable[[], T], runs: int) -> tuple[list[T], float]:
-    """Return what `work` returned in the `runs` runs that others disturbed least, and how much they did at most.
+    """Return the results of the `runs` runs with the least use by other processes, and their largest such use.
 
-    It is run until they used less than `LITTLE` of the machine in so many runs, or until PATIENCE seconds are over.
-    So the choice is by what others did, never by how long a run took.
+    Runs are repeated until others used less than `LITTLE` of the machine in so many runs, or until PATIENCE seconds are
+    over. So runs are selected by the use of others, never by their own duration.
     """
     done: list[tuple[float, int, T]] = []
     patience, begin = float(os.environ.get(PATIENCE, '0')), time.perf_counter()
@@ -111,7 +111,7 @@ def undisturbed(work: Callable[[], T], runs: int) -> tuple[list[T], float]:
 
 
 def timed(work: Callable[[], object], runs: int) -> float:
-    """Return the median of the seconds that `work` takes."""
+    """Return the median duration of `work`, seconds."""
 
     def run() -> float:
         begin = time.perf_counter()
@@ -122,9 +122,9 @@ def timed(work: Callable[[], object], runs: int) -> float:
 
 
 class Timing(dict[str, float]):
-    """Medians over runs, in seconds: each stage, and `total`, all but the standard map, which no other map needs.
+    """Medians over runs, in seconds: each stage, and `total`, all except the standard map, which no other map needs.
 
-    `maps` are those of the last run, `others` is what other processes used of the machine at most.
+    `maps` are those of the last run, `others` is the largest use of the machine by other processes.
     """
 
     def __init__(self, parameters: Parameters, readings: Readings, runs: int) -> None:
@@ -143,22 +143,22 @@ class Timing(dict[str, float]):
 
 
 def memory_in_use() -> int:
-    """Return the bytes of memory that this process has now."""
+    """Return the memory of this process, bytes."""
     return _status('VmRSS')
 
 
 class PeakMemory:
-    """The growth of this process's peak memory from here on; needs Linux."""
+    """The growth of this process's peak memory from now on; needs Linux."""
 
     def __init__(self) -> None:
         gc.collect()
-        # makes the kernel forget the peak so far
+        # resets the kernel's peak
         Path('/proc/self/clear_refs').write_text('5')
         self._before = _status('VmRSS')
 
     @property
     def growth(self) -> int:
-        """Bytes by which the highest use since then was above the use at that time."""
+        """Difference between the peak since then and the memory at that time, bytes."""
         return _status('VmHWM') - self._before
 
 
@@ -178,7 +178,7 @@ def _sum(words: Any) -> Any:
 
 
 def stream_seconds(size: float, runs: int) -> float:
-    """Return how long it takes to read so many bytes of memory once, on one core, from the first to the last."""
+    """Return the time to read so many bytes of memory once in sequence, on one core, seconds."""
     words = np.ones(max(int(size) // 8, 1), np.uint64)
     _sum(words)
     return timed(lambda: _sum(words), runs)

@@ -1,17 +1,17 @@
 #!/usr/bin/env python3
-"""Changes modules in small ways, one change at a time, and counts how many of the changes the tests notice.
+"""Mutation tests: changes modules one small change at a time, and counts the changes that tests detect.
 
 usage: mutation.py [--only NAME ...] [--most 100] [--seed 0] [--survivors]
 
-The changes are made by cosmic-ray 8 (`pip install cosmic-ray`, in an environment of its own if that is on the path), in
-a copy of the checkout: operators, comparisons, numbers and constants are replaced, loops and exceptions left out, and
-so on. The tests of a module are run after each change, without compiling kernels where none of the node's parts starts.
-The score is the part of the changes with which a test fails, or does not end; changes that mean the same as before
-count against it. `--survivors` prints the others. Of more than `--most` changes of a module, so many are
-tried, drawn with `--seed`.
+cosmic-ray 8 makes the changes (`pip install cosmic-ray`, in its own environment if that is on the path), in a copy of
+the checkout: operators, comparisons, numbers and constants are replaced, loops and exceptions left out, and so on. The
+tests of a module are run after each change, without compilation of kernels unless a part of the node starts. The score
+is the fraction of changes with which a test fails, or does not end; equivalent changes count against it.
+`--survivors` prints undetected ones. Of more than `--most` changes of a module, so many are tried, drawn with
+`--seed`.
 
-Left out are changes of `|`, nearly all of which are in annotations that are never evaluated, and those of an operator
-into one of bits, modulo or powers, which any test notices.
+Changes of `|` are left out, nearly all of which are in annotations that are never evaluated, and those of an operator
+into a bitwise one, modulo or powers, which any test detects.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ MODULES = {
     'node/ros_parameters': ('node/test_ros_parameters',),
     'node/saver': ('node/test_saver',),
 }
-"""Modules, and the tests that must notice their changes, with what else pytest is told; each takes seconds."""
+"""Modules, and the tests that must detect their changes, with options of pytest; each takes seconds."""
 
 LEFT_OUT = [
     'core/ReplaceBinaryOperator_BitOr_.*',
@@ -66,7 +66,7 @@ LEFT_OUT = [
     'core/ReplaceUnaryOperator_.*_Invert',
     'core/ReplaceComparisonOperator_.*_(Is|IsNot)',
 ]
-"""`|` is nearly always in annotations, which are never evaluated; the others would be noticed by any test."""
+"""`|` is nearly always in annotations, which are never evaluated; any test detects the others."""
 
 CONFIGURATION = """
 [cosmic-ray]
@@ -84,7 +84,7 @@ exclude-operators = {left_out}
 
 
 def copy_of_checkout(folder: Path) -> None:
-    """Copy what the tests need."""
+    """Copy the files that the tests need."""
     for name in ('forward_grid_mapper', 'test', 'benchmarks', 'config', 'docs', 'launch'):
         shutil.copytree(ROOT / name, folder / name, ignore=shutil.ignore_patterns('__pycache__', 'kernels_*'))
     for name in ('pyproject.toml', 'README.md', 'setup.py', 'setup.cfg', 'package.xml'):
@@ -92,7 +92,7 @@ def copy_of_checkout(folder: Path) -> None:
 
 
 def draw(session: Path, most: int, seed: int) -> int:
-    """Leave so many of the changes that are to be made; return how many there were."""
+    """Keep so many of the planned changes; return their number before."""
     with contextlib.closing(sqlite3.connect(session)) as database, database:
         found = database.execute(
             'select job_id from mutation_specs where job_id not in (select job_id from work_results) '
@@ -105,15 +105,15 @@ def draw(session: Path, most: int, seed: int) -> int:
 
 
 def changes_of(module: str, folder: Path, most: int, seed: int) -> tuple[int, list[tuple[bool, str]]]:
-    """Return how many changes of a module there are, and of each that was made whether a test noticed it, and what."""
+    """Return the number of changes of a module, and for each one tried whether it was detected, and its text."""
     configuration = folder / 'cosmic_ray.toml'
     session = folder / f'{module.replace("/", "_")}.sqlite'
-    # sources change within a second and without changing in size, which compiled files would hide
+    # sources change within a second and with the same size, which bytecode caches would not notice
     environment = {
         **os.environ,
         'PYTHONPATH': str(folder),
         'PYTHONDONTWRITEBYTECODE': '1',
-        # a node compiles its kernels when it starts; no change is to one of them
+        # a node compiles its kernels at its start; kernels are not changed
         'NUMBA_DISABLE_JIT': str(int(not module.startswith('node/'))),
         'NUMBA_CACHE_DIR': os.environ.get('NUMBA_CACHE_DIR', str(folder / 'kernels')),
         'PYTEST_DISABLE_PLUGIN_AUTOLOAD': '1',

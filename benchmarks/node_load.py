@@ -1,12 +1,12 @@
 #!/usr/bin/env python3
-"""How many readings a second the node takes without losing one, and what that costs.
+"""Rate of readings that the node processes without a loss, and its cost.
 
 usage: node_load.py [--rates 480 1000 2000 ...] [--seconds 10] [--best-effort] [--em]
 
-Starts the node in a process of its own, publishes Range from 24 sonars at each rate, with odometry at 50 Hz, and
-reads the node's own account from /diagnostics. `lost` counts readings that never arrived, `est.` those that the node
-says were lost, `cpu` is the node's part of one core, `delay` the longest time from publishing a reading to taking it.
-With --em, EM runs all the while, again and again over everything that was sent so far. Needs rclpy.
+Starts the node in its own process, publishes Range from 24 sonars at each rate, with odometry at 50 Hz, and reads the
+node's counts from /diagnostics. `lost` is the number of readings that never arrived, `est.` the number of losses that
+the node estimated, `cpu` the node's use of one core, `delay` the longest time from publishing a reading to its
+callback. With --em, EM runs repeatedly on all readings so far. Needs rclpy.
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ class Load:
                     self.counts[key] = int(values[f'readings {key}'])
 
     def stamp(self, header: object) -> None:
-        """Stamp a message with now."""
+        """Set the stamp of a message to the current time."""
         header.stamp.sec, header.stamp.nanosec = divmod(time.time_ns(), 1_000_000_000)
 
     def run(self, rate: float, seconds: float, em: bool) -> None:
@@ -110,7 +110,7 @@ class Load:
         self.sent += fired
 
     def settle(self, seconds: float = 4.0) -> None:
-        """Wait until the node has counted everything, or nothing more comes."""
+        """Wait until the node has counted all messages, or receives no more."""
         end = time.monotonic() + seconds
         while time.monotonic() < end and self.counts['received'] < self.sent:
             before = self.counts['received']

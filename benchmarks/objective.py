@@ -1,12 +1,12 @@
 #!/usr/bin/env python3
-"""The objective that EM reaches, here and in another checkout, evaluated by the same code.
+"""The objective that EM reaches, in this and in another checkout, evaluated by the same code.
 
 usage: objective.py [--against DIR] [--seeds 3] [--data ../shared/data]
 
-The paper's two worlds, the building, and the real recordings below --data where it is there; each with a prior and
-lost echoes, and with the paper's plain maximum likelihood, in both cases without what the defaults add to the
-paper's model, or the objectives would not be the same. For each map: J(m) = log p(Z | m) + logit(prior) x (occupied
-cells) in nats, from the exact forward model of this checkout; F1 in the simulated worlds, with one cell of tolerance.
+The paper's two worlds, the building, and the real recordings below --data, if they exist; each with a prior and lost
+echoes, and with the paper's plain maximum likelihood, in both cases without the default's extensions of the paper's
+model, since objectives would differ. For each map: J(m) = log p(Z | m) + logit(prior) x (occupied cells) in nats, from
+the exact forward model of this checkout; F1 in the simulated worlds, with one cell of tolerance.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ RUNS = 3
 
 
 class Reached(NamedTuple):
-    """A map, and the median of the seconds it took."""
+    """A map, and the median duration of its search, seconds."""
 
     grid: Grid
     ml: NDArray[np.int8]
@@ -52,17 +52,17 @@ class Reached(NamedTuple):
 
 
 def save(path: Path, readings: Readings, values: dict[str, float]) -> None:
-    """Write readings and parameters for another checkout to read."""
+    """Write readings and parameters for another checkout."""
     columns = {name: getattr(readings, name) for name in COLUMNS}
     np.savez(path, **columns, names=np.array(readings.sensor_names), values=np.array(json.dumps(values)))
 
 
 def reach(source: Path, target: Path) -> None:
-    """Map what `save` wrote; this alone runs in the other checkout."""
+    """Map the data of `save`; only this function runs in the other checkout."""
     with np.load(source) as file:
         values = json.loads(str(file['values']))
         readings = Readings.from_columns(tuple(file['names'].tolist()), **{name: file[name] for name in COLUMNS})
-    # what this checkout does not know it does not do
+    # parameters that this checkout does not have are left out
     known = Parameters().complete()
     parameters = Parameters.restored({name: value for name, value in values.items() if name in known})
     warm_up()
@@ -108,7 +108,7 @@ def main() -> None:
 
 def compare(options: argparse.Namespace) -> None:
     """Print the table."""
-    # not imported in another checkout, which need not have all of it
+    # not imported in another checkout, which may lack some of it
     from measuring import PLAIN, machine
 
     from forward_grid_mapper.core.sensor.forward_model import log_likelihood

@@ -1,13 +1,13 @@
 #!/usr/bin/env python3
-"""What it takes to keep the forward map up to date with every sweep of 24 sonars, and what it comes to.
+"""Time and quality of the online map, updated with every sweep of 24 sonars.
 
 usage: online.py [--only latency quality standing] [--seeds 3]
 
-latency   milliseconds a sweep while the robot drives, with 50 000 and 200 000 readings stored. Readings that say the
-          same as one before are merged; once as is, and once with that switched off, so that every reading is stored.
-quality   F1 and log-likelihood of the online map against those of EM on the same readings, with and without merging:
-          of simulated drives, and of the recordings under ../shared/data, where they are, fed 8 readings at a time
-standing  a robot stands still for an hour at 20 sweeps a second
+latency   milliseconds a sweep while the robot drives, with 50 000 and 200 000 readings stored. Readings equal to an
+          earlier one are merged; also without merging, so that every reading is stored.
+quality   F1 and log-likelihood of the online map and of EM on the same readings, with and without merging: simulated
+          drives, and the recordings under ../shared/data, if they exist, in steps of 8 readings
+standing  a robot does not move for an hour at 20 sweeps a second
 """
 
 from __future__ import annotations
@@ -38,18 +38,18 @@ from forward_grid_mapper.simulation.world import corridor_world
 
 SONARS = 24
 MEASURED = 500
-"""Sweeps that are timed once the readings are stored."""
+"""Sweeps that are timed after the readings are stored."""
 
 RECORDED_SONARS = 8
-"""Readings of the recordings that are fed at a time."""
+"""Readings of the recordings in each step."""
 
 RATE = 20
-"""Sweeps a second of the robot that stands."""
+"""Rate of sweeps of the robot that does not move, Hz."""
 
 
 @contextmanager
 def merging(on: bool) -> Iterator[None]:
-    """Switch merging of equal readings off, by calling none equal, for as long as the context lasts."""
+    """Disable merging of equal readings in a context, by treating all as different."""
     before = online_map.SAME_PLACE, online_map.SAME_RANGE
     if not on:
         online_map.SAME_PLACE = online_map.SAME_RANGE = 1e-9
@@ -60,13 +60,13 @@ def merging(on: bool) -> Iterator[None]:
 
 
 def sweeps(readings: Readings, size: int = SONARS) -> Iterator[Readings]:
-    """Return the readings sweep by sweep."""
+    """Yield the readings sweep by sweep."""
     for first in range(0, len(readings), size):
         yield readings.select(slice(first, first + size))
 
 
 class Times(NamedTuple):
-    """Milliseconds that sweeps took, shape (N,), and whether the map was refined then."""
+    """Durations of sweeps, milliseconds, shape (N,), and whether the map was refined in them."""
 
     taken: NDArray[np.float64]
     refined: NDArray[np.bool_]
@@ -78,7 +78,7 @@ class Times(NamedTuple):
 
     @property
     def refinement(self) -> str:
-        """Median, 95th percentile and maximum of those in which the map was refined."""
+        """Median, 95th percentile and maximum of sweeps with a refinement of the map."""
         return spread(self.taken[self.refined], (50, 95, 100))
 
 
@@ -111,7 +111,7 @@ def building(laps: int) -> Readings:
 
 
 def latencies(drive: Callable[[int], Readings], rounds: int, stored: int, merge: bool) -> tuple[int, int, str, float]:
-    """Return readings given and kept, the spread of the sweeps that follow, and milliseconds to read both maps out."""
+    """Return readings given and kept, the durations of later sweeps, and milliseconds to compute both maps."""
     warm_up()
     readings = drive(rounds)
     before = stored - stored % SONARS
@@ -142,7 +142,7 @@ def latency(seeds: int) -> None:
 
 
 def quality(seeds: int) -> None:
-    """Print how good the online map is."""
+    """Print the quality of the online map."""
     parameters = Parameters()
     print(f'\nThe map after all sweeps, one by one, against EM on the same readings; means of {seeds} drives;')
     print('logp: mean log-likelihood of a reading, nats')
@@ -206,7 +206,7 @@ def quality(seeds: int) -> None:
 
 
 def standing(seeds: int) -> None:
-    """Print what an hour of standing still costs."""
+    """Print the cost of an hour without motion."""
     warm_up()
     world, sonars = corridor_world(), sonar_ring(SONARS)
     online, drive = OnlineMap(Parameters()), corridor_drive(0)

@@ -1,10 +1,10 @@
 #!/usr/bin/env python3
-"""How often the search finds the best map of all, on maps small enough to try every one.
+"""How often the search finds the optimal map, on maps small enough for exhaustive search.
 
 usage: optimum.py [--cases 200] [--readings 12]
 
-Random readings on 4 x 3 and 4 x 4 cells. Prints the fraction of cases in which the search reached the true optimum, and
-how far below it ended in the others, in nats.
+Random readings on 4 x 3 and 4 x 4 cells. Prints the fraction of cases in which the search reached the optimum, and its
+distance from the optimum in the others, nats.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ from forward_grid_mapper.core.search.search import Search
 from forward_grid_mapper.core.sensor.forward_model import log_likelihood
 
 INDEPENDENT = {'end_cost': 0.0}
-"""Cells that know nothing of each other, as in the sum over all maps here."""
+"""Cells are independent, as in the exhaustive search here."""
 
 
 def random_readings(rng: np.random.Generator, grid: Grid, count: int) -> Readings:
-    """Return readings from random places of the grid in random directions, one in four without echo."""
+    """Return readings at random poses in the grid, one in four without echo."""
     left, right, bottom, top = grid.extent
     z_max = 1.2 * max(right - left, top - bottom)
     z = np.where(rng.random(count) < 0.25, z_max, rng.uniform(0.05, 1.0, count) * z_max)
@@ -36,7 +36,7 @@ def random_readings(rng: np.random.Generator, grid: Grid, count: int) -> Reading
 
 
 def best_of_all(readings: Readings, grid: Grid, model: ModelParameters, prior: float) -> float:
-    """Return the objective of the best map, by trying every one."""
+    """Return the objective of the optimal map, by exhaustive search."""
     best = -math.inf
     for number in range(2**grid.size):
         cells = ((number >> np.arange(grid.size)) & 1).astype(np.uint8).reshape(grid.shape)

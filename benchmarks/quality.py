@@ -1,15 +1,15 @@
 #!/usr/bin/env python3
-"""How good the maps are: the default, the paper's plain maximum likelihood map, and the standard map at its best gains.
+"""Quality of maps: the default, the paper's plain maximum likelihood map, and the standard map with its best gains.
 
 usage: quality.py [--quick] [--ablate] [--set NAME=VALUE ...] [--runs 5] [--pictures DIR]
 
-On the simulated worlds of the paper, on worlds of our own, with cones of 15° and 30°, in cells of 0.1 m and, for two
-of them, of half and a quarter of that, on readings drawn from the
-forward model itself, and on the recordings under ../shared/data where they are. Each way of mapping has the same
-parameters everywhere; but the standard map has the gains of the best F1, or of the best nav_iou, for the very world,
-and for its log loss the gains and the scale that lose least there, which nobody could know.
+On the simulated worlds of the paper, on our own worlds, with cones of 15° and 30°, in cells of 0.1 m and, for two of
+them, of half and a quarter of that, on readings drawn from the forward model itself, and on the recordings under
+../shared/data, if they exist. Each method has the same parameters everywhere; but the standard map has the gains of
+the best F1, or of the best nav_iou, for each world, and for its log loss the gains and the scale with the smallest
+loss there, which users could not know.
 
---quick takes one seed of everything; --ablate also scores the default without each of its parts; --set changes the
+--quick uses one seed of everything; --ablate also scores the default without each of its parts; --set changes the
 default; --runs are those of the timing; --pictures draws maps into a folder.
 """
 
@@ -67,7 +67,7 @@ PLAIN: dict[str, Any] = {
     'max_incidence_angle': 1.5708,
     'least_passed': 0.0,
 }
-"""Flips and shifts, and nothing else, with the default's sensor model."""
+"""Only flips and shifts, with the default's sensor model."""
 
 ABLATIONS: dict[str, dict[str, Any]] = {
     'surfaces before the centre': {'surface_offset': 0.0},
@@ -79,11 +79,11 @@ ABLATIONS: dict[str, dict[str, Any]] = {
     'lost echoes': {'p_lost': 0.0},
     'all of these but lost echoes': {**PLAIN, 'alpha': 0.8},
 }
-"""What the default is without each of its parts."""
+"""The default without each of its parts."""
 
 RESOLUTIONS = (0.1, 0.05, 0.025)
 RESOLUTION_WORLDS = ('doors 15°', 'clutter 15°')
-"""The edges of cells, metres, and the drives, their first seeds, for the table of resolutions."""
+"""Edges of cells, metres, and the drives, with their first seeds, for the table of resolutions."""
 
 DRAWN = {
     'p_hit 0.9, p_rand 0.05, p_lost 0': {'p_hit': 0.9, 'p_rand': 0.05, 'p_lost': 0.0},
@@ -117,7 +117,7 @@ Means over seeds, but for door, shut, gap and smooth the worst seed. "-": nothin
 
 @dataclass
 class Results:
-    """Figures of one way of mapping by group, and what its uncertainty map says of simulated cells."""
+    """Figures of one method by group, and its uncertainty maps of simulated cells."""
 
     figures: dict[str, Figures] = field(default_factory=dict)
     beliefs: list[Belief] = field(default_factory=list)
@@ -130,7 +130,7 @@ def groups_of(cases: Iterable[Case]) -> dict[str, list[Case]]:
 
 
 def belief(uncertainty: Any, case: Case) -> Belief:
-    """Return what an uncertainty map says of a case."""
+    """Return the probabilities of an uncertainty map for a case."""
     known = known_cells(uncertainty, case)
     return Belief(np.asarray(uncertainty[known], np.float64), case.truth[known] > 0.5)
 
@@ -265,7 +265,7 @@ def print_resolutions(groups: dict[str, list[Case]], base: dict[str, Any], tool:
 
 
 def print_cost(base: dict[str, Any], paper: dict[str, Any], runs: int) -> None:
-    """Print what the default costs beside plain EM, run by turns."""
+    """Print the cost of the default and of plain EM, run alternately."""
     variants = {
         'default': base,
         "plain EM, the default's model": {**base, **PLAIN},

@@ -1,4 +1,4 @@
-"""Pictures of what `quality.py` maps: the truth, the standard map, the maximum likelihood map of the paper and ours."""
+"""Pictures of the maps of `quality.py`: the truth, the standard map, the paper's maximum likelihood map and ours."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from forward_grid_mapper.files.panels import Tile
 SHOWN = ('corridor 15°', 'office 15°', 'clutter 30°', 'office_a', 'office_b')
 MARGIN = 0.3
 WIDE = 2.6
-"""Width by height from which on maps are put one below the other."""
+"""Ratio of width to height from which maps are stacked."""
 
 
 def draw_pictures(
     folder: Path, groups: dict[str, list[Case]], base: dict[str, Any], paper: dict[str, Any], tool: ModuleType | None
 ) -> None:
-    """Draw the first case of each group in `SHOWN` that is there."""
+    """Draw the first case of each group in `SHOWN`, if it exists."""
     folder.mkdir(parents=True, exist_ok=True)
     for name in SHOWN:
         if name in groups:

@@ -1,4 +1,4 @@
-"""Figures of a map for `quality.py`, and the standard map at the gains that are best for the very drive."""
+"""Figures of a map for `quality.py`, and the standard map with the best gains for each drive."""
 
 from __future__ import annotations
 
@@ -20,25 +20,25 @@ from forward_grid_mapper.simulation.score import score_map
 Floats = NDArray[np.float64]
 
 CLIP = 0.02
-"""Probabilities are kept this far from 0 and 1 before their log loss is taken."""
+"""Probabilities are clipped to this distance from 0 and 1 before the log loss."""
 
 OFTEN = 6
-"""Readings that must meet a wall cell for it to count as well observed."""
+"""Fewest readings that must hit a wall cell for it to count as well observed."""
 
 ROBOT_RADIUS = 0.15
 SCALES = (0.03, 0.06, 0.1, 0.2, 0.35, 0.6, 1.0)
-"""Factors on the log odds of the standard map, among which the best is taken, on top of its gains."""
+"""Factors on the log odds of the standard map, of which the best is used, in addition to its gains."""
 
 LOGIT = math.log(0.65 / 0.35)
-"""Log odds above which a cell of the standard map counts as occupied, and below whose negative it counts as free."""
+"""Absolute log odds from which a cell of the standard map counts as occupied, or as free if negative."""
 
 
 @dataclass(frozen=True)
 class Figures:
-    """How well a map shows a case; NaN where there is nothing to say.
+    """Quality of a map of a case; NaN for figures that do not apply.
 
     `coverage` and `gap` are over all visible wall cells, `coverage_often` and `gap_often` over those that `OFTEN`
-    readings meet. `loss` is in nats a cell.
+    readings hit. `loss` is in nats a cell.
     """
 
     f1: float
@@ -57,7 +57,7 @@ class Figures:
 
 
 _WORST = {'door': min, 'doors_closed': max, 'gap': max, 'gap_often': max, 'smooth': min}
-"""How figures of several seeds are put together; by their mean, if not named here."""
+"""How figures of several seeds are combined; others by their mean."""
 
 
 def together(figures: Sequence[Figures]) -> Figures:
@@ -133,7 +133,7 @@ def score(ml: NDArray[np.int8], grid: Grid, case: Case, tool: ModuleType | None,
 
 
 class Belief(NamedTuple):
-    """Probabilities of the cells of a case that the map and the truth know, and which of them are occupied."""
+    """Probabilities of the cells of a case that are known in the map and in the truth, and which are occupied."""
 
     p: Floats
     occupied: NDArray[np.bool_]
@@ -146,17 +146,17 @@ class Belief(NamedTuple):
 
     @property
     def base(self) -> float:
-        """That of a map that is everywhere at the fraction of occupied cells."""
+        """Log loss of a map with the fraction of occupied cells everywhere."""
         return Belief(np.full(len(self.p), self.occupied.mean()), self.occupied).loss
 
 
 def known_cells(uncertainty: Floats, case: Case) -> NDArray[np.bool_]:
-    """Return the cells that an uncertainty map and the truth know."""
+    """Return the cells that are known in an uncertainty map and in the truth."""
     return np.asarray(np.isfinite(uncertainty) & np.isfinite(case.truth))
 
 
 def reliability(beliefs: Sequence[Belief]) -> list[str]:
-    """Return a table: by stated probability, how many cells there are and how many of them are occupied."""
+    """Return a table: for each range of probabilities, the number of cells, and of occupied ones."""
     p = np.concatenate([b.p for b in beliefs])
     occupied = np.concatenate([b.occupied for b in beliefs])
     lines = [f'{"stated":>14s}{"cells":>9s}{"mean":>8s}{"occupied":>10s}']
@@ -170,7 +170,7 @@ def reliability(beliefs: Sequence[Belief]) -> list[str]:
 
 
 class Standard:
-    """The standard map of a case for any gains at once: its log odds are linear in them."""
+    """The standard map of a case for all gains: its log odds are linear in them."""
 
     def __init__(self, case: Case, tool: ModuleType | None) -> None:
         self.case, self._tool = case, tool
@@ -228,14 +228,14 @@ def oracle(
 ) -> tuple[Figures, Figures]:
     """Return the figures of the standard map with the gains of the best F1, and with those of the best nav_iou.
 
-    Both have the least log loss of any gains.
+    Both have the smallest log loss of any gains.
 
     Parameters
     ----------
     cases : sequence of Case
-        Of one group: the gains are the same for all, and the best for them.
+        Of one group: the gains are the same for all.
     known : sequence of bool arrays
-        The cells of each over which log loss is taken.
+        The cells of each for the log loss.
     """
     maps = [Standard(case, tool) for case in cases]
     loss = least_loss(maps, known)
@@ -248,6 +248,6 @@ def oracle(
 
 
 def least_loss(maps: Sequence[Standard], known: Sequence[NDArray[np.bool_]]) -> float:
-    """Return the least mean log loss of any gains and any of `SCALES`."""
+    """Return the smallest mean log loss of any gains and any of `SCALES`."""
     means = [np.mean([m.losses(g, k) for m, k in zip(maps, known, strict=True)], axis=0).min() for g in GAINS]
     return float(min(means))

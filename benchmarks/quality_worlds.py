@@ -1,4 +1,4 @@
-"""What `quality.py` maps: simulated drives, readings drawn from the forward model itself, and real recordings."""
+"""Data of `quality.py`: simulated drives, readings drawn from the forward model itself, and real recordings."""
 
 from __future__ import annotations
 
@@ -31,30 +31,30 @@ SHARED = Path(__file__).resolve().parents[2] / 'shared'
 RECORDINGS = ('office_a', 'office_b')
 ODOMETRY = '/odom_corrected'
 DEPTH = 0.2
-"""Metres behind the nearest wall of a cone beyond which a wall does not count as visible."""
+"""Metres behind the nearest wall of a cone beyond which a wall is not visible."""
 
 ROUGHER = NoiseModel(sigma=0.08, p_random=0.1, p_lost=0.1)
 
 
 @dataclass(frozen=True)
 class Case:
-    """Readings to map, and the truth to score the map by.
+    """Readings to map, and the truth for scores.
 
     Attributes
     ----------
     group : str
-        Cases of one group differ by their seeds alone; they are scored together.
+        Cases of one group differ only by their seeds; they are scored together.
     readings : Readings
     path_xy : float64, shape (P, 2)
-        Where the robot drove, metres.
+        Path of the robot, metres.
     truth : float64, shape `grid.shape`
         1 occupied, 0 free, NaN unknown.
-    origin, resolution
+    Corner, and edge of a cell, of the truth, metres.
         Corner and cell of the truth, metres.
     world : World, optional
         The simulated world; None for a recording.
     met : int64, shape `truth.shape`
-        Number of readings with a ray that meets each wall cell; of shape (0, 0) for a recording.
+        Number of readings with a ray that hits each wall cell; of shape (0, 0) for a recording.
     """
 
     group: str
@@ -132,12 +132,12 @@ OWN = {
     'office': (office_world, ((1.5, 4.9), (3.25, 4.9), (3.25, 3.2), (3.25, 4.9), (8.3, 4.9), (8.3, 3.0), (8.3, 4.9),
                               (10.8, 4.9), (10.8, 6.8), (10.8, 4.9), (14.5, 4.9))),
 }
-"""Worlds that are not the paper's, and the ways through them."""
+"""Our own worlds, and the paths through them."""
 # fmt: on
 
 
 def readings_that_meet(world: World, readings: Readings) -> NDArray[np.int64]:
-    """Return how many readings have a ray that meets each wall cell, as in `visible_surface`, shape `grid.shape`."""
+    """Return the number of readings with a ray that hits each wall cell, see `visible_surface`, shape `grid.shape`."""
     count = np.zeros(world.grid.size, np.int64)
     fan = np.linspace(-1.0, 1.0, VISIBLE_RAYS)
     for start in range(0, len(readings), 10_000):
@@ -173,7 +173,7 @@ def ring(degrees: int) -> SonarArray:
 
 
 def simulated_cases(quick: bool) -> Iterator[Case]:
-    """Yield the simulated drives, those of a group one after the other; one seed of each if `quick`."""
+    """Yield the simulated drives, group by group; only one seed of each if `quick`."""
     seeds = range(1 if quick else 5)
     wide = sonar_ring(field_of_view=math.radians(30.0))
     for n in (1, 3, 16):
@@ -224,7 +224,7 @@ def drawn(group: str, recording: Recording, model: dict[str, float], seed: int =
 
 
 def on_grid(world: World, grid: Grid) -> NDArray[np.bool_]:
-    """Return which cells of a grid of the world's lattice are walls."""
+    """Return the wall cells of a world on a grid of its lattice."""
     whole = grid.union(world.grid)
     walls = np.zeros(whole.shape, np.bool_)
     walls[whole.window(world.grid)] = world.reference == 1
@@ -247,7 +247,7 @@ def scoring_tool() -> ModuleType | None:
 
 
 def recorded_cases(tool: ModuleType) -> Iterator[Case]:
-    """Yield the recordings that are there."""
+    """Yield the recordings that exist."""
     for name in RECORDINGS:
         folder = SHARED / 'data' / name
         if not folder.is_dir():

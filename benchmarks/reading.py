@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Reading bags: CPU time of a message, one by one and many at once, which give the same readings.
+"""Reading of bags: CPU time for each message, one by one and many at once, with equal readings.
 
 usage: reading.py BAG [BAG ...] [--repeat 3]
 
@@ -66,7 +66,7 @@ def main() -> None:
 
 
 def row(path: Path, repeat: int) -> None:
-    """Time a bag in turns, and compare what comes out."""
+    """Time a bag alternately by both methods, and compare the results."""
     best: dict[Callable[[Bag, Topics], PoseAssociator], float] = {}
     made: list[PoseAssociator] = []
     for read in (one_by_one, at_once) * repeat:

@@ -1,11 +1,11 @@
 #!/usr/bin/env python3
-"""How time and memory grow with the number of pairs of a cell and a reading, from 1e5 to 1e8.
+"""Growth of time and memory with the number of pairs of a cell and a reading, from 1e5 to 1e8.
 
 usage: scaling.py [--runs 5] [--patience 0] [--most 1e8] [--plot scaling.png]
 
-Two ways to more pairs: more readings on the same cells, and finer cells for the same readings. Prints medians of the
-time from readings in the map frame to maximum likelihood map and uncertainty map, and the peak memory of a process of
-its own for each.
+There are more pairs with more readings on the same cells, or with smaller cells for the same readings. Prints medians
+of the time from readings in the map frame to maximum likelihood map and uncertainty map, and the peak memory, each in
+its own process.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class Point(NamedTuple):
 
 
 def measure(readings: Readings, resolution: float, runs: int) -> Point:
-    """Return the figures of one job, from a process of its own."""
+    """Return the figures of one job, from its own process."""
     warm_up()
     parameters = Parameters.from_flat({'resolution': resolution})
     peak = PeakMemory()
@@ -132,7 +132,7 @@ def main() -> None:
         )
         points = found[name] = []
         for drive, count, resolution in jobs:
-            # each job has about three times the pairs of the one before, or more
+            # each job has at least about three times the pairs of the one before
             if points and points[-1].pairs * 3.0 > options.most:
                 break
             p = in_own_process(measure, drive(count), resolution, options.runs)

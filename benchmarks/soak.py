@@ -1,12 +1,12 @@
 #!/usr/bin/env python3
-"""A drive of hours, compressed in time: whether memory and delays stay flat, and the maps right.
+"""A drive of hours, compressed in time: whether memory and delays are constant, and the maps right.
 
 usage: soak.py [--readings 1000000] [--max-readings 200000] [--journal]
 
-A robot with 24 sonars goes to and fro in the simulated corridor, each tour with noise of its own: 24 000 readings in
-four minutes. Its messages go through the callbacks of the node, in this process, as fast as they are taken; after every
-simulated second the node's timers get their turn. At the end EM runs, and the maps are scored against the world beside
-those of the first tour alone. Needs rclpy.
+A robot with 24 sonars drives back and forth in the simulated corridor, each tour with its own noise: 24 000 readings in
+four minutes. Its messages are passed to the callbacks of the node, in this process, as fast as they are processed;
+after every simulated second the node's timers are run. At the end EM runs, and the maps are scored against the world,
+beside those of the first tour alone. Needs rclpy.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ from forward_grid_mapper.simulation.score import score_map, threshold, visible_s
 
 TOUR = 24_000
 TICK = NANOSECONDS
-"""Simulated time between two turns of the timers."""
+"""Simulated time between two runs of the timers."""
 
 
 def resident() -> float:
@@ -49,7 +49,7 @@ def resident() -> float:
 
 
 def ros(message: RangeMessage | OdometryMessage) -> Range | Odometry:
-    """Return the message as it comes from a subscription."""
+    """Return the message in the form of a subscription."""
     if isinstance(message, RangeMessage):
         made = Range(
             range=message.range,
@@ -81,7 +81,7 @@ def messages(tours: int) -> Iterator[RangeMessage | OdometryMessage]:
 
 
 class Soak:
-    """The node in this process, and what is measured of it."""
+    """The node in this process, with measurements."""
 
     def __init__(self, max_readings: int, folder: Path, journal: bool) -> None:
         extrinsics = corridor_drive(0, passes=1).extrinsics
@@ -99,7 +99,7 @@ class Soak:
         self.live: list[float] = []
 
     def take(self, message: Range | Odometry) -> None:
-        """Let the node take a message."""
+        """Pass a message to the node."""
         intake, info = self.node.intake, {'source_timestamp': time.time_ns()}
         begin = time.perf_counter()
         if isinstance(message, Range):
@@ -109,7 +109,7 @@ class Soak:
         self.message.append(time.perf_counter() - begin)
 
     def tick(self) -> None:
-        """Let the node's timers have their turn."""
+        """Run the node's timers."""
         begin = time.perf_counter()
         self.node.publish_live()
         self.update.append(time.perf_counter() - begin)
@@ -118,12 +118,12 @@ class Soak:
         self.node.intake.work()
         self.node.inbox.work()
         self.live.append(time.perf_counter() - begin)
-        # the drive is a thousand times as fast as a real one, and the live map has a thread of its own
+        # the drive is a thousand times as fast as a real one, so the thread of the live map may fall behind
         if self.node.live.worker.waiting > 20:
             self.node.live.snapshot()
 
     def row(self, seconds: float) -> str:
-        """Return what was measured since the last row."""
+        """Return the measurements since the last row."""
         buffer = self.node.associator.buffer
         worst, typical = 1e3 * max(self.message), 1e6 * float(np.median(self.message))
         update, live = (1e3 * max(x) for x in (self.update, self.live))
@@ -143,7 +143,7 @@ def main() -> None:
     parser.add_argument('--max-readings', type=int, default=200_000)
     parser.add_argument('--journal', action='store_true', help='keep a journal as well')
     options = parser.parse_args()
-    # as the node does
+    # as in the node
     sys.setswitchinterval(0.0005)
     rclpy.init(args=['soak', '--ros-args', '--log-level', 'ERROR'])
     print(f'{platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}, numpy {np.__version__}')

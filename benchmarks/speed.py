@@ -3,12 +3,12 @@
 
 usage: speed.py [--runs 5] [--patience 0] [--only jobs threads memory live table2]
 
-jobs     four drives: medians of every stage against the time they should take; bytes a pair, stored and at the peak of
-         the process; EM against building the standard map; time per pair against reading the same bytes in one stream
-threads  one thread against two, whose maps must be equal
-memory   a bound on memory that the pairs do not fit, with which the maps must be equal
-live     readings a second that the standard map takes on one core
-table2   EM against the loops of the paper's Table 2, which cast every reading anew at each flip that they consider
+jobs     four drives: medians of every stage and their targets; bytes a pair, stored and at the peak of the process; EM
+         relative to building the standard map; time per pair relative to reading the same bytes in sequence
+threads  one thread and two, whose maps must be equal
+memory   a bound on memory that the pairs exceed, with which the maps must be equal
+live     readings a second of the standard map on one core
+table2   EM and the loops of the paper's Table 2, which cast every reading again at each flip that they consider
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from forward_grid_mapper.simulation.sonar import sonar_ring
 
 
 class Job(NamedTuple):
-    """A drive to map, and the seconds that it should take at most."""
+    """A drive to map, and its target, seconds."""
 
     name: str
     drive: Callable[[], Readings]
@@ -116,7 +116,7 @@ def jobs(runs: int) -> None:
 
 
 def assert_equal(one: MapSet, other: MapSet) -> None:
-    """Check that two runs came to the same, bit for bit."""
+    """Check that two runs have the same results, bit for bit."""
     np.testing.assert_array_equal(one.ml, other.ml)
     np.testing.assert_array_equal(one.uncertainty, other.uncertainty)
     assert one.objective == other.objective
@@ -166,7 +166,7 @@ def memory(runs: int) -> None:
 
 
 def measure_live(readings: Readings, runs: int) -> float:
-    """Return the readings a second that a live map takes on one core."""
+    """Return the readings a second of a live map on one core."""
     if hasattr(os, 'sched_setaffinity'):
         os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
     warm_up()
@@ -189,7 +189,7 @@ def live(runs: int) -> None:
 
 
 def table_2(runs: int) -> None:
-    """Compare with the loops of the paper's Table 2, on as many readings as they can take."""
+    """Compare with the loops of the paper's Table 2, on as many readings as these can process."""
     print("\nEM against the paper's Table 2, both from the empty map until no cell flips, on one thread, for J")
     print('without what the defaults add: ' + ', '.join(PLAIN))
     parameters = Parameters().varied({**PLAIN, 'threads': 1})

@@ -1,10 +1,10 @@
-"""The loops of the paper's Table 2, compiled but otherwise as they stand, to compare with.
+"""The loops of the paper's Table 2, compiled but otherwise unchanged, for comparison.
 
-For every cell, for every reading whose cone contains it: cast the reading anew, collect the occupied cells of its cone,
-and compute its likelihood with the cell occupied and with the cell free. The cell takes the more likely value. Sweeps
-over all cells go on until none flips. Model, cones and prior are those of the package. Where the printed text is
-wrong it is corrected as `docs/paper.md` says, or there would be no map to compare. The list of
-readings of each cell is made beforehand, and its making is not counted.
+For every cell, for every reading whose cone contains it: cast the reading again, collect the occupied cells of its
+cone, and compute its likelihood with the cell occupied and with the cell free. The cell gets the more likely value.
+Sweeps over all cells are repeated until none flips. Model, cones and prior are those of the package. Errors of the
+printed text are corrected as `docs/paper.md` describes, since there would be no map to compare otherwise. The list of
+readings of each cell is made beforehand, and is not timed.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ from forward_grid_mapper.core.sensor.cone_table import cone_table, grid_of, walk
 from forward_grid_mapper.core.sensor.density import causes_of, density
 
 LARGEST = 100_000
-"""Cells of the largest cone."""
+"""Most cells of a cone."""
 
 
 class Table2(NamedTuple):
-    """What the loops came to; `casts` counts readings cast anew, two likelihoods each."""
+    """The result of the loops; `casts` counts readings cast again, two likelihoods each."""
 
     grid: Grid
     occupied: NDArray[np.uint8]
@@ -68,7 +68,7 @@ def _likelihood(reading: Any, hits: Any, causes: Any, t: int, resolution: float)
 
 @numba.njit(error_model='numpy')
 def _sweep(table: Any, lists: Any, causes: Any, occupied: Any, shape: tuple[int, int], numbers: Any) -> tuple[int, int]:
-    """Visit all cells once; return how many flipped, and how often a reading was cast."""
+    """Visit all cells once; return the number of flips, and of casts."""
     begin, readings = lists
     prior, least, resolution = numbers
     cells, distances = np.empty(LARGEST, np.int32), np.empty(LARGEST)
@@ -101,7 +101,7 @@ def _sweep(table: Any, lists: Any, causes: Any, occupied: Any, shape: tuple[int,
 
 
 def search(readings: Readings, parameters: Parameters, most_sweeps: int = 200) -> Table2:
-    """Return the map that the loops find, from the empty one."""
+    """Return the map of the loops, from the empty one."""
     p = parameters
     grid = grid_of(readings, p.model, p.grid, beyond=arc_depths(p.grid.resolution)[1])
     table = cone_table(readings, grid, p.model)
@@ -110,7 +110,7 @@ def search(readings: Readings, parameters: Parameters, most_sweeps: int = 200) -
     prior = math.log(p.search.prior / (1 - p.search.prior))
     numbers = (prior, LEAST_GAIN, grid.resolution)
     occupied = np.zeros(grid.size, np.uint8)
-    # compiles, and visits no cell
+    # compiles without visiting a cell
     _sweep(table, lists, causes, occupied[:0], grid.shape, numbers)
     sweeps, flips, casts = 0, 0, 0
     start = time.perf_counter()

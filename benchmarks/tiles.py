@@ -1,12 +1,12 @@
 #!/usr/bin/env python3
-"""Maps in tiles against the whole map: figures, seams, time and memory.
+"""Maps in tiles and whole maps: figures, seams, time and memory.
 
 usage: tiles.py [--sizes 5,10,20,40] [--seeds 3] [--memory]
 
-For the simulated corridor and building, and the recordings beside the checkout where they are: the objective of the
-searched map, F1 and nav_iou of the ML map against those of the whole map, and how many cells of the ML map differ near
-seams (within 0.5 m) and elsewhere. With --memory: peak memory and time of one job, whole and in tiles, each in a
-process of its own.
+For the simulated corridor and building, and the recordings beside the checkout, if they exist: the objective of the
+searched map, F1 and nav_iou of the ML map, relative to the whole map, and the number of cells of the ML map that differ
+near seams (within 0.5 m) and elsewhere. With --memory: peak memory and time of one job, whole and in tiles, each in its
+own process.
 """
 
 from __future__ import annotations
@@ -29,10 +29,10 @@ from forward_grid_mapper.core.warm_up import warm_up
 from forward_grid_mapper.simulation.drive import building_drive, corridor_drive
 
 NEAR = 0.5
-"""Metres from a seam that count as near."""
+"""Largest distance from a seam that counts as near, metres."""
 
 DRIVES = 4
-"""Drives through the building of the job whose memory is measured."""
+"""Drives through the building in the job for memory."""
 
 
 def cases(seeds: int) -> Iterator[tuple[str, Case]]:
@@ -49,7 +49,7 @@ def cases(seeds: int) -> Iterator[tuple[str, Case]]:
 
 
 def by_seams(one: MapSet, other: MapSet, size: float) -> tuple[float, float]:
-    """Return which part of the known cells of two maps differ, near seams and elsewhere."""
+    """Return the fraction of the known cells that differ between two maps, near seams and elsewhere."""
     x, y = one.grid.centers()
     off = [np.abs((c + size / 2) % size - size / 2) for c in (x, y)]
     near = (off[0][None, :] < NEAR) | (off[1][:, None] < NEAR)
@@ -85,7 +85,7 @@ def many() -> Readings:
 
 
 def job(size: float) -> tuple[int, float, int]:
-    """Return readings, CPU seconds and peak memory, bytes, of one job; a size of 0 maps all at once."""
+    """Return readings, CPU seconds and peak memory, bytes, of one job; a size of 0 is without tiles."""
     warm_up()
     readings, parameters = many(), Parameters()
     TiledMapper(parameters, 5.0).run(corridor_drive(0).readings.select(slice(0, 2000)))
@@ -95,7 +95,7 @@ def job(size: float) -> tuple[int, float, int]:
 
 
 def main() -> None:
-    """Print what the command line asks for."""
+    """Run the benchmark."""
     options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     options.add_argument('--sizes', default='5,10,20,40')
     options.add_argument('--seeds', type=int, default=3)

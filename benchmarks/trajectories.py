@@ -1,16 +1,16 @@
-"""How well drift is taken out of wheel odometry: simulated buildings and levels of drift, and recordings.
+"""Quality of refined trajectories: simulated buildings with levels of odometry drift, and recordings.
 
     python benchmarks/trajectories.py                       # all simulated runs
     python benchmarks/trajectories.py --robot front --level wheels --seeds 2
-    python benchmarks/trajectories.py --maps                # and the maps that are made of them
+    python benchmarks/trajectories.py --maps                # with scores of the maps
     python benchmarks/trajectories.py --shared ../shared/data
     python benchmarks/trajectories.py --drawn 12            # buildings of many materials, drawn at random
-    python benchmarks/trajectories.py --distance 250 500 1000    # how time and memory grow
+    python benchmarks/trajectories.py --distance 250 500 1000    # growth of time and memory
 
-Each run prints the absolute trajectory error (rms after rigid alignment, metres) of odometry and of what `Refiner`
-makes of it, whether that was taken, and the time of one core a metre; each group ends with a summary. Of recordings the
-map is scored as well, by ../shared/tools/score_map.py with --align. With --maps, so are maps of simulated runs, from
-exact poses, from odometry, and from what was made of it; the latter two are aligned with the exact poses.
+Each run prints the absolute trajectory error (rms after rigid alignment, metres) of odometry and of the result of
+`Refiner`, whether this was accepted, and the time of one core for each metre; each group ends with a summary. Maps of
+recordings are scored as well, by ../shared/tools/score_map.py with --align. With --maps, so are maps of simulated runs,
+from exact poses, from odometry, and from the result; the latter two are aligned with the exact poses.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ from forward_grid_mapper.simulation.world import Floorplan, World, building_tour
 
 
 def octagon() -> SonarArray:
-    """Return eight sonars at equal angles, of which none looks straight ahead or to a side."""
+    """Return eight sonars at equal angles, none of which points straight ahead or to a side."""
     ring = sonar_ring(8)
     return dataclasses.replace(ring, yaws=tuple(yaw + math.pi / 8 for yaw in ring.yaws))
 
@@ -60,13 +60,13 @@ ROBOTS = {
 """Sonars, metres between sweeps, and noise."""
 
 SMOOTH = 0.35
-"""Part of the walls, in pieces of 3 m, that are smooth."""
+"""Fraction of the walls, in pieces of 3 m, that are smooth."""
 
 RECORDINGS = ('building_a', 'building_b', 'building_c', 'office_a', 'office_b')
 
 
 def in_pieces(world: World, rng: np.random.Generator) -> World:
-    """Return a world whose walls are of one material every 3 m."""
+    """Return a world with walls in pieces of 3 m of one material."""
     segments, smooth = [], []
     for (x0, y0, x1, y1), was in zip(world.segments, world.smooth, strict=True):
         count = max(1, round(math.hypot(x1 - x0, y1 - y0) / 3.0))
@@ -78,7 +78,7 @@ def in_pieces(world: World, rng: np.random.Generator) -> World:
 
 
 def corridors(seed: int, legs: int) -> tuple[World, np.ndarray]:
-    """Return a building with rooms along a corridor that goes around, and a way of so many of its sides."""
+    """Return a building with rooms along a corridor around it, and a path along so many of its sides."""
     rng = np.random.default_rng([seed, 5])
     width, height = (int(side * rng.uniform(0.8, 1.2)) for side in (420, 260))
     deep, across = int(rng.integers(38, 55)), int(rng.integers(17, 24))
@@ -114,7 +114,7 @@ def corridors(seed: int, legs: int) -> tuple[World, np.ndarray]:
 
 
 def worlds(seed: int) -> dict[str, tuple[World, np.ndarray]]:
-    """Return worlds and ways through them; a seed changes floor plans and materials."""
+    """Return worlds and paths through them; a seed changes floor plans and materials."""
     rng = np.random.default_rng(seed)
     tour = building_tour() + np.r_[np.zeros((1, 2)), rng.uniform(-0.05, 0.05, (len(building_tour()) - 1, 2))]
     world, way = corridors(seed + 100, 3)
@@ -149,7 +149,7 @@ def run(name: str, readings: Readings, odometry: Odometry, true: Odometry) -> di
 
 
 def aligned(readings: Readings, path: Odometry, true: Odometry) -> Readings:
-    """Return the readings moved rigidly, as lays the path on the true one best."""
+    """Return the readings after the rigid transform that aligns the path with the true one."""
     estimate, truth = path.at(true.stamp), true.pose
     a, b = estimate[:, :2] - estimate[:, :2].mean(0), truth[:, :2] - truth[:, :2].mean(0)
     turn = math.atan2((a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum(), (a * b).sum())
@@ -160,7 +160,7 @@ def aligned(readings: Readings, path: Odometry, true: Odometry) -> Readings:
 
 
 def add_map_scores(row: dict[str, Any], exact: Recording, drifted: Recording) -> None:
-    """Print and note F1 of the maps from exact poses, from odometry and from what was made of it."""
+    """Print and store F1 of the maps from exact poses, from odometry and from the result."""
     true, visible = odometry_of(exact), visible_surface(exact.world, exact.readings, SURFACE_DEPTH)
     placed = {
         'exact': exact.readings,
@@ -189,7 +189,7 @@ def simulated(robot: str, level: str, seeds: range, first: int, maps: bool) -> l
 
 
 def drawn(level: str, seeds: range) -> list[dict[str, Any]]:
-    """Run drives through buildings of many materials, turned by any angle, with sensors that the seed chooses."""
+    """Run drives through random buildings of many materials, rotated by any angle, with sensors chosen by the seed."""
     rows = []
     for seed in seeds:
         _, _, poses, stamps, readings = building_drive(seed, there_and_back=True)
@@ -203,7 +203,7 @@ def drawn(level: str, seeds: range) -> list[dict[str, Any]]:
 
 
 def far(robot: str, level: str, distances: list[float], seed: int) -> None:
-    """Run drives around one building, longer and longer ones, and print time and the most memory so far."""
+    """Run drives around one building, of increasing length, and print time and the peak memory so far."""
     sonars, spacing, noise = ROBOTS[robot]
     for distance in sorted(distances):
         legs = 4
@@ -219,7 +219,7 @@ def far(robot: str, level: str, distances: list[float], seed: int) -> None:
 
 
 def recorded(folder: Path) -> list[dict[str, Any]]:
-    """Run the recordings that have corrected odometry beside the raw one."""
+    """Run the recordings that have corrected odometry in addition to the raw one."""
     rows, tool = [], scoring_tool()
     for name in RECORDINGS:
         if not (folder / name).exists():
@@ -235,7 +235,7 @@ def recorded(folder: Path) -> list[dict[str, Any]]:
 
 
 def print_map_score(readings: Readings, folder: Path, tool: ModuleType) -> None:
-    """Print how good the map of readings is, turned and moved onto the reference."""
+    """Print scores of the map of readings, aligned with the reference."""
     maps = Mapper(Parameters()).run(readings)
     probability = np.where(maps.ml == UNKNOWN, np.nan, maps.ml)
     truth, corner, cell = tool.load(folder / 'reference.yaml')
@@ -248,7 +248,7 @@ def print_map_score(readings: Readings, folder: Path, tool: ModuleType) -> None:
 
 
 def summary(title: str, rows: list[dict[str, Any]]) -> None:
-    """Print what a group of runs comes to."""
+    """Print a summary of a group of runs."""
     before, after, spent = (np.array([row[key] for row in rows], float) for key in ('before', 'after', 'ms'))
     taken, worse = (sum(bool(row[key]) for row in rows) for key in ('taken', 'worse'))
     print(
@@ -266,7 +266,7 @@ def summary(title: str, rows: list[dict[str, Any]]) -> None:
 
 
 def main() -> None:
-    """Do what the command line asks for."""
+    """Run the benchmark."""
     parser = argparse.ArgumentParser(description=__doc__.split('\n\n')[0])
     parser.add_argument('--robot', choices=[*ROBOTS], action='append')
     parser.add_argument('--level', choices=['none', *LEVELS], action='append')

@@ -1,4 +1,4 @@
-"""A hook of mkdocs: the pages that stand beside docs/ become pages of the site, README.md its first."""
+"""A hook of mkdocs: adds the pages beside docs/ to the site, with README.md as its first page."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ FILES = ('CITATION.cff',)
 
 
 def on_files(files: Any, config: Any) -> Any:
-    """Add them; links into docs/ become links beside them."""
+    """Add the pages; links into docs/ become links to pages beside them."""
     from mkdocs.structure.files import File
 
     root = Path(config.config_file_path).parent
