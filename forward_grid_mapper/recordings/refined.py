@@ -51,7 +51,7 @@ class RefinedDrives:
     odometry : tuple of Odometry
         As recorded.
     outcomes : tuple of Refinement
-    told : tuple of dict
+    estimates : tuple of dict
         The calibration that each drive with a refined trajectory determines.
     """
 
