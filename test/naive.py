@@ -367,7 +367,7 @@ def normals(readings: Readings, grid: Grid, model: ModelParameters) -> tuple[np.
 def met(
     readings: Readings, grid: Grid, model: ModelParameters, normals: SurfaceNormals, limits: tuple[float, ...]
 ) -> np.ndarray:
-    """Echoes of each cell whose normal is known, and passes, by how far off it it is met: that of `incidence`.
+    """Echoes of each cell whose normal is known, and passes, by how far from it the cell is met: that of `incidence`.
 
     Shape (2, zones, cells).
     """

@@ -223,7 +223,7 @@ def _decisive_evidence(maps: MapArchive, found: CellEvidence, state: int) -> str
         kind = f'the one with the most evidence for {other}'
         readings = 'reading' if more == 1 else 'readings'
         return f'to be {other} it takes {abs(total):.1f} nats more: {more} more {readings} like {kind}'
-    none = f'so far no single reading gives evidence for it of {LEAST_TYPICAL:g} nats or more'
+    none = f'so far no single reading gives {LEAST_TYPICAL:g} nats or more for that'
     return f'to be {other} it takes {abs(total):.1f} nats more; {none}'
 
 

@@ -26,8 +26,8 @@ MOST = {'scale': 0.5, 'turn_scale': 0.5, 'bias': math.radians(30.0), 'heading': 
 HOW = {
     'scale': 'factor for every measured distance, or for the radius of both wheels',
     'turn_scale': 'factor for every measured turn, or divisor of the wheel separation',
-    'bias': 'degrees to add to the yaw for each metre driven forwards (to the left is positive); for a robot with two '
-    'wheels b metres apart, the right one is larger than the left one by the fraction of this times b times 0.0175',
+    'bias': 'degrees to add to the yaw for each metre driven forwards (to the left is positive); if the robot has two '
+    'wheels b metres apart, the right wheel is larger than the left one by a fraction of 0.0175 * b * this value',
     'heading': 'direction of travel, in degrees to the left of the heading; the odometry frame, or the mounting of '
     'the sensors, is rotated by this angle',
 }

@@ -85,10 +85,10 @@ def _values(learned: Learned) -> Iterator[str]:
     if seen := learned.cross_validation:
         at_first, at_learned = seen.gains
         yield (
-            f'  Held-out readings, nats each that the map of the learned values gains: {at_first:+.3f} ± '
-            f'{seen.error_at_first:.3f} at'
+            f'  Gain of the map of the learned values, nats a held-out reading: {at_first:+.3f} ± '
+            f'{seen.error_at_first:.3f} by'
         )
-        yield f'  the initial values, {at_learned:+.3f} ± {seen.error_at_learned:.3f} at the learned ones'
+        yield f'  the initial model, {at_learned:+.3f} ± {seen.error_at_learned:.3f} by the learned one'
     yield textwrap.fill(_HOW, _WIDTH, initial_indent='  ', subsequent_indent='  ')
 
 

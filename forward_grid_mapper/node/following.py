@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from ..core.common.errors import Cancelled
 from ..core.common.readings import Readings
+from ..core.common.words import counted
 from ..core.messages.message_types import Pose2
 from ..core.trajectory.correction import Correction
 from ..core.trajectory.following import Follower
@@ -93,7 +94,7 @@ class Following:
         follower = self.follower
         if follower is None:
             return {}
-        said = f'{follower.windows} windows, {follower.places} places recognised'
+        said = f'{counted(follower.windows, "window")}, {counted(follower.places, "place")} recognised'
         if follower.kept:
             said += '; the last correction is kept, since it predicts the readings better'
         return {'followed since the latest run': f'{said}; ended: {follower.obstacle}' if follower.obstacle else said}

@@ -14,6 +14,7 @@ from ..core.common.errors import Cancelled
 from ..core.common.grid import Grid
 from ..core.common.parameters import Parameters
 from ..core.common.readings import Readings
+from ..core.common.words import counted
 from ..core.mapping import Mapper, Watch
 from ..core.maps.log_odds_map import LogOddsMap
 from ..core.maps.map_set import MapSet
@@ -191,7 +192,7 @@ def outcome_words(found: Found) -> str:
         said = f'trajectory of the previous run kept ({refinement.reason}; result of this run alone: {found.kept})'
     return (
         f'{said}: odometry was off by {refinement.moved:.2f} m (root mean square), '
-        f'{correction.moved:.2f} m at the end of the drive, {refinement.loops} places recognised'
+        f'{correction.moved:.2f} m at the end of the drive, {counted(refinement.loops, "place")} recognised'
         + (f'; {wheels}' if wheels else '')
         + (f'; {refinement.jumps}' if refinement.jumps else '')
     )

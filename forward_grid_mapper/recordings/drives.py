@@ -245,8 +245,8 @@ def _copies(drives: Sequence[Described], readings: Sequence[Readings]) -> tuple[
             names = drives[pair.one].name, drives[pair.other].name
             part, whole = names if pair.echoes[0] <= pair.echoes[1] else names[::-1]
             notes.append(
-                f'{pair.shared} of {min(pair.echoes)} echoes of {part} are in {whole} as well: it is a part of it, and '
-                f'what counts twice is wrong evidence; leave out {part}'
+                f'{pair.shared} of {min(pair.echoes)} echoes of {part} are in {whole} as well: {part} is a part of '
+                f'{whole}, and the evidence of these echoes counts twice; leave out {part}'
             )
     return left_out, notes
 

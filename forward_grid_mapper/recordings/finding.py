@@ -103,7 +103,7 @@ def _holds_recordings(folder: Path) -> bool:
 
 def _left_out(path: Path, skipped: Sequence[Path]) -> str:
     names = ', '.join(entry.name for entry in skipped)
-    return f'of {readable(path)} these are left out: {names}; if they are recordings, add them to the command line'
+    return f'in {readable(path)} these are left out: {names}; if they are recordings, add them to the command line'
 
 
 def _natural(name: str) -> list[tuple[int, str]]:

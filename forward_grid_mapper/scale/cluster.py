@@ -167,9 +167,9 @@ class Cluster:
                     raise
                 except KilledWorker as error:
                     raise ClusterError(
-                        f'{name} {number} ended its worker {SETTINGS["distributed.scheduler.allowed-failures"]} times '
-                        'and more: most likely it has too little memory. Give it more (--memory-per-worker), or make '
-                        'tiles smaller (--tiles)'
+                        f'{name} {number} ended its worker more than '
+                        f'{SETTINGS["distributed.scheduler.allowed-failures"]} times: most likely it has too little '
+                        'memory. Give it more (--memory-per-worker), or make tiles smaller (--tiles)'
                     ) from error
                 except MemoryError as error:
                     raise ClusterError(

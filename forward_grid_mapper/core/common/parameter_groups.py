@@ -99,7 +99,7 @@ class ModelParameters:
 
     plain_model: bool = param(
         False,
-        'Use the plain model of the paper: the constants in the table below have their plain values. '
+        'Use the plain model of the paper: the constants of the model (docs/parameters.md) have their plain values. '
         'config/paper.yaml has the other values of the paper.',
         read_only=True,
     )

@@ -109,7 +109,7 @@ def _floor(readings: Readings) -> str:
     if len(at_it) < min(2, len(parts)) or min(at_it) > 0.5:
         return ''
     return (
-        f'{count / len(heard):.0%} of the echoes are at {shortest:.3f} m, hardly any is as short, and no reading is '
+        f'{count / len(heard):.0%} of the echoes are at {shortest:.3f} m, hardly any is shorter, and no reading is '
         f'without an echo: does the driver send this range if there is no echo? Let it send +inf (REP 117), otherwise '
         f'the robot is mapped as walled in'
     )

@@ -122,7 +122,7 @@ def _below(ranges: Floats, least: Floats, limits: Floats) -> str:
     if limit < 1.0 and _middle((least / ranges)[below]) < 2.0:
         return ''
     return (
-        f'{count} of {len(ranges)} ranges looked at are below min_range ({limit:g} m), and so are rejected: are '
+        f'{count} of {len(ranges)} examined ranges are below min_range ({limit:g} m), and so are rejected: are '
         f'the limits in centimetres or millimetres and the ranges in metres? Messages '
         f'must state metres; correct the driver'
     )

@@ -336,7 +336,7 @@ def test_a_sensor_that_hears_the_robot_is_no_silence() -> None:
     """One that answers min_range all the time, in whatever direction it looks; it has a verdict of its own."""
     frame = next(iter(circling().extrinsics))
     near = circling().with_ranges(lambda m: m._replace(range=0.1 if m.frame_id == frame and m.stamp % 7 else m.range))
-    assert not [text for text in told(near) if 'hears nothing' in text]
+    assert not [text for text in told(near) if 'if there is no echo' in text]
 
 
 def test_a_variance_that_ranges_may_have_is_no_fault() -> None:
