@@ -149,7 +149,7 @@ def test_scale_and_negate(tmp_path: Path) -> None:
         ({'mode': 'odd'}, 'trinary, scale, raw'),
         ({'resolution': None}, 'not the YAML of a map'),
         ({'resolution': 0.0}, 'above zero'),
-        ({'origin': [0, 0, 0.1]}, 'turned'),
+        ({'origin': [0, 0, 0.1]}, 'rotated'),
         ({'origin': [0.013, 0, 0]}, 'not a multiple'),
     ],
 )
