@@ -96,19 +96,19 @@ SCENARIOS: dict[str, tuple[Callable[[Messages], Messages], str]] = {
     ),
     'yaw of odometry clockwise': (
         lambda m: m.driven(lambda p: Pose2(p.x, p.y, -p.yaw)),
-        r'y, or yaw, seems to have the wrong sign in it.*correct its driver',
+        r'y, or yaw, seems to have the wrong sign in odometry.*correct its driver',
     ),
     'y of odometry to the right': (
         lambda m: m.driven(lambda p: Pose2(p.x, -p.y, p.yaw)),
-        r'y, or yaw, seems to have the wrong sign in it.*correct its driver',
+        r'y, or yaw, seems to have the wrong sign in odometry.*correct its driver',
     ),
     'x of odometry backwards': (
         lambda m: m.driven(lambda p: Pose2(-p.x, p.y, p.yaw)),
-        r'(x|y, or yaw,) seems to have the wrong sign in it.*correct its driver',
+        r'(x|y, or yaw,) seems to have the wrong sign in odometry.*correct its driver',
     ),
     'x and y of odometry swapped': (
         lambda m: m.driven(lambda p: Pose2(p.y, p.x, p.yaw)),
-        r'x and y seem to be swapped in it.*correct its driver',
+        r'x and y seem to be swapped in odometry.*correct its driver',
     ),
     'odometry without orientation': (
         lambda m: m.driven(lambda p: Pose2(p.x, p.y, 0.0)),
