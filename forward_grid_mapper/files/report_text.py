@@ -92,7 +92,8 @@ def _description(found: dict[str, Any]) -> str:
 def _wheels(found: dict[str, Any]) -> str:
     words = found.get('odometry') or ''
     some = found.get('told') is None or found['told']
-    return f'{words}; these values are for this drive: measure before you set them' if words and some else words
+    check = '; these values are for this drive: measure a straight line and a full turn before you set them'
+    return words + check if words and some else words
 
 
 def _counts(data: dict[str, Any]) -> Iterator[str]:

@@ -52,7 +52,7 @@ def test_the_report_says_what_became_of_the_trajectory() -> None:
     text = ' '.join(report_text({'input': {'trajectory': refined}}).split())
     assert 'off by 5.43 m and 16.0°' in text
     assert '1 place recognised' in text
-    assert 'Wheels' in text and 'measure before you set them' in text
+    assert 'Wheels' in text and 'measure a straight line and a full turn' in ' '.join(text.split())
     refined |= {'told': {}, 'odometry': 'the drive does not show whether distances are measured too long'}
     assert 'measure before' not in report_text({'input': {'trajectory': refined}})
     left = report_text({'input': {'trajectory': {'refined': False, 'reason': 'the drive is short'}}})
