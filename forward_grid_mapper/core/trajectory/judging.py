@@ -9,8 +9,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 
-from .holding_out import FEWEST_BLOCKS, Gain, blocks_of, gain, held_out_blocks, predicted
+from .holding_out import FEWEST_BLOCKS, LEAST_SIGMAS, Gain, blocks_of, gain, held_out_blocks, predicted
 from .passes import BLOCK, Progress
 from .poses import Floats, wrapped
 from .scans import Scans
@@ -23,7 +24,11 @@ JUDGED_ON, HELD_OUT = 60, 40
 """Most blocks of `gain_over_drive`, and most held-out windows of `last_not_worse`."""
 
 MOST_WORSE = 1.0
-"""Standard errors by which a later trajectory may predict held-out windows worse and is still taken."""
+"""Standard errors by which a trajectory may predict readings worse and is still not called worse."""
+
+FIRST, FEWEST_FIRST, CLEAR = 3, 12, 2.0
+"""One block of so many is compared first, if these are so many; the others only if the gain of all blocks is not
+expected to be beyond the thresholds by so many σ. A local map for each block takes most of the time."""
 
 TURNED, LEAST_SIGMAS_OF_TURNS = math.radians(8.0), 1.5
 """A turn within `SPAN` is examined if trajectory and odometry differ by so many radians. Readings there must be
@@ -43,9 +48,7 @@ def gain_over_drive(scans: Scans, before: Floats, after: Floats, watch: Progress
     """
     blocks = blocks_of(len(before), BLOCK, JUDGED_ON)
     # without other visits: under drift their maps contradict this one, or lie too far off to matter
-    before_values = predicted(scans, before, blocks, SPAN)
-    watch(0.5)
-    return gain(before_values, predicted(scans, after, blocks, SPAN))
+    return _compared(scans, before, after, blocks, (-MOST_WORSE, LEAST_SIGMAS), SPAN, watch)
 
 
 def gain_at_revisits(scans: Scans, before: Floats, after: Floats) -> Gain:
@@ -57,13 +60,42 @@ def gain_at_revisits(scans: Scans, before: Floats, after: Floats) -> Gain:
 
 def last_not_worse(scans: Scans, first: Floats, *others: Floats) -> Floats:
     """Return the last trajectory that does not predict held-out windows worse than the one taken before it."""
-    blocks = held_out_blocks(scans, HELD_OUT)
-    best, best_values = first, predicted(scans, first, blocks)
+    blocks, best = held_out_blocks(scans, HELD_OUT), first
     for nodes in others:
-        values = predicted(scans, nodes, blocks)
-        if gain(best_values, values).sigmas > -MOST_WORSE:
-            best, best_values = nodes, values
+        if _compared(scans, best, nodes, blocks, (-MOST_WORSE, -MOST_WORSE)).sigmas > -MOST_WORSE:
+            best = nodes
     return best
+
+
+def _compared(
+    scans: Scans,
+    before: Floats,
+    after: Floats,
+    blocks: list[NDArray[np.int64]],
+    thresholds: tuple[float, float],
+    span: float = np.inf,
+    watch: Progress = lambda part: None,
+) -> Gain:
+    """Return the gain of one trajectory over another in predicting blocks: of all, if some do not clearly decide.
+
+    If n of N blocks have a gain of s standard errors, all are expected to have √(N/n) s ± √(N/n − 1).
+
+    Parameters
+    ----------
+    thresholds : float, float
+        The smallest and the largest number of standard errors that the caller compares the gain with.
+
+    The others are as in `predicted` and `gain_over_drive`.
+    """
+    first = blocks[::FIRST]
+    if len(first) >= FEWEST_FIRST:
+        better = gain(predicted(scans, before, first, span), predicted(scans, after, first, span))
+        more = len(blocks) / len(first)
+        expected, margin = math.sqrt(more) * better.sigmas, CLEAR * math.sqrt(more - 1.0)
+        if not thresholds[0] - margin < expected < thresholds[1] + margin:
+            return better
+        watch(1.0 / more)
+    return gain(predicted(scans, before, blocks, span), predicted(scans, after, blocks, span))
 
 
 def gain_of_objective(scans: Scans, before: Floats, after: Floats) -> Gain:
@@ -91,7 +123,7 @@ def turns_supported(scans: Scans, nodes: Floats) -> bool:
     sharp = [blocks[k] for k in np.sort(np.argsort(-excess, kind='stable')[:JUDGED_ON]) if excess[k] > TURNED]
     if len(sharp) < FEWEST_BLOCKS:
         return True
-    better = gain(*(predicted(scans, each, sharp, SPAN) for each in (windows.node, nodes)))
+    better = _compared(scans, windows.node, nodes, sharp, (LEAST_SIGMAS_OF_TURNS, LEAST_SIGMAS_OF_TURNS), SPAN)
     return bool(np.isinf(better.error)) or better.sigmas > LEAST_SIGMAS_OF_TURNS
 
 
