@@ -176,7 +176,7 @@ class Contents:
             return
         for row in TABLE:
             if row.name in values:
-                with suppress(ParameterError, OverflowError):
+                with suppress(ParameterError):
                     self.parameters[row.name] = row.check(values[row.name])
 
     def add_path(self, data: object) -> None:
