@@ -73,7 +73,7 @@ class Kernels:
     def _compile(self, name: str, ready: Callable[[], None], begin: float) -> None:
         self.stage = name
         self._steps[name]()
-        self._log(f'kernels of the {name} are ready after {time.monotonic() - begin:.1f} s')
+        self._log(f'{name} kernels are ready after {time.monotonic() - begin:.1f} s')
         self._done[name].set()
         if name == 'live map':
             ready()

@@ -114,7 +114,7 @@ def test_a_manager_starts_pauses_and_ends_it(start: Any, robot: Robot, manager: 
     robot.until(lambda: {f'/forward_grid_mapper/{name}' for name in MAPS} <= published(robot))
     robot.until(lambda: robot.diagnostics.get('readings', {}).get('message') == 'inactive: nothing is received')
     assert robot.range_out.get_subscription_count() == 0
-    node.wait_for('kernels of the EM are ready')
+    node.wait_for('EM kernels are ready')
     node.wait_for('ready: the live map is updated with the readings; activate the node to receive them')
     assert 'no Range message has been received on /sonar' in robot.call('run_em').message
     assert manager.change(Transition.TRANSITION_ACTIVATE)
