@@ -103,21 +103,34 @@ def test_arguments_are_parted_as_ros_parts_them() -> None:
     assert ros == ['--ros-args', '-r', 'a:=b', '--', '--ros-args', '--log-level', 'debug']
 
 
-def test_a_signal_ends_a_wait_at_once_and_the_next_one_is_harmless() -> None:
-    before = signal.getsignal(signal.SIGTERM)
+@pytest.mark.parametrize('number', [signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_ends_a_wait_at_once_and_the_next_one_is_harmless(number: signal.Signals) -> None:
+    before = {each: signal.getsignal(each) for each in (signal.SIGTERM, signal.SIGHUP)}
     try:
         with StopSignal() as stop:
             assert not stop.wait(0.01)
-            threading.Timer(0.1, signal.raise_signal, [signal.SIGTERM]).start()
+            threading.Timer(0.1, signal.raise_signal, [number]).start()
             begin = time.monotonic()
             assert stop.wait(20.0)
             assert time.monotonic() - begin < 5.0
             signal.raise_signal(signal.SIGINT)
             assert stop.is_set()
-        signal.raise_signal(signal.SIGTERM)
+        signal.raise_signal(number)
     finally:
-        signal.signal(signal.SIGTERM, before)
+        for each, handler in before.items():
+            signal.signal(each, handler)
         signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def test_a_replay_under_nohup_survives_its_terminal() -> None:
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        with StopSignal() as stop:
+            signal.raise_signal(signal.SIGHUP)
+            assert not stop.wait(0.1)
+        assert signal.getsignal(signal.SIGHUP) == signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGHUP, before)
 
 
 def test_signals_go_back_to_who_had_them() -> None:
