@@ -134,6 +134,8 @@ class Bag:
     def batches(self, topics: Topics, progress: Callable[[int, int], None] | None = None) -> Iterator[MessageBatch]:
         """Yield the messages of the chosen topics by log time, many at once; the files of a split bag in order.
 
+        Files whose log times overlap are read together.
+
         Parameters
         ----------
         topics : Topics
