@@ -15,6 +15,7 @@ import numpy as np
 from ..core.common.errors import BagError, InputError
 from ..core.messages.message_batch import MessageBatch, joined
 from ..core.messages.message_types import OdometryMessage, RangeMessage, range_message
+from ..core.messages.repeated_topics import RepeatedTopics
 from .choice import ODOMETRY, RANGE, Topics, choose_range_topics, choose_topics
 from .columns import Columns, InOrder
 from .decoder import TF_MESSAGE, decoder_of
@@ -46,11 +47,14 @@ class Bag:
     ----------
     undecodable : dict
         Number of messages by topic that did not fit their type and were skipped.
+    repeated : RepeatedTopics
+        Compares the ranges that `batches` has read.
     """
 
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
         self.undecodable: dict[str, int] = {}
+        self.repeated = RepeatedTopics()
         self._sources: list[Source] = []
         self._damage: str | None = None
 
@@ -150,6 +154,7 @@ class Bag:
         """
         chain = self._chain(topics)
         wanted = self._begin(topics)
+        self.repeated = RepeatedTopics()
         total = sum(c.total for c in self._channels() if (c.topic, c.msgtype) in wanted)
         done = decoded = 0
 
@@ -167,6 +172,9 @@ class Bag:
                 places = np.flatnonzero(np.isin(keys, mine))
                 found, wrong = decoding.decode(places, [raw[k][2] for k in places.tolist()])
                 parts += found
+                if len(topics.range_topics) > 1:
+                    for part in found:
+                        self.repeated.add_batch(channels[mine[0]].topic, part.ranges)
                 bad += [(place, channels[int(keys[place])]) for place in wrong]
             for _, channel in sorted(bad, key=lambda one: one[0]):
                 self._count_undecodable(channel)

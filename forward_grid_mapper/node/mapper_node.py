@@ -370,7 +370,12 @@ class MapperNode(ManagedNode):
                 'rejected': dict(associator.rejected),
                 'lost': self.intake.lost,
             },
-            'warnings': [*associator.limits.warnings(), *self.intake.loss_note(), *rejections],
+            'warnings': [
+                *associator.limits.warnings(),
+                *self.intake.loss_note(),
+                *self.intake.repeated(),
+                *rejections,
+            ],
         }
         path, odometry = list(associator.path), associator.odometry
         return Account(source, len(associator.buffer), path, odometry, node.save_directory, f'Maps of {name}')

@@ -243,7 +243,8 @@ def read_drive(
         undecodable = dict(bag.undecodable)
         if topics.odom_type == TF_MESSAGE and not spans.odometry:
             lookup.moving = bag.moving_frames(topics.odom_topic)
-        warnings = topics.notes() + _warnings(bag, associator, lookup)
+        warnings = [*topics.notes(), *bag.repeated.notes(topics.range_topics, _choosing)]
+        warnings += _warnings(bag, associator, lookup)
     if not len(associator.buffer):
         if not associator.received and spans.left_out:
             first, last = spans.left_out
@@ -282,6 +283,10 @@ def _constant_transforms(path: Path | str) -> StaticTransforms:
     """Return the constant transforms of a bag, which may be open elsewhere."""
     with Bag(path) as bag:
         return bag.constant_transforms_on_tf()
+
+
+def _choosing(topics: Sequence[str]) -> str:
+    return f'To use one of them, add `--range-topics {" ".join(map(quoted, topics))}`'
 
 
 def _warnings(bag: Bag, associator: PoseAssociator, lookup: Extrinsics) -> list[str]:
