@@ -237,7 +237,7 @@ class Bag:
 
     def moving_frames(self, topic: str | None = None) -> dict[str, str]:
         """Return the parent of each frame that transforms of this topic, or of `/tf`, place; they may move."""
-        topics = self._moving_topics() if topic is None else {topic}
+        topics = self.moving_topics() if topic is None else {topic}
         parents: dict[str, str] = {}
         for message in self._searched(topics):
             for item in message.transforms:
@@ -250,17 +250,22 @@ class Bag:
         Simulators, and the static_transform_publisher of ROS 1's tf, repeat fixed transforms there.
         """
         transforms = StaticTransforms('/tf')
-        for parent, child, numbers in constant_transforms(self._searched(self._moving_topics())):
+        for parent, child, numbers in constant_transforms(self._searched(self.moving_topics())):
             _add(transforms, parent, child, numbers[:3], numbers[3:])
         transforms.take(self.static_transforms())
         return transforms
 
-    def _moving_topics(self) -> set[str]:
+    def moving_topics(self) -> set[str]:
+        """Return `/tf` and the `tf` of any namespace, if the bag has them."""
         return {c.topic for c in self._channels() if c.msgtype == TF_MESSAGE and c.topic.split('/')[-1] == 'tf'}
 
-    def originals(self, topics: Topics) -> Iterator[tuple[str, Any]]:
-        """Yield topic and message of the chosen topics by log time, as rosbags decodes them."""
-        for channel, message in self._decoded(self._begin(topics)):
+    def originals(self, topics: Topics, transforms: Collection[str] = ()) -> Iterator[tuple[str, Any]]:
+        """Yield topic and message of the chosen topics by log time, as rosbags decodes them.
+
+        `transforms` are topics of transforms to be yielded as well.
+        """
+        wanted = self._begin(topics) | {(topic, TF_MESSAGE) for topic in transforms}
+        for channel, message in self._decoded(wanted):
             if message is not None:
                 yield channel.topic, message
 
