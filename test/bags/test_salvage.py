@@ -79,6 +79,8 @@ def test_a_chunk_that_its_checksum_refutes_is_not_believed(tmp_path: Path) -> No
 class Reader:
     """A reader of rosbags that stops at damage."""
 
+    start_time, end_time = 0, 10
+
     def __init__(self, given: list[RawMessage]) -> None:
         self._given = given
         definition = MessageDefinition(MessageDefinitionFormat.NONE, '')

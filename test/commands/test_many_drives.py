@@ -102,6 +102,46 @@ def test_the_order_of_arguments_does_not_matter(days: Path, tmp_path: Path, orde
             np.testing.assert_array_equal(getattr(columns[0], name), getattr(columns[1], name))
 
 
+def test_a_bag_without_static_transforms_uses_those_of_another(days: Path, tmp_path: Path) -> None:
+    without = write_tape(tmp_path / 'without', day(1)._replace(extrinsics=()))
+    expected = read(days / 'day_0', days / 'day_1').readings
+    for order in ([days / 'day_0', without], [without, days / 'day_0'], [days / 'day_0', without, days / 'day_2.bag']):
+        drives = read(*order)
+        assert drives.source['mounts_from'] == f'/tf_static, /tf_static of {days / "day_0"}'
+        (warning,) = (text for text in drives.source['warnings'] if 'tf_static' in text)
+        assert warning.startswith(
+            f'{without}: the bag has no /tf_static, so that of {days / "day_0"} gives the poses of'
+        )
+        if len(order) == 2:
+            for column in ('x', 'y', 'yaw', 'z'):
+                np.testing.assert_array_equal(getattr(drives.readings, column), getattr(expected, column))
+
+
+def test_transforms_of_other_bags_that_differ_are_not_used(tmp_path: Path) -> None:
+    with_it, frame = day(0), day(0).extrinsics[0][0]
+    moved = [(name, pose._replace(x=pose.x + 0.1) if name == frame else pose) for name, pose in with_it.extrinsics]
+    one = write_tape(tmp_path / 'one', with_it)
+    other = write_tape(tmp_path / 'other', day(2)._replace(extrinsics=moved))
+    without = write_tape(tmp_path / 'without', day(1)._replace(extrinsics=()))
+    drives = read(one, without, other)
+    (warning,) = (text for text in drives.source['warnings'] if 'no pose on the robot' in text)
+    assert (
+        f'The other bags have different poses of {frame}, {one} and {other}: are they of different robots?' in warning
+    )
+    assert f'--sensor {frame}=x,y,yaw' in warning
+    # the other sensors of that bag have the same pose in both
+    (mapped_drive,) = (drive for drive in drives.drives if drive.source['bag'] == str(without))
+    assert frame not in mapped_drive.source['extrinsics'] and len(mapped_drive.source['extrinsics']) == len(moved) - 1
+
+
+def test_transforms_of_a_robot_with_other_frames_are_no_help(days: Path, tmp_path: Path) -> None:
+    renamed = day(1)
+    renamed = renamed._replace(extrinsics=(), ranges=[m._replace(frame_id=f'r2/{m.frame_id}') for m in renamed.ranges])
+    without = write_tape(tmp_path / 'without', renamed)
+    with pytest.raises(InputError, match=r'1 of 2 drives cannot be mapped.*\n.*without: no pose on the robot'):
+        read(days / 'day_0', without)
+
+
 def test_drives_at_one_time_have_one_order_too(tmp_path: Path) -> None:
     paths = [write_tape(tmp_path / f'robot_{number}', day(number, 0)) for number in range(3)]
     orders = [names(read(*order)) for order in itertools.permutations(paths)]

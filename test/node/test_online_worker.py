@@ -292,14 +292,13 @@ def test_readings_that_were_taken_are_not_said_to_be_missing(node: Node, maps: t
     assert node.worker.worker.trouble == '' and node.worker.kept == 3
 
 
-def test_a_map_that_cannot_be_shown_is_shown_later(node: Node, maps: type[PlainMap]) -> None:
+def test_a_map_that_cannot_be_shown_is_shown_later_without_further_readings(node: Node, maps: type[PlainMap]) -> None:
     node.worker.offer(readings(1))
     node.settle()
     maps.error = MemoryError()
     node.publish()
     assert node.shown == [] and node.worker.worker.trouble == 'there is not enough memory'
     maps.error = None
-    node.worker.show()
     node.publish()
     assert len(node.shown) == 1
 

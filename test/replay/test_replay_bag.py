@@ -143,7 +143,7 @@ def test_topics_can_be_renamed(dds: Wire, tmp_path: Path) -> None:
     assert listener.plain == messages_in(bag)
 
 
-@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_signal_that_comes_twice_ends_it_in_order(dds: Wire, tmp_path: Path, number: signal.Signals) -> None:
     listener = dds.listen()
     replay = dds.replay(write_bag(tmp_path), '--loop')
