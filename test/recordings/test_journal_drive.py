@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import sqlite3
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,14 +23,20 @@ from forward_grid_mapper.files.journal_format import ROW
 from forward_grid_mapper.files.map_archive import read_npz
 
 
-def journal(folder: Path, count: int, parameters: dict[str, Any] | None = None, **columns: Any) -> Path:
+def journal(
+    folder: Path,
+    count: int,
+    parameters: dict[str, Any] | None = None,
+    path: Sequence[tuple[float, float]] = ((0.0, 0.0),),
+    **columns: Any,
+) -> Path:
     made = Journal(folder, print)
     assert not list(made.restore())
     number = np.arange(count)
     values = {'x': 0.0, 'y': 0.0, 'yaw': 0.01 * number, 'z_max': 5.0, 'half_angle': 0.1, 'stamp': number, **columns}
     readings = Readings.from_columns(names=('sonar',), z=values.pop('z', 2.0) + 0 * number, **values)
     made.parameters = parameters or {}
-    made.put(readings, ('map', 'base'), [(0.0, 0.0)])
+    made.put(readings, ('map', 'base'), list(path))
     made.close()
     return folder
 
@@ -45,6 +53,21 @@ def test_options_that_a_journal_has_no_use_for(tmp_path: Path, capsys: pytest.Ca
     assert 'leave out' in capsys.readouterr().err
     assert process_bag([str(folder), '-o', str(tmp_path / 'b'), '-q', '--sensor', 'sonar=0,0,0']) == 0
     assert 'have no effect' in capsys.readouterr().err
+    refining = ['--refine-poses', '--sensor', 'sonar=0,0,0']
+    assert process_bag([str(folder), '-o', str(tmp_path / 'c'), '-q', *refining]) == 0
+    assert 'have no effect' not in capsys.readouterr().err
+
+
+def test_a_part_has_the_path_of_that_part(tmp_path: Path) -> None:
+    """The path in a journal has no stamps."""
+    number = np.arange(300)
+    way = {'x': 0.05 * number, 'stamp': number * 10**8}
+    folder = journal(tmp_path / 'j', 300, path=[(x, 0.0) for x in way['x'].tolist()], **way)
+    driven = {}
+    for name, options in (('whole', []), ('part', ['--start', '10', '--duration', '10'])):
+        assert process_bag([str(folder), '-o', str(tmp_path / name), '-q', *options]) == 0
+        driven[name] = json.loads((tmp_path / name / 'report.json').read_text())['input']['path_m']
+    assert driven == {'whole': pytest.approx(14.95, abs=0.1), 'part': pytest.approx(5.0, abs=0.1)}
 
 
 def test_a_damaged_journal_is_mapped_as_far_as_it_goes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
