@@ -23,6 +23,9 @@ from .drive import WHOLE, Drive, FullLiveMap, Part, length_of, thinning_note
 MOST_NAMED = 10
 """Most parameters that a warning names."""
 
+MOST_FILES = 3
+"""Most earlier files that an error names, the latest ones."""
+
 POSES_UNUSED = (
     'a journal contains readings in the map frame: given poses of sensors have no effect, except with --refine-poses '
     'and --odometry-calibration, where they are used to compute odometry from the readings'
@@ -70,7 +73,10 @@ def read_journal(
             for reason, count in associator.rejected.items()
         ]
         why = '; '.join(filter(None, [contents.harm, *reasons]))
-        raise InputError(f'the journal {path} contains no reading{f" to map: {why}" if why else ""}')
+        # a reset begins a new file
+        earlier = sorted(str(other) for other in path.parent.glob('drive_*.journal') if other.name < path.name)
+        hint = f'; earlier files can be given by name: {", ".join(earlier[-MOST_FILES:])}' if earlier else ''
+        raise InputError(f'the journal {path} contains no reading{f" to map: {why}" if why else ""}{hint}')
     associator.map_frame, associator.base_frame = contents.map_frame, contents.base_frame
     for point in contents.path:
         associator.extend_path(point)

@@ -44,7 +44,17 @@ def journal(
 def test_a_journal_without_readings(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = journal(tmp_path / 'empty', 0)
     assert process_bag([str(folder), '-o', str(tmp_path / 'out')]) == 1
-    assert 'contains no reading' in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert 'contains no reading' in said and 'earlier' not in said
+
+
+def test_after_a_reset_the_earlier_file_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = journal(tmp_path / 'reset', 300)
+    (journal(tmp_path / 'empty', 0) / 'drive_0001.journal').rename(folder / 'drive_0002.journal')
+    assert process_bag([str(folder), '-o', str(tmp_path / 'out')]) == 1
+    said = capsys.readouterr().err
+    assert 'drive_0002.journal contains no reading; earlier files can be given by name: ' in said
+    assert f'{folder / "drive_0001.journal"}' in said
 
 
 def test_options_that_a_journal_has_no_use_for(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
