@@ -115,6 +115,14 @@ def test_the_parameters_of_the_node_are_compared(tmp_path: Path, capsys: pytest.
     assert 'mapped with' not in capsys.readouterr().err
 
 
+def test_parameters_that_are_ignored_are_not_reported_as_changed(tmp_path: Path) -> None:
+    file = tmp_path / 'robot.yaml'
+    file.write_text('/**:\n  ros__parameters:\n    resolution: 0.2\n    journal: /var/lib/robot\n')
+    folder = journal(tmp_path / 'j', 300)
+    assert process_bag([str(folder), '-o', str(tmp_path / 'a'), '-q', '--params', str(file)]) == 0
+    assert list(json.loads((tmp_path / 'a' / 'report.json').read_text())['changed_parameters']) == ['resolution']
+
+
 def test_a_journal_of_the_previous_format(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / 'drive_0001.journal').write_bytes(Previous.file(300))
     assert process_bag([str(tmp_path), '-o', str(tmp_path / 'a'), '-q']) == 0
