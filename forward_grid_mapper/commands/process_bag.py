@@ -8,11 +8,13 @@ import sys
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from ..core.common.errors import ParameterError
+from ..core.common.parameters import Parameters
 from ..core.common.shell import module_line
 from ..core.joint_learning import map_and_learn
 from ..core.mapping import Mapper
@@ -29,6 +31,7 @@ from ..files.rerun_recording import check_rerun, write_rerun
 from ..files.results import write_results
 from ..recordings.drive import jumps_note
 from ..recordings.drives import Drives, read_drives
+from ..recordings.journal_drive import POSES_UNUSED
 from ..recordings.refined import Given, refine_drives
 from .console import Ticker, run
 from .desktop import show
@@ -111,6 +114,8 @@ def parser() -> argparse.ArgumentParser:
 def process(options: argparse.Namespace) -> int:
     """Run the command with its options."""
     parameters, extrinsics, ignored = chosen_parameters(options)
+    # those of the node are ignored, so that reports do not have them either
+    parameters = replace(parameters, node=Parameters().node)
     extrinsics |= chosen_sensors(options)
     if options.learn < 0:
         raise ParameterError('--learn: the number of rounds must not be negative')
@@ -146,6 +151,8 @@ def process(options: argparse.Namespace) -> int:
         )
         source = drives.source
         source['warnings'] += ignored
+        if options.refine_poses or given:
+            source['warnings'] = [text for text in source['warnings'] if not text.endswith(POSES_UNUSED)]
         ticker.warn(source['warnings'])
         read = time.perf_counter() - begin
         refined = None

@@ -82,9 +82,11 @@ def parser() -> argparse.ArgumentParser:
         choices=tuple(LEVELS),
         help='drift of odometry: low, middle, high, or like the wheels of an old robot (default: no drift)',
     )
-    made.add_argument('--sonars', choices=sorted(SONARS), default='ring', help='ring of 24 or front array of 8')
     made.add_argument(
-        '--topics', choices=('one', 'each'), default='one', help='all sonars on /sonar, or one topic each'
+        '--sonars', choices=sorted(SONARS), default='ring', help='ring of 24 (default) or front array of 8'
+    )
+    made.add_argument(
+        '--topics', choices=('one', 'each'), default='one', help='all sonars on /sonar (default), or one topic each'
     )
     made.add_argument('--format', choices=sorted(FORMATS), default='mcap', help='bag format (default mcap)')
     made.add_argument('--seed', type=int, default=0, help='seed of the noise (default 0)')

@@ -16,6 +16,7 @@ from .common.readings import Readings
 from .evidence.evidence import Evidence
 from .learning.sensor_health import sensor_health
 from .mapping import Mapper
+from .maps.cell_evidence import cell_evidence
 from .maps.log_odds_map import LogOddsMap, map_grid
 from .maps.map_set import MapSet
 from .online_map import OnlineMap
@@ -59,10 +60,11 @@ def warm_up_online_map() -> None:
 
 
 def warm_up_em() -> MapSet:
-    """Compile the kernels of EM and of the steps after it."""
+    """Compile the kernels of EM, of the steps after it, and of the page that is saved with the maps."""
     _flip_at_once(_square_room())
     maps = Mapper(Parameters()).run(_square_room())
     sensor_health(maps)
+    cell_evidence(maps.readings, maps.grid, maps.ml, maps.parameters, maps.normals, (0.5, 0.5))
     return maps
 
 

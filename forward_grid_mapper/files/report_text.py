@@ -10,6 +10,12 @@ from typing import Any
 
 from ..core.common.words import counted
 
+UNTESTED = (
+    'the drive may not determine these values, which are estimated with the trajectory: process_bag --refine-poses '
+    'states those that it does, with their standard deviations'
+)
+"""Said of a calibration that was not tested: along a bare corridor, its values may have the wrong sign."""
+
 _LABEL = 14
 _WIDTH = 100
 _SHOWN = 6
@@ -91,9 +97,10 @@ def _description(found: dict[str, Any]) -> str:
 
 def _wheels(found: dict[str, Any]) -> str:
     words = found.get('odometry') or ''
-    some = found.get('calibration_estimates') is None or found['calibration_estimates']
-    check = '; these values are for this drive: measure a straight line and a full turn before you set them'
-    return words + check if words and some else words
+    if not words or found.get('calibration_estimates') == {}:
+        return words
+    check = 'these values are for this drive: measure a straight line and a full turn before you set them'
+    return f'{words}; {UNTESTED if found.get("calibration_estimates") is None else check}'
 
 
 def _counts(data: dict[str, Any]) -> Iterator[str]:

@@ -24,7 +24,6 @@ from ..core.trajectory.keeping import keep_if_not_worse
 from ..core.trajectory.outcome import Refinement
 from ..core.trajectory.refinement import Refiner
 from ..core.trajectory.windows import Odometry
-from ..files.trajectory_text import calibration_words
 from .background import reason
 
 BATCH = 20_000
@@ -186,13 +185,11 @@ def outcome_words(found: Found) -> str:
         return ''
     if correction is None:
         return f'odometry is used as the trajectory: {refinement.reason}'
-    wheels = calibration_words(refinement.calibration)
     said = 'trajectory refined'
     if found.kept:
         said = f'trajectory of the previous run kept ({refinement.reason}; result of this run alone: {found.kept})'
     return (
         f'{said}: odometry was off by {refinement.moved:.2f} m (root mean square), '
         f'{correction.moved:.2f} m at the end of the drive, {counted(refinement.loops, "place")} recognised'
-        + (f'; {wheels}' if wheels else '')
         + (f'; {refinement.jumps}' if refinement.jumps else '')
     )

@@ -25,6 +25,7 @@ from ..core.trajectory.correction import Correction
 from ..core.trajectory.jumps import jumps
 from ..core.trajectory.refinement import SHORTEST
 from ..core.trajectory.windows import Odometry
+from ..files.report_text import UNTESTED
 from ..files.trajectory_text import calibration_words
 from .background import Worker
 from .diagnostics import status
@@ -217,13 +218,14 @@ class Trajectory:
         refinement = self.found.refinement if self.found else None
         if refinement is not None and self.correction is not None:
             x, y, yaw = self.correction.last.tolist()
+            wheels = calibration_words(refinement.calibration)
             values |= {
                 'odometry off (m, root mean square)': f'{refinement.moved:.2f}',
                 'odometry off (deg, standard deviation)': f'{math.degrees(refinement.turned):.1f}',
                 'moved at the end of the drive (m)': f'{self.correction.moved:.2f}',
                 'places recognised': refinement.loops,
                 'correction (x m, y m, yaw deg)': f'{x:.2f}, {y:.2f}, {math.degrees(yaw):.1f}',
-                'wheels': calibration_words(refinement.calibration) or 'no systematic error found',
+                'wheels': f'{wheels}; {UNTESTED}' if wheels else 'no systematic error found',
             }
         if self.following is not None:
             values |= self.following.values()

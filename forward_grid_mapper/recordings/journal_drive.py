@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
+
+import numpy as np
 
 from ..core.common.errors import InputError, ParameterError
 from ..core.common.parameters import TABLE, Parameters
@@ -20,6 +22,15 @@ from .drive import WHOLE, Drive, FullLiveMap, Part, length_of, thinning_note
 
 MOST_NAMED = 10
 """Most parameters that a warning names."""
+
+MOST_FILES = 3
+"""Most earlier files that an error names, the latest ones."""
+
+POSES_UNUSED = (
+    'a journal contains readings in the map frame: given poses of sensors have no effect, except with --refine-poses '
+    'and --odometry-calibration, where they are used to compute odometry from the readings'
+)
+"""The warning of poses of sensors, which does not hold with these options."""
 
 
 def read_journal(
@@ -47,9 +58,11 @@ def read_journal(
     live = FullLiveMap(associator, parameters)
     contents = Contents()
     first, last, names = math.inf, -math.inf, set()
-    held = read(path, contents)
+    held: Iterable[Readings] = read(path, contents)
     if not part.whole:
-        held = iter(_cut(list(held), path, part))
+        held = _cut(list(held), path, part)
+        # the path in the file has no stamps
+        contents.path[:] = _path_of(held)
     for readings in held:
         associator.restore(readings)
         first, last = min(first, int(readings.stamp.min())), max(last, int(readings.stamp.max()))
@@ -60,16 +73,16 @@ def read_journal(
             for reason, count in associator.rejected.items()
         ]
         why = '; '.join(filter(None, [contents.harm, *reasons]))
-        raise InputError(f'the journal {path} contains no reading{f" to map: {why}" if why else ""}')
+        # a reset begins a new file
+        earlier = sorted(str(other) for other in path.parent.glob('drive_*.journal') if other.name < path.name)
+        hint = f'; earlier files can be given by name: {", ".join(earlier[-MOST_FILES:])}' if earlier else ''
+        raise InputError(f'the journal {path} contains no reading{f" to map: {why}" if why else ""}{hint}')
     associator.map_frame, associator.base_frame = contents.map_frame, contents.base_frame
     for point in contents.path:
         associator.extend_path(point)
     warnings = _warnings(path, contents, associator, parameters)
     if extrinsics:
-        warnings.append(
-            'a journal contains readings in the map frame: given poses of sensors have no effect, except with '
-            '--refine-poses, where they are used to compute odometry from the readings'
-        )
+        warnings.append(POSES_UNUSED)
     source = {
         'bag': readable(path),
         'odom_frame': associator.map_frame,
@@ -99,6 +112,18 @@ def _cut(held: Sequence[Readings], path: Path, part: Part) -> list[Readings]:
     if held and not chosen:
         raise InputError(f'{path} has no reading in the part {part}; it spans {(last - first) / NANOSECONDS:.1f} s')
     return chosen
+
+
+def _path_of(held: Sequence[Readings]) -> list[tuple[float, float]]:
+    """Return the path of the sensor with the most readings, which is close to that of the robot."""
+    if not held:
+        return []
+    names = np.concatenate([np.array(readings.sensor_names)[readings.sensor] for readings in held])
+    stamp, x, y = (np.concatenate([getattr(readings, name) for readings in held]) for name in ('stamp', 'x', 'y'))
+    frames, counts = np.unique(names, return_counts=True)
+    which = np.flatnonzero(names == frames[counts.argmax()])
+    which = which[np.argsort(stamp[which], kind='stable')]
+    return list(zip(x[which].tolist(), y[which].tolist(), strict=True))
 
 
 def _warnings(path: Path, contents: Contents, associator: PoseAssociator, parameters: Parameters) -> list[str]:

@@ -69,6 +69,21 @@ print(found.accepted, len(before) > 2, signatures() - before)
     assert done.stdout.split() == ['True', 'True', 'set()'], done.stdout
 
 
+def test_the_page_of_a_map_and_the_explanation_of_a_cell_need_no_more_kernels() -> None:
+    """The node writes the page as well, when it saves maps."""
+    program = f"""{SIGNATURES}
+from forward_grid_mapper.core.common.parameters import Parameters
+from forward_grid_mapper.core.maps.cell_evidence import cell_evidence, prior_odds
+maps = warm_up()
+before = signatures()
+prior_odds(maps.grid, maps.ml, Parameters())
+found = cell_evidence(maps.readings, maps.grid, maps.ml, Parameters(), maps.normals, (0.5, 0.5))
+print(len(found.readings) > 0, len(before) > 2, [kernel for _, kernel, _ in signatures() - before])
+"""
+    done = subprocess.run([sys.executable, '-c', program], capture_output=True, text=True, check=True, timeout=600)
+    assert done.stdout.split() == ['True', 'True', '[]'], done.stdout
+
+
 def test_the_live_map_needs_no_kernel_of_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(*arguments: object, **options: object) -> None:
         raise AssertionError('not needed for the live map')

@@ -64,11 +64,15 @@ def test_the_report_says_what_became_of_the_trajectory() -> None:
     text = ' '.join(report_text({'input': {'trajectory': refined}}).split())
     assert 'off by 5.43 m and 16.0°' in text
     assert '1 place recognised' in text
-    assert 'Wheels' in text and 'measure a straight line and a full turn' in ' '.join(text.split())
-    unknown = 'the drive does not show whether distances are measured too long'
-    refined |= {'calibration_estimates': {}, 'odometry': unknown}
-    text = ' '.join(report_text({'input': {'trajectory': refined}}).split())
-    assert unknown in text and 'measure a straight line' not in text
+    # the node does not ask which of them the drive determines
+    assert 'turns are measured 2.0 % too large; the drive may not determine these values' in text
+    assert 'measure a straight line' not in text
+    estimates = {'calibration_estimates': {'turn_scale': {'value': -0.02, 'sigma': 0.004}}, 'odometry': 'turns are … too large (± 0.4 %)'}
+    text = ' '.join(report_text({'input': {'trajectory': refined | estimates}}).split())
+    assert 'Wheels turns are … too large (± 0.4 %); these values are for this drive: measure a straight line' in text
+    assert 'may not determine' not in text
+    refined |= {'calibration_estimates': {}, 'odometry': 'the drive does not show whether distances are measured too long'}
+    assert 'measure a straight line' not in report_text({'input': {'trajectory': refined}})
     left = report_text({'input': {'trajectory': {'refined': False, 'reason': 'the drive is short'}}})
     assert "odometry's, not refined: the drive is short" in left
     assert 'Wheels' not in left

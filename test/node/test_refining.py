@@ -39,6 +39,24 @@ def test_the_live_map_and_what_comes_later_are_moved(inside: Callable[..., Insid
     assert_live(robot, odometry_of(robot))
 
 
+def test_values_of_the_wheels_that_nobody_tested_are_no_result(
+    inside: Callable[..., Inside], quick: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """They are estimated with the trajectory, with a prior, and may have the wrong sign."""
+    run = QuickRefiner.run
+    monkeypatch.setattr(
+        QuickRefiner, 'run', lambda *given: replace(run(*given), calibration={'turn_scale': -0.05, 'scale': 0.01})
+    )
+    robot, _ = refined(inside(refine_poses=True).start())
+    trajectory = robot.node.trajectory
+    assert 'trajectory refined' in trajectory.outcome() and 'measured' not in trajectory.outcome()
+    (status,) = trajectory.statuses('mapper')
+    wheels = {each.key: each.value for each in status.values}['wheels']
+    assert wheels.startswith(
+        'distances are measured 1.0 % too short; turns are measured 5.0 % too large; the drive may'
+    )
+
+
 def test_readings_that_come_while_it_runs_are_not_lost(
     inside: Callable[..., Inside], quick: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import sqlite3
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,14 +23,20 @@ from forward_grid_mapper.files.journal_format import ROW
 from forward_grid_mapper.files.map_archive import read_npz
 
 
-def journal(folder: Path, count: int, parameters: dict[str, Any] | None = None, **columns: Any) -> Path:
+def journal(
+    folder: Path,
+    count: int,
+    parameters: dict[str, Any] | None = None,
+    path: Sequence[tuple[float, float]] = ((0.0, 0.0),),
+    **columns: Any,
+) -> Path:
     made = Journal(folder, print)
     assert not list(made.restore())
     number = np.arange(count)
     values = {'x': 0.0, 'y': 0.0, 'yaw': 0.01 * number, 'z_max': 5.0, 'half_angle': 0.1, 'stamp': number, **columns}
     readings = Readings.from_columns(names=('sonar',), z=values.pop('z', 2.0) + 0 * number, **values)
     made.parameters = parameters or {}
-    made.put(readings, ('map', 'base'), [(0.0, 0.0)])
+    made.put(readings, ('map', 'base'), list(path))
     made.close()
     return folder
 
@@ -36,7 +44,17 @@ def journal(folder: Path, count: int, parameters: dict[str, Any] | None = None, 
 def test_a_journal_without_readings(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = journal(tmp_path / 'empty', 0)
     assert process_bag([str(folder), '-o', str(tmp_path / 'out')]) == 1
-    assert 'contains no reading' in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert 'contains no reading' in said and 'earlier' not in said
+
+
+def test_after_a_reset_the_earlier_file_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = journal(tmp_path / 'reset', 300)
+    (journal(tmp_path / 'empty', 0) / 'drive_0001.journal').rename(folder / 'drive_0002.journal')
+    assert process_bag([str(folder), '-o', str(tmp_path / 'out')]) == 1
+    said = capsys.readouterr().err
+    assert 'drive_0002.journal contains no reading; earlier files can be given by name: ' in said
+    assert f'{folder / "drive_0001.journal"}' in said
 
 
 def test_options_that_a_journal_has_no_use_for(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -45,6 +63,21 @@ def test_options_that_a_journal_has_no_use_for(tmp_path: Path, capsys: pytest.Ca
     assert 'leave out' in capsys.readouterr().err
     assert process_bag([str(folder), '-o', str(tmp_path / 'b'), '-q', '--sensor', 'sonar=0,0,0']) == 0
     assert 'have no effect' in capsys.readouterr().err
+    refining = ['--refine-poses', '--sensor', 'sonar=0,0,0']
+    assert process_bag([str(folder), '-o', str(tmp_path / 'c'), '-q', *refining]) == 0
+    assert 'have no effect' not in capsys.readouterr().err
+
+
+def test_a_part_has_the_path_of_that_part(tmp_path: Path) -> None:
+    """The path in a journal has no stamps."""
+    number = np.arange(300)
+    way = {'x': 0.05 * number, 'stamp': number * 10**8}
+    folder = journal(tmp_path / 'j', 300, path=[(x, 0.0) for x in way['x'].tolist()], **way)
+    driven = {}
+    for name, options in (('whole', []), ('part', ['--start', '10', '--duration', '10'])):
+        assert process_bag([str(folder), '-o', str(tmp_path / name), '-q', *options]) == 0
+        driven[name] = json.loads((tmp_path / name / 'report.json').read_text())['input']['path_m']
+    assert driven == {'whole': pytest.approx(14.95, abs=0.1), 'part': pytest.approx(5.0, abs=0.1)}
 
 
 def test_a_damaged_journal_is_mapped_as_far_as_it_goes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -80,6 +113,14 @@ def test_the_parameters_of_the_node_are_compared(tmp_path: Path, capsys: pytest.
     assert 'the node that kept drive_0001.journal mapped with resolution=0.05' in capsys.readouterr().err
     assert process_bag([str(folder), '-o', str(tmp_path / 'b'), '-q', '--set', 'resolution=0.05']) == 0
     assert 'mapped with' not in capsys.readouterr().err
+
+
+def test_parameters_that_are_ignored_are_not_reported_as_changed(tmp_path: Path) -> None:
+    file = tmp_path / 'robot.yaml'
+    file.write_text('/**:\n  ros__parameters:\n    resolution: 0.2\n    journal: /var/lib/robot\n')
+    folder = journal(tmp_path / 'j', 300)
+    assert process_bag([str(folder), '-o', str(tmp_path / 'a'), '-q', '--params', str(file)]) == 0
+    assert list(json.loads((tmp_path / 'a' / 'report.json').read_text())['changed_parameters']) == ['resolution']
 
 
 def test_a_journal_of_the_previous_format(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -28,7 +28,7 @@ SIGMA = np.array([0.1, 0.1, math.radians(4.0)])
 """σ of the prior of the begin: metres, metres, radians."""
 
 SIGMAS = 2.5
-"""Half the size of the searched area, σ."""
+"""Half the size of the first grid, σ; the finer grids may leave it, by up to one of their steps before."""
 
 STEP, FINER, LEVELS = 0.15, 1 / 3, 3
 """Step of the first grid, metres; factor of the steps from one grid to the next; number of grids."""
