@@ -67,11 +67,17 @@ def test_the_report_says_what_became_of_the_trajectory() -> None:
     # the node does not ask which of them the drive determines
     assert 'turns are measured 2.0 % too large; the drive may not determine these values' in text
     assert 'measure a straight line' not in text
-    estimates = {'calibration_estimates': {'turn_scale': {'value': -0.02, 'sigma': 0.004}}, 'odometry': 'turns are … too large (± 0.4 %)'}
+    estimates = {
+        'calibration_estimates': {'turn_scale': {'value': -0.02, 'sigma': 0.004}},
+        'odometry': 'turns are … too large (± 0.4 %)',
+    }
     text = ' '.join(report_text({'input': {'trajectory': refined | estimates}}).split())
     assert 'Wheels turns are … too large (± 0.4 %); these values are for this drive: measure a straight line' in text
     assert 'may not determine' not in text
-    refined |= {'calibration_estimates': {}, 'odometry': 'the drive does not show whether distances are measured too long'}
+    refined |= {
+        'calibration_estimates': {},
+        'odometry': 'the drive does not show whether distances are measured too long',
+    }
     assert 'measure a straight line' not in report_text({'input': {'trajectory': refined}})
     left = report_text({'input': {'trajectory': {'refined': False, 'reason': 'the drive is short'}}})
     assert "odometry's, not refined: the drive is short" in left
