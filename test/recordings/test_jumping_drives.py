@@ -32,9 +32,9 @@ def outcome_of(drive: Any, **values: Any) -> Refinement:
     return Refinement(True, 'better', drive.associator.readings, trajectory, {'scale': 0.01}, **values)
 
 
-@pytest.mark.parametrize(('section', 'count'), [(None, 10), ((2 * 10**9, 7 * 10**9), 6)])
+@pytest.mark.parametrize(('stretch', 'count'), [(None, 10), ((2 * 10**9, 7 * 10**9), 6)])
 def test_errors_of_the_wheels_come_from_a_part_without_jumps(
-    section: tuple[int, int] | None, count: int, monkeypatch: pytest.MonkeyPatch
+    stretch: tuple[int, int] | None, count: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     lengths: list[list[int]] = []
 
@@ -44,7 +44,7 @@ def test_errors_of_the_wheels_come_from_a_part_without_jumps(
 
     monkeypatch.setattr(refined, 'determined_calibration', certain)
     drive = drive_of('a')
-    outcome = outcome_of(drive, section=section)
+    outcome = outcome_of(drive, stretch=stretch)
     odometry = Odometry.of(*drive.associator.odometry)
     for given in (None, refined.Given({'scale': 0.0}, 'c.yaml')):
         refined._estimates(drive, odometry, outcome, Parameters(), lambda stage, part: None, given)
