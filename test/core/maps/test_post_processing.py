@@ -177,7 +177,7 @@ def test_walls_are_extended_as_in_the_twin(seed: int) -> None:
         actual, seen = (
             a.reshape(GRID.shape) for a in (evidence.state.maps.evidence * QUANTUM, evidence.state.maps.seen)
         )
-        expected = naive.drawn_out(occupied, actual, seen, steps, barred)
+        expected = naive.extended_walls(occupied, actual, seen, steps, barred)
         assert np.array_equal(out.reshape(GRID.shape), expected)
 
 
