@@ -259,9 +259,7 @@ def is_spoken(name: str) -> bool:
 
 @cache
 def library_names() -> frozenset[str]:
-    """Names that other programs import and use: functions of the library, their arguments, and
-    attributes of results.
-    """
+    """Names that other programs use: functions of the library, their arguments, and attributes of results."""
     found = {'grid.shape', 'grid.extent'}
     for node in ast.walk(tree_of(PACKAGE / 'library.py')):
         if isinstance(node, ast.FunctionDef):
@@ -364,8 +362,8 @@ def wrong_links(text: str, page: Path) -> list[str]:
 
 
 def wrong_defaults(text: str) -> list[str]:
-    """Parameters with another default than stated: in tables with a column `default`, and in
-    brackets after bold words.
+    """Parameters with another default than stated: in a column `default` of tables, and in brackets
+    after bold words.
     """
     stated = []
     column = None

@@ -1,6 +1,4 @@
-"""Layers: each imports only from those below it, no two modules import each other, and the core has
-few dependencies.
-"""
+"""Layers: each imports only from those below, no two modules import each other, and the core has few dependencies."""
 
 from __future__ import annotations
 

@@ -1,6 +1,4 @@
-"""Orientations are converted to headings in the same way for odometry, static transforms of bags,
-and TF in the node.
-"""
+"""Headings from orientations: the same for odometry, static transforms of bags, and TF in the node."""
 
 from __future__ import annotations
 

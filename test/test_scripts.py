@@ -100,7 +100,7 @@ def test_missing_venv_is_reported_with_a_remedy(caller: Caller) -> None:
     assert caller.run('demo').returncode == 0
 
 
-def test_incomplete_environment_is_made_anew(caller: Caller) -> None:
+def test_incomplete_environment_is_replaced(caller: Caller) -> None:
     (caller.venv / 'bin').mkdir(parents=True)
     (caller.venv / 'pyvenv.cfg').touch()
     (caller.venv / 'bin' / 'python').symlink_to('/bin/false')
@@ -108,7 +108,7 @@ def test_incomplete_environment_is_made_anew(caller: Caller) -> None:
     assert caller.made == 1
 
 
-def test_environment_of_another_python_is_made_anew(caller: Caller) -> None:
+def test_environment_of_another_python_is_replaced(caller: Caller) -> None:
     assert caller.run('demo').returncode == 0
     (caller.venv / 'bin' / 'python').write_text(PYTHON.replace('${VERSION:-3.12.1}', '3.10.2'))
     assert caller.run('demo').returncode == 0

@@ -1,5 +1,4 @@
-"""Bags that are made to use unlimited time or memory: each is read or rejected, within 20 s of processor time and 1.5
-GB.
+"""Bags made to use unlimited time or memory: each is read or rejected, within 20 s of processor time and 1.5 GB.
 
 Each attempt runs in a separate process with limits of address space and processor time, and a time-out. It is a child
 of a process that has already imported the package, which takes longer than most attempts.
@@ -131,9 +130,7 @@ READ = Reader()
 
 
 def attempt(path: Path) -> tuple[int, str, int]:
-    """Read a bag; return the number of messages or -1, the message to the user, and the number of messages that do not
-    fit.
-    """
+    """Read a bag; return the number of messages or -1, the message to the user, and the number of unfit messages."""
     count, message, unfit = READ.read(path)
     return int(count), message, int(unfit)
 

@@ -49,9 +49,7 @@ class Tape(NamedTuple):
 
 @lru_cache(maxsize=1)
 def tape() -> Tape:
-    """A drive past a door with eight sonars; the numbers of a Range are exact in single precision,
-    as in its message.
-    """
+    """A drive past a door with eight sonars; the numbers of a Range are exact in single precision."""
     recording = door_drive(1, NOISY, 0, front_array())
     exact = [
         m._replace(
@@ -63,9 +61,7 @@ def tape() -> Tape:
 
 
 def backwards_sensors() -> tuple[tuple[tuple[str, Pose2], ...], Tape]:
-    """Poses of the sonars of a ring, and a drive past a door whose transforms have these sonars
-    rotated by 180 degrees.
-    """
+    """Poses of the sonars of a ring, and a drive past a door with transforms that rotate the sonars by 180 degrees."""
     made = door_drive(1, NOISY, 0, sonar_ring())
     wrong = tuple((frame, Pose2(-p.x, -p.y, p.yaw + math.pi)) for frame, p in made.extrinsics)
     return made.extrinsics, Tape(wrong, list(made.odometry), list(made.ranges))
@@ -139,10 +135,8 @@ def assert_same_maps(one: Path, other: Path) -> None:
         np.testing.assert_array_equal(a[name], b[name], name)
 
 
-def refusal(capsys: pytest.CaptureFixture[str], folder: Path, *arguments: object, code: int = 1) -> str:
-    """The error message of process_bag for wrong arguments; it must be well formed, and `folder`
-    must stay unchanged.
-    """
+def error_of(capsys: pytest.CaptureFixture[str], folder: Path, *arguments: object, code: int = 1) -> str:
+    """The error message of process_bag for wrong arguments; `folder` must stay unchanged."""
     before = everything_in(folder)
     capsys.readouterr()
     assert code_of(process_bag.main, *arguments) == code

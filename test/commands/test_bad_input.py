@@ -16,9 +16,9 @@ from drive_samples import (
     Tape,
     assert_same_maps,
     code_of,
+    error_of,
     in_turn,
     mapped,
-    refusal,
     report_in,
     tape,
     write_tape,
@@ -59,10 +59,10 @@ def every(step: int, **changes: Any) -> Tape:
     return tape()._replace(ranges=[m._replace(**changes) if k % step == 0 else m for k, m in enumerate(tape().ranges)])
 
 
-def refused_drive(capsys: pytest.CaptureFixture[str], folder: Path, drive: Tape, *options: object) -> str:
+def error_of_drive(capsys: pytest.CaptureFixture[str], folder: Path, drive: Tape, *options: object) -> str:
     """The error message for a bag of this drive."""
     bag = write_tape(folder / 'bag', drive)
-    return refusal(capsys, folder, bag, '-o', folder / 'maps', *options)
+    return error_of(capsys, folder, bag, '-o', folder / 'maps', *options)
 
 
 # ---- bags
@@ -78,12 +78,12 @@ def test_folder_with_a_folder_of_bags_is_rejected_with_its_path(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     write_tape(tmp_path / 'campus' / 'drives' / 'first', tape())
-    error = refusal(capsys, tmp_path, tmp_path / 'campus', '-o', tmp_path / 'maps')
+    error = error_of(capsys, tmp_path, tmp_path / 'campus', '-o', tmp_path / 'maps')
     assert f'There are bags in {tmp_path / "campus" / "drives"}' in error
 
 
 def test_absent_bag_is_rejected(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    error = refusal(capsys, tmp_path, tmp_path / 'absent', '-o', tmp_path / 'maps')
+    error = error_of(capsys, tmp_path, tmp_path / 'absent', '-o', tmp_path / 'maps')
     assert str(tmp_path / 'absent') in error and 'does not exist' in error and 'Give a bag' in error
 
 
@@ -92,7 +92,7 @@ def test_file_that_is_no_bag_is_rejected(tmp_path: Path, capsys: pytest.CaptureF
     (tmp_path / 'empty.mcap').write_text('')
     (tmp_path / 'folder').mkdir()
     for name, expected in (('text.bag', 'neither an MCAP'), ('empty.mcap', '0 bytes'), ('folder', 'is not a bag')):
-        error = refusal(capsys, tmp_path, tmp_path / name, '-o', tmp_path / 'maps')
+        error = error_of(capsys, tmp_path, tmp_path / name, '-o', tmp_path / 'maps')
         assert str(tmp_path / name) in error and expected in error
 
 
@@ -119,31 +119,31 @@ def test_pipe_is_rejected_at_once(tmp_path: Path, capsys: pytest.CaptureFixture[
         pipe = next(write_tape(tmp_path / 'bag', tape()).glob('*.mcap'))
         pipe.unlink()
     os.mkfifo(pipe)
-    error = refusal(capsys, tmp_path, pipe.parent if inside else pipe, '-o', tmp_path / 'maps')
+    error = error_of(capsys, tmp_path, pipe.parent if inside else pipe, '-o', tmp_path / 'maps')
     assert str(pipe) in error and 'ive a bag folder' in error
 
 
 def test_bag_without_any_intact_message_is_rejected(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = next(write_tape(tmp_path / 'bag', tape()).glob('*.mcap'))
     file.write_bytes(file.read_bytes()[:100])
-    error = refusal(capsys, tmp_path, file, '-o', tmp_path / 'maps')
+    error = error_of(capsys, tmp_path, file, '-o', tmp_path / 'maps')
     assert 'cut off' in error and 'mcap recover' in error
 
 
 def test_bag_without_ranges_is_rejected(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    error = refused_drive(capsys, tmp_path, tape()._replace(ranges=[]))
+    error = error_of_drive(capsys, tmp_path, tape()._replace(ranges=[]))
     assert 'no sensor_msgs/Range' in error and 'LaserScan, PointCloud and other types are not read' in error
     assert '/odom: ' in error and '/tf_static: ' in error
 
 
 def test_static_transforms_are_not_offered_as_odometry(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     bag = write_tape(tmp_path / 'bag', tape())
-    error = refusal(capsys, tmp_path, bag, '-o', tmp_path / 'maps', '--odom-topic', '/nowhere')
+    error = error_of(capsys, tmp_path, bag, '-o', tmp_path / 'maps', '--odom-topic', '/nowhere')
     assert "no topic '/nowhere'" in error and '/odom' in error and '/tf_static' not in error
 
 
 def test_bag_without_odometry_is_rejected(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    error = refused_drive(capsys, tmp_path, tape()._replace(odometry=[]))
+    error = error_of_drive(capsys, tmp_path, tape()._replace(odometry=[]))
     assert 'no nav_msgs/Odometry' in error
     assert f'/sonar: {COUNT} sensor_msgs/msg/Range' in error
 
@@ -153,7 +153,7 @@ def test_several_odometry_topics_require_a_choice(tmp_path: Path, capsys: pytest
     bag = write_tape(
         tmp_path / 'bag', tape()._replace(odometry=odometry), odometry_topic=lambda m: f'/{m.frame_id}/pose'
     )
-    error = refusal(capsys, tmp_path, bag, '-o', tmp_path / 'maps')
+    error = error_of(capsys, tmp_path, bag, '-o', tmp_path / 'maps')
     assert '--odom-topic' in error
     for frame in ('map', 'odom'):
         assert f'/{frame}/pose: {len(odometry) // 2} messages, {frame} → base_link' in error
@@ -171,7 +171,7 @@ def test_several_odometry_topics_require_a_choice(tmp_path: Path, capsys: pytest
 def test_unknown_topic_is_rejected_with_those_that_exist(
     tmp_path: Path, plain: Path, capsys: pytest.CaptureFixture[str], options: list[str], expected: str
 ) -> None:
-    error = refusal(capsys, tmp_path, plain / 'bag', '-o', tmp_path / 'maps', *options)
+    error = error_of(capsys, tmp_path, plain / 'bag', '-o', tmp_path / 'maps', *options)
     assert re.search(expected, error), error
 
 
@@ -179,7 +179,7 @@ def test_unknown_topic_is_rejected_with_those_that_exist(
 
 
 def test_drive_without_any_sensor_pose_is_rejected(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    error = refused_drive(capsys, tmp_path, tape()._replace(extrinsics=()))
+    error = error_of_drive(capsys, tmp_path, tape()._replace(extrinsics=()))
     assert all(frame in error for frame in FRAMES)
     assert (
         'no /tf_static' in error and f'--sensor {FRAMES[0]}=x,y,yaw' in error and f'sensors.{FRAMES[0]}.pose' in error
@@ -192,7 +192,7 @@ def test_drive_without_sensor_poses_that_ends_with_ranges_is_rejected(
 ) -> None:
     newest = max(message.stamp for message in tape().ranges)
     odometry = [message for message in tape().odometry if message.stamp < newest - 10**8]
-    error = refused_drive(capsys, tmp_path, tape()._replace(extrinsics=(), odometry=odometry))
+    error = error_of_drive(capsys, tmp_path, tape()._replace(extrinsics=(), odometry=odometry))
     assert error.startswith('no pose on the robot (frame ') and f'--sensor {FRAMES[0]}=x,y,yaw' in error
 
 
@@ -201,7 +201,7 @@ def test_drive_without_sensor_poses_and_with_bad_ranges_is_rejected(
 ) -> None:
     drive = tape()._replace(extrinsics=())
     first = drive.ranges[0]._replace(range=math.nan)
-    error = refused_drive(capsys, tmp_path, drive._replace(ranges=[first, *drive.ranges[1:]]))
+    error = error_of_drive(capsys, tmp_path, drive._replace(ranges=[first, *drive.ranges[1:]]))
     assert 'nan_range' in error and all(frame in error for frame in FRAMES)
     assert 'no /tf_static' in error and f'--sensor {FRAMES[0]}=x,y,yaw' in error
 
@@ -216,30 +216,30 @@ def test_frame_with_control_characters_is_rejected_and_escaped(tmp_path: Path) -
 
 
 def test_transforms_not_connected_to_the_base_are_rejected(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    error = refused_drive(capsys, tmp_path, tape().with_odometry(child_frame_id='base_footprint'))
+    error = error_of_drive(capsys, tmp_path, tape().with_odometry(child_frame_id='base_footprint'))
     assert 'base_footprint' in error and 'base_link' in error and '--sensor' in error
     assert 'do not join it to base_link: publish that transform, or have odometry name base_link' in error
 
 
 def test_frames_with_another_prefix_are_named_in_the_error(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     drive = tape().with_odometry(child_frame_id='robot1/base_link')
-    error = refused_drive(capsys, tmp_path, drive)
+    error = error_of_drive(capsys, tmp_path, drive)
     assert 'The transforms have base_link, not robot1/base_link: set the same prefix' in error
     ranges = [m._replace(frame_id=f'robot1/{m.frame_id}') for m in drive.ranges]
     (tmp_path / 'all').mkdir()
-    error = refused_drive(capsys, tmp_path / 'all', drive._replace(ranges=ranges))
+    error = error_of_drive(capsys, tmp_path / 'all', drive._replace(ranges=ranges))
     assert (
         f'base_link, not robot1/base_link; {FRAMES[0]}, not robot1/{FRAMES[0]}' in error and 'and 6 more: set' in error
     )
 
 
 def test_odometry_without_child_frame_is_rejected(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    error = refused_drive(capsys, tmp_path, tape().with_odometry(child_frame_id=''))
+    error = error_of_drive(capsys, tmp_path, tape().with_odometry(child_frame_id=''))
     assert 'odometry has no child_frame_id' in error and '--sensor' in error
 
 
 def test_stamps_of_zero_are_rejected_with_a_remedy(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    error = refused_drive(capsys, tmp_path, tape().with_ranges(stamp=0))
+    error = error_of_drive(capsys, tmp_path, tape().with_ranges(stamp=0))
     assert f'{COUNT} zero_stamp (header.stamp is 0: set it in the driver)' in error
 
 
@@ -274,7 +274,7 @@ class Unnormalised(BagWriter):
 
 def test_quaternions_of_wrong_length_are_rejected(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     bag = write_tape(tmp_path / 'bag', tape(), writer=Unnormalised)
-    error = refusal(capsys, tmp_path, bag, '-o', tmp_path / 'maps')
+    error = error_of(capsys, tmp_path, bag, '-o', tmp_path / 'maps')
     assert f'all {COUNT} readings were rejected' in error
     assert f'{len(tape().odometry)} odometry messages' in error and 'quaternion is not normalised' in error
     assert 'cos(yaw/2)' in error and 'clocks' not in error
@@ -318,7 +318,7 @@ def test_ranges_and_odometry_that_do_not_overlap_are_rejected(
     for name, shift in (('early', -hour), ('late', hour)):
         odometry = [m._replace(stamp=m.stamp + shift) for m in tape().odometry]
         bag = write_tape(tmp_path / name, tape()._replace(odometry=odometry))
-        error = refusal(capsys, tmp_path, bag, '-o', tmp_path / 'maps')
+        error = error_of(capsys, tmp_path, bag, '-o', tmp_path / 'maps')
         assert 'do not overlap' in error and 'clock' in error
         assert f'{tape().ranges[0].stamp / 1e9:.3f}' in error and f'{odometry[0].stamp / 1e9:.3f}' in error
 
@@ -379,7 +379,7 @@ def test_impossible_field_of_view_is_rejected_with_a_remedy(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], angle: float
 ) -> None:
     drive = tape().with_ranges(field_of_view=angle)
-    error = refused_drive(capsys, tmp_path, drive)
+    error = error_of_drive(capsys, tmp_path, drive)
     assert f'{COUNT} bad_field_of_view' in error and 'set the parameter field_of_view to the full angle' in error
     right = tape().ranges[0].field_of_view
     report = mapped(tmp_path / 'bag', tmp_path / 'maps', '--set', f'field_of_view={right!r}')
@@ -403,7 +403,7 @@ def test_impossible_field_of_view_is_rejected_with_a_remedy(
 def test_impossible_ranges_are_rejected_with_reason(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], changes: dict[str, Any], reason: str, words: str
 ) -> None:
-    error = refused_drive(capsys, tmp_path, tape().with_ranges(**changes))
+    error = error_of_drive(capsys, tmp_path, tape().with_ranges(**changes))
     assert f'all {COUNT} readings were rejected' in error and reason in error and words in error
     some = every(3, **changes)
     bad = sum(all(getattr(m, k) is v or getattr(m, k) == v for k, v in changes.items()) for m in some.ranges)
@@ -425,14 +425,14 @@ def test_drive_without_echoes_gives_a_map_without_walls(tmp_path: Path) -> None:
 def test_drive_without_echoes_that_are_discarded_is_rejected(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    error = refused_drive(capsys, tmp_path, tape().with_ranges(range=math.inf), '--set', 'over_range=discard')
+    error = error_of_drive(capsys, tmp_path, tape().with_ranges(range=math.inf), '--set', 'over_range=discard')
     assert 'over_range' in error and 'discard' in error
 
 
 def test_most_frequent_reason_comes_first(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     drive = tape().with_ranges(range=math.nan)
     drive = drive._replace(ranges=[m._replace(frame_id='') if k % 4 else m for k, m in enumerate(drive.ranges)])
-    error = refused_drive(capsys, tmp_path, drive)
+    error = error_of_drive(capsys, tmp_path, drive)
     assert error.index('empty_frame_id') < error.index('nan_range'), 'the most frequent comes first'
 
 
@@ -467,7 +467,7 @@ def test_pose_at_ten_million_metres_is_rejected(tmp_path: Path) -> None:
 def test_impossible_option_is_rejected_with_reason(
     tmp_path: Path, plain: Path, capsys: pytest.CaptureFixture[str], options: list[str], expected: list[str]
 ) -> None:
-    error = refusal(capsys, tmp_path, plain / 'bag', '-o', tmp_path / 'maps', *options)
+    error = error_of(capsys, tmp_path, plain / 'bag', '-o', tmp_path / 'maps', *options)
     assert all(word in error for word in expected), error
     assert '\n' not in error
 
@@ -485,11 +485,11 @@ def test_impossible_option_is_rejected_with_reason(
 def test_wrong_command_line_is_rejected_with_exit_code_2(
     tmp_path: Path, plain: Path, capsys: pytest.CaptureFixture[str], options: list[str], expected: str
 ) -> None:
-    assert expected in refusal(capsys, tmp_path, plain / 'bag', *options, code=2)
+    assert expected in error_of(capsys, tmp_path, plain / 'bag', *options, code=2)
 
 
 def test_missing_bag_is_rejected_with_exit_code_2(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert 'bag' in refusal(capsys, tmp_path, code=2)
+    assert 'bag' in error_of(capsys, tmp_path, code=2)
 
 
 @pytest.mark.parametrize(
@@ -512,7 +512,7 @@ def test_bad_parameter_file_is_rejected_with_reason(
 ) -> None:
     file = tmp_path / 'p.yaml'
     file.write_text(text)
-    error = refusal(capsys, tmp_path, plain / 'bag', '-o', tmp_path / 'maps', '--params', file)
+    error = error_of(capsys, tmp_path, plain / 'bag', '-o', tmp_path / 'maps', '--params', file)
     assert str(file) in error
     assert all(word in error for word in expected), error
 
@@ -526,7 +526,7 @@ def test_path_that_is_no_parameter_file_is_rejected(
         (tmp_path, 'cannot be read: Is a directory'),
         (picture, 'not valid YAML'),
     ):
-        error = refusal(capsys, tmp_path, plain / 'bag', '-o', tmp_path / 'maps', '--params', path)
+        error = error_of(capsys, tmp_path, plain / 'bag', '-o', tmp_path / 'maps', '--params', path)
         assert str(path) in error and expected in error
 
 
@@ -535,6 +535,6 @@ def test_bad_setting_is_rejected_with_a_good_parameter_file(
 ) -> None:
     (tmp_path / 'p.yaml').write_text('')
     options = ('--params', tmp_path / 'p.yaml', '--set', 'p_rand=-1')
-    assert 'p_rand' in refusal(capsys, tmp_path, plain / 'bag', '-o', tmp_path / 'maps', *options)
+    assert 'p_rand' in error_of(capsys, tmp_path, plain / 'bag', '-o', tmp_path / 'maps', *options)
     assert code_of(process_bag.main, plain / 'bag', '-q', '-o', tmp_path / 'maps', *options[:2]) == 0
     assert report_in(tmp_path / 'maps')['changed_parameters'] == {}

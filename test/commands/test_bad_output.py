@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from drive_samples import FILES, code_of, everything_in, mapped, refusal, tape, write_tape
+from drive_samples import FILES, code_of, error_of, everything_in, mapped, tape, write_tape
 from rosbags import rosbag2
 
 from forward_grid_mapper.bags.writer import BagWriter
@@ -52,7 +52,7 @@ def test_existing_output_is_rejected_and_unchanged(
         (tmp_path / 'mine.txt' / 'deep' / 'maps', 'a part of this path is a file'),
         (bag, 'exists and is not empty'),
     ):
-        error = refusal(capsys, tmp_path, bag, '-o', path)
+        error = error_of(capsys, tmp_path, bag, '-o', path)
         assert str(path) in error and expected in error and '-o' in error
     assert (tmp_path / 'mine.txt').read_text() == 'mine'
 
@@ -65,7 +65,7 @@ def test_output_without_permission_is_rejected(
         raise PermissionError(errno.EACCES, 'Permission denied')
 
     monkeypatch.setattr(Path, 'mkdir', refuse)
-    error = refusal(capsys, tmp_path, bag, '-o', tmp_path / 'new' / 'maps')
+    error = error_of(capsys, tmp_path, bag, '-o', tmp_path / 'new' / 'maps')
     assert str(tmp_path / 'new' / 'maps') in error and 'no permission' in error and '-o' in error
 
 
@@ -74,7 +74,7 @@ def test_output_in_a_read_only_folder_is_rejected(
     tmp_path: Path, bag: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / 'locked').mkdir(mode=0o500)
-    assert 'no permission' in refusal(capsys, tmp_path, bag, '-o', tmp_path / 'locked' / 'maps')
+    assert 'no permission' in error_of(capsys, tmp_path, bag, '-o', tmp_path / 'locked' / 'maps')
 
 
 def full(*arguments: object, **options: object) -> None:
@@ -101,7 +101,7 @@ def test_full_disk_leaves_no_incomplete_results(
         output.mkdir()
     with monkeypatch.context() as patch:
         patch.setattr(owner, name, full)
-        error = refusal(capsys, tmp_path, bag, '-o', output, '--bag')
+        error = error_of(capsys, tmp_path, bag, '-o', output, '--bag')
     assert str(tmp_path) in error
     assert 'disk is full' in error or 'No space left' in error
     mapped(bag, output, '--bag')
@@ -125,7 +125,7 @@ def test_file_size_limit_leaves_no_incomplete_results(
     tmp_path: Path, bag: Path, capsys: pytest.CaptureFixture[str], limit: int, name: str
 ) -> None:
     with no_file_larger_than(limit):
-        error = refusal(capsys, tmp_path, bag, '-q', '-o', tmp_path / 'maps')
+        error = error_of(capsys, tmp_path, bag, '-q', '-o', tmp_path / 'maps')
     assert f'{name} cannot be written: File too large' in error
     assert everything_in(tmp_path) == []
 

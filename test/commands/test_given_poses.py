@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from drive_samples import Tape, code_of, refusal, report_in, tape, write_tape
+from drive_samples import Tape, code_of, error_of, report_in, tape, write_tape
 
 from forward_grid_mapper.commands import learn, process_bag
 from forward_grid_mapper.core.common.errors import InputError
@@ -118,7 +118,7 @@ def test_bad_pose_file_is_rejected_with_reason(
     file = tmp_path / 'poses.txt'
     file.write_text(text)
     bag = write_tape(tmp_path / 'bag', tape())
-    error = refusal(capsys, tmp_path, bag, '--poses', file, '-o', tmp_path / 'maps')
+    error = error_of(capsys, tmp_path, bag, '--poses', file, '-o', tmp_path / 'maps')
     assert expected in error and 'poses.txt' in error
 
 
@@ -136,10 +136,10 @@ def test_pose_file_without_permission_is_rejected(tmp_path: Path, monkeypatch: p
 def test_path_that_is_no_pose_file_is_rejected(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     bag = write_tape(tmp_path / 'bag', tape())
     options = (bag, '-o', tmp_path / 'maps', '--poses')
-    assert 'absent does not exist' in refusal(capsys, tmp_path, *options, tmp_path / 'absent')
-    assert 'is not a file with poses' in refusal(capsys, tmp_path, *options, tmp_path)
+    assert 'absent does not exist' in error_of(capsys, tmp_path, *options, tmp_path / 'absent')
+    assert 'is not a file with poses' in error_of(capsys, tmp_path, *options, tmp_path)
     file = written(tmp_path / 'poses', 'csv')
-    assert 'leave out --odom-topic' in refusal(capsys, tmp_path, *options, file, '--odom-topic', '/odom')
+    assert 'leave out --odom-topic' in error_of(capsys, tmp_path, *options, file, '--odom-topic', '/odom')
 
 
 def test_command_printed_by_learn_names_the_poses(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

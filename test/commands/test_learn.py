@@ -112,7 +112,7 @@ def test_values_rejected_by_held_out_readings_are_not_written(
     assert 'Nothing was learned from' in file.read_text().splitlines()[0]
 
 
-def test_output_says_that_values_were_not_tested(bag: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_output_mentions_that_values_were_not_tested(bag: Path, capsys: pytest.CaptureFixture[str]) -> None:
     text = 'no readings were held out to test the learned values'
     assert text in ' '.join(output_of(capsys, bag, '--rounds', 1, '--keep-going').split())
     assert text not in ' '.join(output_of(capsys, bag, '--rounds', 1).split())

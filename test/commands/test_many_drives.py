@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from drive_samples import FILES, Tape, arrays_in, assert_same_maps, code_of, mapped, refusal, report_in, write_tape
+from drive_samples import FILES, Tape, arrays_in, assert_same_maps, code_of, error_of, mapped, report_in, write_tape
 
 from forward_grid_mapper.commands import learn, process_bag
 from forward_grid_mapper.core.common.errors import InputError
@@ -268,7 +268,7 @@ def test_drives_in_different_map_frames_are_rejected(
     days: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     other = write_tape(tmp_path / 'other', framed(2, 'warehouse'))
-    error = refusal(capsys, tmp_path, days / 'day_0', days / 'day_1', other, '-o', tmp_path / 'maps')
+    error = error_of(capsys, tmp_path, days / 'day_0', days / 'day_1', other, '-o', tmp_path / 'maps')
     assert 'not in the same map frame' in error and f'warehouse: {other}' in error and f'leave out {other}' in error
 
 
@@ -347,7 +347,7 @@ def test_all_drives_that_cannot_be_mapped_are_named(
 ) -> None:
     absent = tmp_path / 'absent'
     silent = write_tape(tmp_path / 'silent', day(2)._replace(ranges=[]))
-    error = refusal(capsys, tmp_path, days / 'day_0', absent, silent, '-o', tmp_path / 'maps')
+    error = error_of(capsys, tmp_path, days / 'day_0', absent, silent, '-o', tmp_path / 'maps')
     assert error.startswith('2 of 3 drives cannot be mapped; leave them out')
     assert f'{absent} does not exist' in error and f'{silent}: The bag has no sensor_msgs/Range' in error
 
@@ -363,7 +363,7 @@ def test_error_lines_of_one_drive_are_indented() -> None:
 
 
 def test_pattern_without_match_is_rejected(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    error = refusal(capsys, tmp_path, f'{tmp_path}/monday_*', '-o', tmp_path / 'maps')
+    error = error_of(capsys, tmp_path, f'{tmp_path}/monday_*', '-o', tmp_path / 'maps')
     assert f'no file or folder matches {tmp_path}/monday_*' in error
 
 
@@ -374,7 +374,7 @@ def test_files_of_a_split_bag_without_metadata_are_rejected(
     folder.mkdir()
     for number in range(2):
         shutil.copy(next((days / 'day_0').glob('*.mcap')), folder / f'split_{number}.mcap')
-    error = refusal(capsys, tmp_path, folder, '-o', tmp_path / 'maps')
+    error = error_of(capsys, tmp_path, folder, '-o', tmp_path / 'maps')
     assert 'ros2 bag reindex' in error
 
 
@@ -416,7 +416,7 @@ def test_part_is_taken_of_each_drive(days: Path, tmp_path: Path) -> None:
 def test_part_after_the_end_of_the_drive_is_rejected(
     days: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    error = refusal(capsys, tmp_path, days / 'day_0', '-o', tmp_path / 'maps', '--start', 900)
+    error = error_of(capsys, tmp_path, days / 'day_0', '-o', tmp_path / 'maps', '--start', 900)
     assert 'has no reading in the part --start 900; its messages span' in error
 
 

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
-from drive_samples import FILES, assert_same_maps, code_of, mapped, refusal, report_in, tape, write_tape
+from drive_samples import FILES, assert_same_maps, code_of, error_of, mapped, report_in, tape, write_tape
 
 from forward_grid_mapper.commands import process_bag
 from forward_grid_mapper.commands.simulate import write_recording
@@ -113,7 +113,7 @@ def test_given_calibration_is_applied(tmp_path: Path, capsys: pytest.CaptureFixt
     assert np.hypot(a.x - b.x, a.y - b.y).max() < 0.06
     assert 'with the calibration of' in ' '.join((tmp_path / 'maps' / 'report.txt').read_text().split())
     capsys.readouterr()
-    error = refusal(capsys, tmp_path, tmp_path / 'bag', '-o', tmp_path / 'no', '--odometry-calibration', 'absent')
+    error = error_of(capsys, tmp_path, tmp_path / 'bag', '-o', tmp_path / 'no', '--odometry-calibration', 'absent')
     assert 'absent cannot be read' in error
 
 

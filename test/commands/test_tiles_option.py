@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from drive_samples import FILES, arrays_in, mapped, refusal, tape, write_tape
+from drive_samples import FILES, arrays_in, error_of, mapped, tape, write_tape
 
 from forward_grid_mapper.files import drawing
 
@@ -33,6 +33,6 @@ def test_maps_in_tiles_have_the_same_output_files(tmp_path: Path) -> None:
 @pytest.mark.parametrize('size', ['0', '-5', 'nan', 'inf'])
 def test_impossible_size_of_tiles_is_rejected(tmp_path: Path, size: str, capsys: pytest.CaptureFixture[str]) -> None:
     bag = write_tape(tmp_path / 'bag', tape())
-    assert f'--tiles {size}: give the edge' in refusal(
+    assert f'--tiles {size}: give the edge' in error_of(
         capsys, tmp_path, bag, '-o', tmp_path / 'maps', f'--tiles={size}'
     )

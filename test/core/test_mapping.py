@@ -121,7 +121,7 @@ def test_maps_share_a_grid_with_default_parameters(values: dict[str, float]) -> 
 
 
 def test_cells_below_the_robot_are_free_at_standstill() -> None:
-    # A ring of 16 sonars around a hole that none of them sees; three sweeps in a square room.
+    # a ring of 16 sonars around a hole that they do not see; three sweeps in a square room
     yaw = np.tile(np.arange(16) * math.pi / 8, 3)
     wall = 1.5 / np.maximum(np.abs(np.cos(yaw)), np.abs(np.sin(yaw)))
     readings = Readings.from_columns(

@@ -35,7 +35,7 @@ from forward_grid_mapper.simulation.sonar import NOISY
 from samples import PLAIN, FlipsAlone, plain_model, plain_search, random_readings
 
 LINE = Grid(0.1, 0, 0, 12, 1)
-"""One row of cells; cell c lies 0.05 + 0.1 c metres before a sensor at the origin."""
+"""One row of cells; cell c is 0.05 + 0.1 c metres in front of a sensor at the origin."""
 
 AREA = Grid(0.1, 0, 0, 12, 9)
 
@@ -257,9 +257,7 @@ def test_minimising_eq_40_alone_empties_the_map(seed: int) -> None:
 
 
 def stale_gain(readings: Readings, occupied: np.ndarray, cell: int) -> float:
-    """The gain of a flip with the expectations from before, tied to ranks: e_{t,k} weighs the obstacle of rank k
-    afterwards.
-    """
+    """The gain of a flip with the expectations from before, tied to ranks: e_{t,k} weighs the obstacle of rank k."""
     gain = 0.0
     with pytest.MonkeyPatch.context() as patch:
         # no density is zero

@@ -140,7 +140,7 @@ def test_put_does_not_wait_for_commits(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize('what', ['file', 'log', 'both', 'folder', 'moved', 'replaced', 'file cut', 'log cut'])
-def test_deleted_journal_is_detected_and_begun_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, what: str) -> None:
+def test_deleted_journal_is_detected_and_replaced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, what: str) -> None:
     monkeypatch.setattr(journal_module, 'CHECK_PERIOD', 0.01)
     folder, warnings = tmp_path / 'j', []
     journal, _ = opened(folder, warnings)
@@ -418,7 +418,7 @@ def test_journal_folder_that_is_a_file_is_rejected(tmp_path: Path) -> None:
 # at the start of a node
 
 
-def test_half_made_journal_is_made_anew(tmp_path: Path) -> None:
+def test_incomplete_new_journal_is_replaced(tmp_path: Path) -> None:
     for name in ('.new.journal', '.new.journal-journal', '.new.journal-wal'):
         (tmp_path / name).write_bytes(b'SQLite format 3\0' + bytes(1000))
     journal, _ = opened(tmp_path)

@@ -427,7 +427,7 @@ def test_truncated_log_gives_complete_blocks(tmp_path: Path) -> None:
 
 
 def test_journal_is_read_while_it_is_written(tmp_path: Path) -> None:
-    """The log is moved into the file and begun anew at times."""
+    """The log is moved into the file at times, and a new one begins."""
     journal, _ = opened(tmp_path)
     stop = threading.Event()
     count = [0]

@@ -40,7 +40,7 @@ def test_calibration_in_words() -> None:
     assert '1.0° to the right of' in calibration_words({'heading': -math.radians(1.0)})
 
 
-def test_report_says_whether_the_trajectory_was_refined() -> None:
+def test_report_states_whether_the_trajectory_was_refined() -> None:
     refined = {
         'refined': True,
         'reason': 'readings are predicted better',

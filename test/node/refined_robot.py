@@ -50,9 +50,7 @@ def live_of(robot: Inside) -> tuple[Any, np.ndarray]:
 
 
 def expected_live(robot: Inside, bent: Odometry | None) -> tuple[Any, np.ndarray]:
-    """The expected live map of all readings, at the poses of the trajectory for odometry until
-    `bent`, or of odometry.
-    """
+    """The expected live map of all readings: along the refined trajectory for odometry until `bent`, or of odometry."""
     readings = robot.node.associator.readings
     if bent is not None:
         then = bend(bent)

@@ -165,9 +165,7 @@ class Robot:
         return int(self.diagnostics.get('readings', {}).get('readings received', -1))
 
     def play(self, messages: Sequence[RangeMessage | OdometryMessage], rate: float = 1500.0) -> None:
-        """Send messages at a steady rate, not more than the middleware keeps, and wait until the
-        node has received all.
-        """
+        """Send messages at a steady rate, at most as many as the middleware keeps, until the node has received all."""
         self.sent = getattr(self, 'sent', 0)
         begin = time.monotonic()
         for k, message in enumerate(messages):

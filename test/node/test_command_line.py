@@ -18,7 +18,7 @@ from forward_grid_mapper.core.common.errors import MapperError
 from forward_grid_mapper.node import complaints
 
 
-def refused(domain: int, *arguments: str, **changes: str) -> tuple[int, str]:
+def rejected(domain: int, *arguments: str, **changes: str) -> tuple[int, str]:
     command = [sys.executable, '-m', 'forward_grid_mapper', 'mapper', *arguments]
     done = subprocess.run(
         command, capture_output=True, text=True, timeout=120, check=False, env={**environment(domain), **changes}
@@ -42,14 +42,14 @@ def refused(domain: int, *arguments: str, **changes: str) -> tuple[int, str]:
     ],
 )
 def test_bad_arguments_are_rejected_with_reason(domain: int, arguments: list[str], code: int, expected: str) -> None:
-    found, message = refused(domain, *arguments)
+    found, message = rejected(domain, *arguments)
     assert expected in message
     assert found == code
 
 
 @pytest.mark.parametrize('number', ['5000', 'home', '1.5'])
 def test_invalid_domain_is_rejected(domain: int, number: str) -> None:
-    assert refused(domain, ROS_DOMAIN_ID=number) == (
+    assert rejected(domain, ROS_DOMAIN_ID=number) == (
         1,
         f'ROS_DOMAIN_ID is {number}, not a whole number from 0 to 232',
     )

@@ -147,7 +147,7 @@ def journal_status(robot: Robot) -> dict[str, Any]:
     return dict(robot.diagnostics.get('journal', {}))
 
 
-def test_deleted_or_hostile_journal_is_begun_anew(start: Any, domain: int, robot: Robot, tmp_path: Path) -> None:
+def test_deleted_or_hostile_journal_is_replaced(start: Any, domain: int, robot: Robot, tmp_path: Path) -> None:
     folder = tmp_path / 'journal'
     options = (*OPTIONS, '-p', f'journal:={folder}')
     node = start(*options)

@@ -1,6 +1,4 @@
-"""Updates of the live map, with a stand-in for map_msgs: each subscriber has the latest map, with
-or without updates.
-"""
+"""Updates of the live map, with a stand-in for map_msgs: all subscribers have the latest map."""
 
 from __future__ import annotations
 
@@ -44,9 +42,7 @@ def cells(message: Any) -> Any:
 
 
 class Listener:
-    """Combines whole maps and updates like RViz and the static layer of Nav2; `follows` says whether it subscribes to
-    updates.
-    """
+    """Combines maps and updates like RViz and the static layer of Nav2; subscribes to updates if `follows`."""
 
     numbers = itertools.count()
 

@@ -110,9 +110,7 @@ def compare(robot: Robot, bag: Path, out: Path, *options: str) -> None:
 
 
 def replay(start: Any, robot: Robot, path: Path, tmp_path: Path, odom_topic: str | None = None) -> None:
-    """Send the messages of a bag to a node with the sensor poses of the bag, and compare its maps with the offline
-    ones.
-    """
+    """Replay a bag to a node with the sensor poses of the bag, and compare its maps with the offline ones."""
     with Bag(path) as bag:
         transforms = bag.static_transforms()
         messages = list(bag.messages(bag.choose_topics(None, odom_topic)))

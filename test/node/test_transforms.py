@@ -267,7 +267,7 @@ def test_missing_map_frame_is_logged_once_and_its_end_once(
     assert lines.count('the transform to map_frame is available') == 1
 
 
-def heard_from(robot: Inside, pose: Transform) -> None:
+def receive_from(robot: Inside, pose: Transform) -> None:
     """Receive readings of the tower with this pose in TF, and report them several times."""
     buffer: Any = robot.node._extrinsics._transforms._buffer
     buffer.set_transform_static(pose, '')
@@ -281,7 +281,7 @@ def test_sensor_pose_in_millimetres_is_logged_once(inside: Callable[..., Inside]
     lines = log(robot)
     pose = Transform()
     pose.translation.x, pose.rotation.w = 150.0, 1.0
-    heard_from(robot, pose)
+    receive_from(robot, pose)
     assert lines.count('transforms put tower up to 150 m away from the middle of the robot') == 1
 
 
@@ -290,5 +290,5 @@ def test_steep_sensor_is_logged_once(inside: Callable[..., Inside], log: Callabl
     lines = log(robot)
     pose = Transform()
     pose.rotation.y, pose.rotation.w = math.sin(0.75), math.cos(0.75)
-    heard_from(robot, pose)
+    receive_from(robot, pose)
     assert lines.count('readings of tower are rejected: the sensor points up or down') == 1

@@ -1,6 +1,4 @@
-"""Drives with jumps of odometry: errors of the wheels come from a part without jumps, and misplaced parts give a
-warning.
-"""
+"""Drives with jumps of odometry: errors of the wheels from a part without jumps, and warnings about misplaced parts."""
 
 from __future__ import annotations
 

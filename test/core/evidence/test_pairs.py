@@ -52,7 +52,7 @@ def test_runs_and_band_are_the_free_zone_and_the_rest_of_the_cone(some: object) 
     assert np.array_equal(state.maps.seen, seen)
 
 
-def test_each_run_lies_in_one_row() -> None:
+def test_each_run_is_in_one_row() -> None:
     evidence = Evidence(GRID, plain_model(sigma=0.01))
     evidence.extend(random_readings(np.random.default_rng(5), GRID, 60))
     state = evidence.state
@@ -94,7 +94,7 @@ def test_recomputed_pairs_equal_the_stored_ones() -> None:
         max_size=60,
     )
 )
-def test_the_sort_is_stable(keys: list[float]) -> None:
+def test_sort_is_stable(keys: list[float]) -> None:
     workspace = workspace_for(60)
     room = np.full(len(workspace.tally) + 10, -1, np.int32)
     workspace, m = workspace._replace(tally=room[: len(workspace.tally)]), len(keys)

@@ -96,7 +96,7 @@ def test_smooth_walls_and_a_follower_give_no_warning() -> None:
     [(970, 5, 'ok'), (970, 25, 'never hears anything'), (1000, 0, 'never hears anything')],
 )
 def test_sensor_with_few_echoes_is_ok_if_the_map_explains_them(silent: int, random: int, verdict: str) -> None:
-    """A robot may stand for hours where one of its sensors gets no echo of the wall in front of it."""
+    """A robot may pause for hours where one of its sensors gets no echo of the wall in front of it."""
     ranges = np.zeros((3, 400), np.int64)
     ranges[:, 10], ranges[:, 30] = 1, [1000 - silent, 900, 900]
     counts = {

@@ -78,8 +78,8 @@ def test_number_of_threads_does_not_change_mirror_images(monkeypatch: pytest.Mon
 
 
 def along_a_mirror() -> Readings:
-    """A robot between a smooth wall at y = 2 and a rough one at y = 0. Beams at large incidence angles receive echoes
-    of the rough wall, mirrored by the smooth one.
+    """A robot between a smooth wall at y = 2, which mirrors beams at large incidence angles, and a
+    rough one at y = 0.
     """
     x, yaw = (values.ravel() for values in np.meshgrid(np.arange(0.5, 6.0, 0.05), np.radians(np.arange(-90, 91, 7.5))))
     up, away = yaw > 0, np.abs(np.sin(yaw))

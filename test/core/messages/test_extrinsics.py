@@ -47,7 +47,7 @@ def test_projected_cone_is_as_wide_as_the_cone_seen_from_above(half_angle: float
 @pytest.mark.parametrize(('half_angle', 'degrees'), [(0.6, 60.0), (math.radians(31), -59.5), (1.5, 10.0)])
 def test_cone_that_contains_the_vertical_is_rejected_as_steep(half_angle: float, degrees: float) -> None:
     elevation = math.radians(degrees)
-    # the zenith, or the nadir, lies within the cone
+    # the zenith or the nadir is within the cone
     assert math.acos(abs(axis_of(0.0, elevation)[2])) <= half_angle
     assert shadow_of(half_angle, elevation) is None
     m = measured(half_angle=half_angle)

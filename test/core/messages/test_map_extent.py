@@ -108,9 +108,7 @@ def largest(count: int, **values: float) -> Parameters:
 
 @pytest.mark.parametrize('across', [True, False])
 def test_map_of_exactly_max_cells_is_accepted_and_one_more_is_not(across: bool) -> None:
-    """Two readings 90 m apart: their box has one more cell in a row than its length needs, since it may begin within a
-    cell.
-    """
+    """Two readings 90 m apart: their box may have one more cell in a row, since it may begin within a cell."""
     reach = reach_with_margin(measured(), PARAMETERS)
     cell = PARAMETERS.grid.resolution
     pose = Pose2(90.0, 0, 0) if across else Pose2(0, 90.0, 0)

@@ -134,7 +134,7 @@ def test_columns_grow_in_small_copies(monkeypatch: pytest.MonkeyPatch, restored:
 
 
 def test_thinning_in_the_background_loses_no_readings() -> None:
-    """The kept readings are the same whether appending waits for thinning or not, and whatever comes meanwhile."""
+    """The kept readings are the same whether appending waits for thinning or not."""
     bound = 200
     aside: list[tuple[Callable[[], Any], Callable[[Any], None]]] = []
     ours, waiting = ReadingBuffer(bound), ReadingBuffer(bound)

@@ -147,7 +147,7 @@ def test_readings_without_pose_are_rejected_with_reason() -> None:
     assert set(p.rejected) <= set(REASONS)
 
 
-def test_a_reading_times_out_by_stamps_and_by_the_clock() -> None:
+def test_reading_times_out_by_stamps_and_by_the_clock() -> None:
     clock = Clock()
     fast, still = associator(clock=clock), associator(clock=clock)
     for p in (fast, still):
@@ -385,7 +385,7 @@ def test_readings_of_a_sensor_with_clock_ahead_do_not_accumulate() -> None:
     assert accounted(p)
 
 
-def test_readings_wait_while_stamps_of_odometry_stand_still() -> None:
+def test_readings_wait_while_odometry_has_constant_stamps() -> None:
     clock = Clock()
     p = associator(clock=clock)
     p.add_odometry(odometry(1.0))
@@ -467,7 +467,7 @@ def test_clock_set_ahead_and_back_is_one_jump() -> None:
     assert p.odometry[0].tolist() == [10_400_000_000, 10_500_000_000]
 
 
-def test_of_two_clocks_on_one_topic_one_is_used() -> None:
+def test_one_of_two_clocks_on_one_topic_is_used() -> None:
     p = associator()
     for k in range(100):
         p.add_odometry(odometry(20.0 + 0.1 * k))
@@ -511,7 +511,7 @@ def test_reading_from_the_future_does_not_delay_others(reset: bool) -> None:
     assert len(p.buffer) == p.received - p.waiting - sum(p.rejected.values()) > 90
 
 
-def test_readings_time_out_if_the_stamp_of_odometry_stands_still() -> None:
+def test_readings_time_out_if_odometry_has_constant_stamps() -> None:
     clock = Clock()
     p = associator(clock=clock)
     for k in range(200):
@@ -534,7 +534,7 @@ def test_counts_by_frame_are_bounded() -> None:
     assert sum(sum(counts.values()) for counts in p.rejected_by_frame.values()) == sum(p.rejected.values())
 
 
-def test_reset_with_another_odometry_frame_starts_anew() -> None:
+def test_reset_with_another_odometry_frame_starts_again() -> None:
     p = associator()
     p.add_odometry(odometry(0.0)._replace(frame_id='garbage'))
     for second in (1.0, 1.5):

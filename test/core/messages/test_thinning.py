@@ -1,4 +1,4 @@
-"""Thinning of readings: of readings that repeat each other the newest are kept, in whatever order they came."""
+"""Thinning of readings: of repeated readings the newest are kept, in any order of arrival."""
 
 from __future__ import annotations
 

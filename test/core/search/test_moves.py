@@ -41,7 +41,7 @@ def random_case(
 ) -> tuple[Evidence, Readings]:
     rng = np.random.default_rng(seed)
     readings = (naive.awkward_readings, random_readings)[seed % 2](rng, GRID, count)
-    # not on the lattice, so that rounding does not decide on which side of the cut a cell lies
+    # not on the lattice, so that rounding does not decide on which side of the cut a cell is
     readings.x[:] += 0.001234
     readings.y[:] -= 0.000777
     readings.z[:] = np.minimum(readings.z + 0.000345, readings.z_max)

@@ -78,7 +78,7 @@ AREA = Grid(0.1, -5, 3, 40, 30)
 
 @settings(max_examples=40, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.sampled_from([0.5, 0.2, 0.05]), st.booleans(), st.sampled_from([GRID, AREA]))
-def test_the_objective_never_falls_and_ends_at_an_optimum(seed: int, prior: float, shifts: bool, grid: Grid) -> None:
+def test_objective_never_falls_and_ends_at_an_optimum(seed: int, prior: float, shifts: bool, grid: Grid) -> None:
     rng = np.random.default_rng(seed)
     some = (random_readings, naive.awkward_readings)[seed % 2]
     readings = some(rng, grid, int(rng.integers(1, 150)))
@@ -323,7 +323,7 @@ def shaped(readings: Readings, grid: Grid, parameters: SearchParameters, travers
 
 @settings(max_examples=25, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.sampled_from([SHAPED, ENDS]), st.sampled_from([GRID, AREA]))
-def test_with_shapes_the_objective_of_either_stage_never_falls_and_ends_at_an_optimum(
+def test_with_shapes_the_objective_of_each_stage_never_falls(
     seed: int, parameters: SearchParameters, grid: Grid
 ) -> None:
     rng = np.random.default_rng(seed)

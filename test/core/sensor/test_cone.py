@@ -175,7 +175,7 @@ def test_cone_table_has_the_readings_in_units_of_cells(offset: float) -> None:
         assert cone['sigma'] == pytest.approx(sigma[t] / 0.1)
 
 
-def test_a_thin_cone_has_no_holes() -> None:
+def test_thin_cone_has_no_holes() -> None:
     rng = np.random.default_rng(2)
     grid = Grid(0.1, -30, -30, 60, 60)
     model = ModelParameters()

@@ -37,9 +37,7 @@ WALL = 3.0
 
 
 def before_wall(echo_up_to: float, share: float = 1.0, count: int = 400, seed: int = 0) -> Readings:
-    """Readings at all incidence angles to a wall at y = 3. A share of those up to one incidence angle have an echo of
-    it.
-    """
+    """Readings at all incidence angles to a wall at y = 3; a share of those up to `echo_up_to` have an echo of it."""
     rng = np.random.default_rng(seed)
     readings = random_readings(rng, GRID, count, z_max=3.4)
     readings.x[:] = rng.uniform(-1.5, 1.5, count)
@@ -196,7 +194,7 @@ def test_smooth_wall_is_not_contradicted_by_readings_at_large_incidence() -> Non
     assert gained_by_freeing(smooth, own) < gained_by_freeing(smooth, unit_normals(smooth))
 
 
-def test_a_mirrored_drive_has_mirrored_incidence_angles() -> None:
+def test_mirrored_drive_has_mirrored_incidence_angles() -> None:
     readings = before_wall(0.3, 0.8)
     mirrored = Readings.from_columns(
         readings.sensor_names,

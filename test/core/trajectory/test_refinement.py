@@ -1,6 +1,4 @@
-"""Refinement of whole drives: drift is corrected, exact odometry is kept, and unsuitable drives are rejected with
-reason.
-"""
+"""Refinement of whole drives: drift is corrected, exact odometry is kept, and unsuitable drives are rejected."""
 
 from __future__ import annotations
 
