@@ -101,7 +101,7 @@ def test_range_ends_at_the_centre_of_the_walls_cell():
     assert measure_at(world, x, y, math.pi / 2)[0, 0] == pytest.approx(centre - y, rel=2e-5)
 
 
-def test_wall_beyond_the_largest_range_is_no_echo_and_too_near_is_min_range():
+def test_wall_out_of_range_is_no_echo_and_too_near_is_min_range():
     assert measure_at(room(), 10.0, 10.0, 0.0)[0, 0] == math.inf
     assert measure_at(room(), 19.9, 10.0, 0.0)[0, 0] == ONE.min_range
 

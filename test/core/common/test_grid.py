@@ -140,7 +140,7 @@ def test_box_of_a_sector_is_that_of_its_points(seed: int) -> None:
     assert (box[[1, 3]] >= np.array(expected)[[1, 3]] - 1e-12).all()
 
 
-def test_box_of_a_cone_that_contains_an_axis_direction_reaches_the_full_range() -> None:
+def test_box_of_a_cone_around_an_axis_direction_has_the_full_range() -> None:
     quarter = math.pi / 2
     for k, (side, sign) in enumerate(((1, 1), (3, 1), (0, -1), (2, -1))):
         for yaw in (k * quarter, k * quarter - 4 * quarter, k * quarter + 0.2):
