@@ -109,7 +109,7 @@ def test_show_opens_the_report(
         (demo.main, ['--offline', '--seen', 1, '--show'], 'demo.png'),
     ],
 )
-def test_show_opens_pictures(
+def test_show_opens_the_picture(
     tmp_path: Path, main: Any, words: list[str], picture: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     shown = []

@@ -72,7 +72,7 @@ def interrupted(
 
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 @pytest.mark.parametrize('command', sorted(COMMANDS))
-def test_signal_during_the_import_of_a_command(tmp_path: Path, command: str, number: signal.Signals) -> None:
+def test_signal_during_the_import_ends_the_command(tmp_path: Path, command: str, number: signal.Signals) -> None:
     module = {'mapper': 'forward_grid_mapper.node.main'}.get(command, 'numpy')
     done = interrupted(tmp_path, module, number, command, *COMMANDS[command])
     assert (done.returncode, done.stdout) == (128 + number, '')
@@ -82,7 +82,7 @@ def test_signal_during_the_import_of_a_command(tmp_path: Path, command: str, num
 
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 @pytest.mark.parametrize('module', ['numba', 'yaml', 'rosbags', 'argparse'])
-def test_signal_during_other_imports(tmp_path: Path, module: str, number: signal.Signals) -> None:
+def test_signal_during_other_imports_ends_the_command(tmp_path: Path, module: str, number: signal.Signals) -> None:
     done = interrupted(tmp_path, module, number, 'process_bag', 'bag')
     assert (done.returncode, done.stderr) == (128 + number, 'process_bag: cancelled; nothing was written\n')
 
@@ -120,7 +120,7 @@ def test_second_signal_does_not_interrupt_the_clean_up(capsys: pytest.CaptureFix
 
 
 @pytest.mark.parametrize('fails', [False, True])
-def test_signal_in_a_callback_of_c_code(capsys: pytest.CaptureFixture[str], fails: bool) -> None:
+def test_signal_in_a_callback_of_c_code_ends_the_command(capsys: pytest.CaptureFixture[str], fails: bool) -> None:
     """As in the compiler of kernels: an exception there is printed as ignored, and the compiler may fail."""
     callback = ctypes.CFUNCTYPE(None)(lambda: signal.raise_signal(signal.SIGTERM))
 

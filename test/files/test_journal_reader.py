@@ -353,7 +353,7 @@ def test_random_bytes_are_rejected(path: Path) -> None:
             numbers(path)
 
 
-def test_pipes_folders_and_links_are_no_journals(path: Path, tmp_path: Path) -> None:
+def test_pipes_folders_and_other_databases_are_no_journals(path: Path, tmp_path: Path) -> None:
     os.mkfifo(path)
     with pytest.raises(BagError, match='not a regular file'):
         numbers(path)

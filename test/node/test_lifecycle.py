@@ -368,12 +368,12 @@ def test_repeated_activations_leave_no_extra_entities(inside: Callable[..., Insi
     assert len([each for each in node.subscriptions if each.msg_type in (Range, Odometry)]) == 2
 
 
-def test_readings_restored_after_a_clean_up_are_not_used(inside: Callable[..., Inside]) -> None:
+def test_readings_restored_after_a_clean_up_do_not_reach_new_parts(inside: Callable[..., Inside]) -> None:
     node = inside(max_readings=10).node
     assert node.trigger_configure() == TransitionCallbackReturn.SUCCESS
     before = node.associator
     assert node.trigger_cleanup() == TransitionCallbackReturn.SUCCESS
-    # thinned readings are given to the maps before
+    # before thinning, readings are given to the maps
     assert before.restore(some_readings(30)) == 0
     assert before.buffer.held < len(before.buffer) == 30
 

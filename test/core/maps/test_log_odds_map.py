@@ -207,7 +207,7 @@ def test_deep_arc_does_not_depend_on_the_order() -> None:
     assert np.array_equal(*maps, equal_nan=True)
 
 
-def test_empty_map() -> None:
+def test_map_without_readings_has_no_cells() -> None:
     live = LogOddsMap(Parameters())
     live.add(random_readings(np.random.default_rng(0), AREA, 0))
     assert live.probability().shape == (0, 0)

@@ -116,7 +116,7 @@ def test_drive_with_few_poses_is_refined(exact: Recording, bent: tuple[Readings,
     assert off(exact, found.trajectory) < 0.2
 
 
-def test_doubtful_step_longer_than_the_examined_path(bent: tuple[Readings, Odometry]) -> None:
+def test_doubtful_step_longer_than_the_examined_path_is_no_jump(bent: tuple[Readings, Odometry]) -> None:
     readings, _ = bent
     pose = np.array([[0.0, 0.0, 0.0], [jumping.LOOKED_BACK + 5.0, 0.0, 0.0]])
     odometry = Odometry.of(readings.stamp.min() + np.array([0, 10_000_000_000]), pose)
