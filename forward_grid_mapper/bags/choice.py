@@ -86,7 +86,7 @@ def choose_topics(
     if not found:
         raise BagError(
             'The bag has no nav_msgs/Odometry messages, which contain the poses of the '
-            f'robot.{_moving(contents, kinds)} {_listing(contents)}'
+            f'robot.{_moving(contents, kinds)}{_from_file(kinds)} {_listing(contents)}'
         )
     if len(found) > 1:
         lines = (
@@ -137,6 +137,14 @@ def _moving(contents: Contents, kinds: Sequence[str]) -> str:
     return f' `--odom-topic {topics[0]}` uses the poses of {BASE_FRAMES[0]} from the transforms of the bag.'
 
 
+def _from_file(kinds: Sequence[str]) -> str:
+    """Return the remedy for a bag without poses, if these types of poses are wanted; otherwise ''."""
+    # commands that take only Odometry have no such option
+    if TF_MESSAGE not in kinds:
+        return ''
+    return ' `--poses FILE` takes them from a TUM or CSV file, as SLAM and tracking systems write it (see --help).'
+
+
 def _of_type(contents: Contents, msgtype: str) -> list[str]:
     # topics with only static transforms have no poses of a robot
     return sorted(
@@ -159,7 +167,7 @@ def _named(contents: Contents, name: str, kinds: tuple[str, ...], option: str) -
     candidates = ', '.join(topic for kind in kinds for topic in _of_type(contents, kind))
     if candidates:
         raise BagError(f'{problem}; `{option}` can be: {candidates}.')
-    raise BagError(f'{problem}, nor any other {kinds[0]}. {_listing(contents)}')
+    raise BagError(f'{problem}, nor any other {kinds[0]}.{_from_file(kinds)} {_listing(contents)}')
 
 
 def _listing(contents: Contents) -> str:

@@ -13,6 +13,7 @@ from ..core.common.errors import BagError
 from ..core.common.shell import quoted
 from . import scan_mcap, scan_rosbag1, scan_sqlite3
 from .bounds import LARGEST_METADATA, Budget, bounded, megabytes, most_unpacked
+from .interleaved import interleaved
 from .mcap_chunks import indexed_messages
 from .salvage import Scan
 from .source import RosbagsSource, Source, one_line
@@ -68,7 +69,7 @@ def open_sources(path: Path) -> tuple[list[Source], str | None]:
     Returns
     -------
     sources : list of Source
-        One for each storage file, in the order of recording.
+        One for each storage file, in the order of recording; one for several files whose log times overlap.
     damage : str or None
         The reason why a part of the bag cannot be read.
 
@@ -115,7 +116,7 @@ def _open_folder(folder: Path) -> tuple[list[Source], str | None]:
     problems += [f'{p.name} is not listed in metadata.yaml and was left out' for p in _unlisted(present, there)]
     if not sources:
         raise BagError('; '.join(problems) or f'{folder} is an empty bag: metadata.yaml lists no file.')
-    return sources, '; '.join(problems) or None
+    return interleaved(sources), '; '.join(problems) or None
 
 
 def is_storage_file(path: Path) -> bool:

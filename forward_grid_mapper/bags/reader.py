@@ -15,6 +15,7 @@ import numpy as np
 from ..core.common.errors import BagError, InputError
 from ..core.messages.message_batch import MessageBatch, joined
 from ..core.messages.message_types import OdometryMessage, RangeMessage, range_message
+from ..core.messages.repeated_topics import RepeatedTopics
 from .choice import ODOMETRY, RANGE, Topics, choose_range_topics, choose_topics
 from .columns import Columns, InOrder
 from .decoder import TF_MESSAGE, decoder_of
@@ -46,11 +47,14 @@ class Bag:
     ----------
     undecodable : dict
         Number of messages by topic that did not fit their type and were skipped.
+    repeated : RepeatedTopics
+        Compares the ranges that `batches` has read.
     """
 
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
         self.undecodable: dict[str, int] = {}
+        self.repeated = RepeatedTopics()
         self._sources: list[Source] = []
         self._damage: str | None = None
 
@@ -134,6 +138,8 @@ class Bag:
     def batches(self, topics: Topics, progress: Callable[[int, int], None] | None = None) -> Iterator[MessageBatch]:
         """Yield the messages of the chosen topics by log time, many at once; the files of a split bag in order.
 
+        Files whose log times overlap are read together.
+
         Parameters
         ----------
         topics : Topics
@@ -148,6 +154,7 @@ class Bag:
         """
         chain = self._chain(topics)
         wanted = self._begin(topics)
+        self.repeated = RepeatedTopics()
         total = sum(c.total for c in self._channels() if (c.topic, c.msgtype) in wanted)
         done = decoded = 0
 
@@ -165,6 +172,9 @@ class Bag:
                 places = np.flatnonzero(np.isin(keys, mine))
                 found, wrong = decoding.decode(places, [raw[k][2] for k in places.tolist()])
                 parts += found
+                if len(topics.range_topics) > 1:
+                    for part in found:
+                        self.repeated.add_batch(channels[mine[0]].topic, part.ranges)
                 bad += [(place, channels[int(keys[place])]) for place in wrong]
             for _, channel in sorted(bad, key=lambda one: one[0]):
                 self._count_undecodable(channel)
@@ -227,7 +237,7 @@ class Bag:
 
     def moving_frames(self, topic: str | None = None) -> dict[str, str]:
         """Return the parent of each frame that transforms of this topic, or of `/tf`, place; they may move."""
-        topics = self._moving_topics() if topic is None else {topic}
+        topics = self.moving_topics() if topic is None else {topic}
         parents: dict[str, str] = {}
         for message in self._searched(topics):
             for item in message.transforms:
@@ -240,17 +250,22 @@ class Bag:
         Simulators, and the static_transform_publisher of ROS 1's tf, repeat fixed transforms there.
         """
         transforms = StaticTransforms('/tf')
-        for parent, child, numbers in constant_transforms(self._searched(self._moving_topics())):
+        for parent, child, numbers in constant_transforms(self._searched(self.moving_topics())):
             _add(transforms, parent, child, numbers[:3], numbers[3:])
         transforms.take(self.static_transforms())
         return transforms
 
-    def _moving_topics(self) -> set[str]:
+    def moving_topics(self) -> set[str]:
+        """Return `/tf` and the `tf` of any namespace, if the bag has them."""
         return {c.topic for c in self._channels() if c.msgtype == TF_MESSAGE and c.topic.split('/')[-1] == 'tf'}
 
-    def originals(self, topics: Topics) -> Iterator[tuple[str, Any]]:
-        """Yield topic and message of the chosen topics by log time, as rosbags decodes them."""
-        for channel, message in self._decoded(self._begin(topics)):
+    def originals(self, topics: Topics, transforms: Collection[str] = ()) -> Iterator[tuple[str, Any]]:
+        """Yield topic and message of the chosen topics by log time, as rosbags decodes them.
+
+        `transforms` are topics of transforms to be yielded as well.
+        """
+        wanted = self._begin(topics) | {(topic, TF_MESSAGE) for topic in transforms}
+        for channel, message in self._decoded(wanted):
             if message is not None:
                 yield channel.topic, message
 

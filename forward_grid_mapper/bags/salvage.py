@@ -23,6 +23,7 @@ class Scan(ABC):
         self._budget = Budget(0)
         self._found: dict[int, Channel] = {}
         self.damage: str | None = None
+        self.span: tuple[int, int] | None = None
         counts = self._count()
         self.channels = [c._replace(total=counts[c.key]) for c in self._found.values()]
 

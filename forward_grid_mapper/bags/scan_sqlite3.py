@@ -90,8 +90,12 @@ class Sqlite3Scan(Scan):
             try:
                 with closing(self._connect()) as database:
                     self._topics(database)
-                    query = 'SELECT topic_id, count(*) FROM messages NOT INDEXED GROUP BY topic_id'
-                    return Counter(dict(database.execute(query).fetchall()))
+                    columns = 'topic_id, count(*), min(timestamp), max(timestamp)'
+                    query = f'SELECT {columns} FROM messages NOT INDEXED GROUP BY topic_id'
+                    rows = database.execute(query).fetchall()
+                    if rows and all(isinstance(time, int) for row in rows for time in row[2:]):
+                        self.span = min(row[2] for row in rows), max(row[3] for row in rows)
+                    return Counter({row[0]: row[1] for row in rows})
             except (sqlite3.Error, OverflowError, Damage) as error:
                 self._note(_reason(error))
         return super()._count()

@@ -35,10 +35,13 @@ class Source(Protocol):
     channels : list of Channel
     damage : str or None
         The reason why not everything could be read, as far as known.
+    span : (int, int) or None
+        Log times of the first and the last message, nanoseconds; None if unknown, or if there is no message.
     """
 
     channels: list[Channel]
     damage: str | None
+    span: tuple[int, int] | None
 
     def messages(self, keys: Collection[int]) -> Iterator[RawMessage]:
         """Yield the messages of these channels by log time."""
@@ -88,6 +91,8 @@ class RosbagsSource:
         self._scan = scan
         self._connections = {c.id: c for c in reader.connections}
         self.damage: str | None = None
+        # rosbags gives the time after the last message
+        self.span = (reader.start_time, reader.end_time - 1) if reader.start_time < reader.end_time else None
         self.channels = [
             Channel(
                 c.id,

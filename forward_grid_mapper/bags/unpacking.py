@@ -32,7 +32,7 @@ class UnpackedMessages:
 
     def __init__(self, source: Source) -> None:
         self._source = source
-        self.channels = source.channels
+        self.channels, self.span = source.channels, source.span
 
     @property
     def damage(self) -> str | None:
@@ -62,7 +62,7 @@ class _InFolder:
 
     def __init__(self, source: Source, folder: Path) -> None:
         self._source, self._folder = source, folder
-        self.channels = source.channels
+        self.channels, self.span = source.channels, source.span
 
     @property
     def damage(self) -> str | None:

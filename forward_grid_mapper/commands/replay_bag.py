@@ -1,4 +1,4 @@
-"""`replay_bag`: publishes a bag's ranges, odometry and static transforms, if `ros2 bag` is not installed."""
+"""`replay_bag`: publishes a bag's ranges, odometry and transforms, if `ros2 bag` is not installed."""
 
 from __future__ import annotations
 
@@ -24,6 +24,8 @@ from .options import BagParser, add_topic_options
 
 COMMAND = 'replay_bag'
 CLOCK_TYPE = 'rosgraph_msgs/msg/Clock'
+TF_DEPTH = 100
+"""Messages on /tf that are kept for late subscribers, as tf2's broadcaster does."""
 
 
 def parser() -> argparse.ArgumentParser:
@@ -31,9 +33,9 @@ def parser() -> argparse.ArgumentParser:
     made = BagParser(
         COMMAND,
         description=(
-            "Replay a recorded drive to the mapper: publishes a bag's Range, Odometry and static transforms, with the "
-            'recorded stamps and in the recorded order, when every topic has a subscriber. Arguments after --ros-args '
-            'are for ROS.'
+            "Replay a recorded drive to the mapper: publishes a bag's Range, Odometry, /tf and /tf_static, "
+            'with the recorded stamps and in the recorded order, when every topic of Range and Odometry has a '
+            'subscriber. Arguments after --ros-args are for ROS.'
         ),
         epilog='example: replay_bag MY_BAG --rate 2 --clock',
     )
@@ -92,13 +94,16 @@ def replay(options: argparse.Namespace, ros_arguments: Sequence[str]) -> int:
             fixed: dict[str, list[Any]] = {}
             for topic, message in bag.static_originals():
                 fixed.setdefault(topic, []).append(message)
-            names = renamed({**sensors, **dict.fromkeys(fixed, TF_MESSAGE), **clock}, options.remap)
+            moving = _moving(bag, options.quiet)
+            names = renamed({**sensors, **dict.fromkeys([*fixed, *moving], TF_MESSAGE), **clock}, options.remap)
+            for topic in moving:
+                publishers.add(names[topic], TF_MESSAGE, depth=TF_DEPTH)
             for topic, transforms in _static(fixed, options.quiet).items():
                 publishers.add(names[topic], TF_MESSAGE, latched=True)
                 publishers.publish_latched(names[topic], transforms=transforms)
             for topic, msgtype in {names[topic]: kind for topic, kind in {**sensors, **clock}.items()}.items():
                 publishers.add(topic, msgtype)
-            player = Player(bag, topics, names, publishers, stop, options.clock, ticker.say)
+            player = Player(bag, topics, names, publishers, stop, options.clock, ticker.say, moving)
             ticker.say('waiting for subscribers')
             if options.wait:
                 publishers.wait_for_subscribers(sorted({names[topic] for topic in sensors}), options.wait)
@@ -114,6 +119,19 @@ def replay(options: argparse.Namespace, ros_arguments: Sequence[str]) -> int:
         counts = f'{player.played[RANGE]:,} Range and {player.played[ODOMETRY]:,} Odometry messages'
         print(f'{"stopped after" if stop.is_set() else "replayed"} {counts} in {seconds:.1f} s')
     return 0
+
+
+def _moving(bag: Bag, quiet: bool) -> list[str]:
+    """Return the topics of moving transforms; none, with a warning, if such messages cannot be published."""
+    topics = sorted(bag.moving_topics())
+    try:
+        if topics:
+            message_class(TF_MESSAGE)
+        return topics
+    except MapperError as error:
+        if not quiet:
+            _print_warning(f'{", ".join(topics)} {"is" if len(topics) == 1 else "are"} not replayed ({error})')
+        return []
 
 
 def _static(messages: Mapping[str, Iterable[Any]], quiet: bool) -> dict[str, list[Any]]:

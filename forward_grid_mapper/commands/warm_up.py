@@ -26,7 +26,7 @@ def compile_kernels(options: argparse.Namespace) -> int:
     """Run the command with its options."""
     begin = time.monotonic()
     for name, compile_all in STEPS.items():
-        print(f'kernels of the {name} …', flush=True)
+        print(f'{name} kernels …', flush=True)
         compile_all()
     made = f'{compiling.count()} compilations' if compiling.count() else 'nothing to compile'
     print(f'all kernels are in {CACHE} after {time.monotonic() - begin:.1f} s, {made}')

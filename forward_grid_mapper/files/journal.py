@@ -24,8 +24,8 @@ from typing import Any, NamedTuple
 
 from ..core.common.errors import BagError, OutputError
 from ..core.common.readings import Readings
-from .journal_database import DRIVE, FULL, Drive, DriveWriter, FolderLock, GoneError, Insert, following, number_of
-from .journal_format import BLOCK, Contents, encoded, points_of, rows_of
+from .journal_database import DRIVE, FULL, Drive, DriveWriter, FolderLock, GoneError, following, number_of
+from .journal_format import Contents, Insert, encoded, path_rows, reading_rows
 from .journal_reader import is_journal, one_line, read
 from .output_folder import expanded, output_errors
 from .syncing import Syncer
@@ -92,8 +92,8 @@ class _Everything:
 
     def __iter__(self) -> Iterator[Insert]:
         yield from self.head
-        yield from _path_rows(self.path, 0)
-        yield from _reading_rows(self.readings, self.numbers, 0)
+        yield from path_rows(self.path, 0)
+        yield from reading_rows(self.readings, self.numbers, 0)
 
 
 class Journal:
@@ -220,11 +220,11 @@ class Journal:
             self.lost += count
             return
         rows = self._head(readings, frames)
-        points = list(_path_rows(list(path), self._next_points))
+        points = list(path_rows(list(path), self._next_points))
         self._next_points += len(points)
         rows += points
         if readings is not None:
-            rows += _reading_rows(readings, self._numbers, self._next)
+            rows += reading_rows(readings, self._numbers, self._next)
         self._next += count
         if rows:
             self._queue(rows, count, sum(len(values[-1]) for _, values in rows))
@@ -392,15 +392,3 @@ def _words(error: Exception) -> str:
     if isinstance(error, OSError):
         return error.strerror or str(error)
     return str(error) if isinstance(error, OutputError) else repr(error)
-
-
-def _path_rows(points: list[tuple[float, float]], number: int) -> Iterator[Insert]:
-    for first in range(0, len(points), BLOCK):
-        yield 'path', (number, points_of(points[first : first + BLOCK]).tobytes())
-        number += 1
-
-
-def _reading_rows(readings: Readings, numbers: Mapping[str, int], number: int) -> Iterator[Insert]:
-    for first in range(0, len(readings), BLOCK):
-        part = readings.select(slice(first, first + BLOCK))
-        yield 'readings', (number + first, rows_of(part, numbers).tobytes())

@@ -16,11 +16,10 @@ from collections.abc import Iterable, Iterator
 from contextlib import closing, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from ..core.common.errors import BagError, OutputError
 from ..core.common.readings import Readings
-from .journal_format import APPLICATION, ROW, TABLES, VERSION, Contents
+from .journal_format import APPLICATION, ROW, TABLES, VERSION, Contents, Insert
 from .journal_reader import check, connect, extent, log_of, one_line, readings, unbounded
 
 DRIVE = re.compile(r'drive_(\d{4,})\.journal')
@@ -38,9 +37,6 @@ INSERT = {
 
 FULL = 'database or disk is full'
 """SQLite's message for a full disk; the transaction may be repeated with the same connection."""
-
-Insert = tuple[str, tuple[Any, ...]]
-"""A table, and the values of a row."""
 
 
 @dataclass

@@ -71,6 +71,9 @@ MOST_POINTS = 200_000
 LATEST = (1 << 32) * NANOSECONDS
 """Largest absolute value of a stamp, nanoseconds: that of 32 bits of seconds, so that differences fit into 64 bits."""
 
+Insert = tuple[str, tuple[Any, ...]]
+"""A table, and the values of a row."""
+
 
 def rows_of(readings: Readings, numbers: Mapping[str, int]) -> NDArray[np.void]:
     """Return readings as rows of `ROW`, shape (N,); `numbers` gives the number of each sensor by its name."""
@@ -84,6 +87,20 @@ def rows_of(readings: Readings, numbers: Mapping[str, int]) -> NDArray[np.void]:
 def points_of(path: Iterable[tuple[float, float]]) -> NDArray[np.float64]:
     """Return points of the path in the format of the table, shape (P, 2)."""
     return np.array(list(path), '<f8').reshape(-1, 2)
+
+
+def path_rows(points: list[tuple[float, float]], number: int) -> Iterator[Insert]:
+    """Yield the rows of points of the path; `number` is that of the first row."""
+    for first in range(0, len(points), BLOCK):
+        yield 'path', (number, points_of(points[first : first + BLOCK]).tobytes())
+        number += 1
+
+
+def reading_rows(readings: Readings, numbers: Mapping[str, int], number: int) -> Iterator[Insert]:
+    """Yield the rows of readings; `number` is that of the first reading, `numbers` are those of the sensors."""
+    for first in range(0, len(readings), BLOCK):
+        part = readings.select(slice(first, first + BLOCK))
+        yield 'readings', (number + first, rows_of(part, numbers).tobytes())
 
 
 def encoded(name: str) -> bytes:
@@ -176,7 +193,7 @@ class Contents:
             return
         for row in TABLE:
             if row.name in values:
-                with suppress(ParameterError, OverflowError):
+                with suppress(ParameterError):
                     self.parameters[row.name] = row.check(values[row.name])
 
     def add_path(self, data: object) -> None:

@@ -91,7 +91,7 @@ def _description(found: dict[str, Any]) -> str:
 
 def _wheels(found: dict[str, Any]) -> str:
     words = found.get('odometry') or ''
-    some = found.get('told') is None or found['told']
+    some = found.get('calibration_estimates') is None or found['calibration_estimates']
     check = '; these values are for this drive: measure a straight line and a full turn before you set them'
     return words + check if words and some else words
 

@@ -68,7 +68,9 @@ def trajectory_data(
         'odometry': calibration_words(outcome.calibration) if outcome.accepted else '',
     }
     if estimates is not None and outcome.accepted:
-        data['told'] = {name: {'value': value, 'sigma': sigma} for name, (value, sigma) in estimates.items()}
+        data['calibration_estimates'] = {
+            name: {'value': value, 'sigma': sigma} for name, (value, sigma) in estimates.items()
+        }
         data['odometry'] = estimate_words(estimates)
     return data
 

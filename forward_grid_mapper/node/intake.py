@@ -14,8 +14,9 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Range
 
 from ..core.common.parameters import Parameters
-from ..core.messages.message_types import OdometryMessage, RangeMessage, odometry_message, range_message
+from ..core.messages.message_types import OdometryMessage, RangeMessage, odometry_message, range_message, stamp_of
 from ..core.messages.pose_association import MOST_WAITING, PoseAssociator
+from ..core.messages.repeated_topics import RepeatedTopics
 from .clocks import OdometryClock, SensorClocks
 from .frames import MapFrame
 from .heard import Heard
@@ -74,6 +75,8 @@ class Intake:
         self.paused = self._ready = False
         self.reliable = own.range_reliability == 'reliable'
         self.heard = Heard()
+        self._repeated = RepeatedTopics()
+        self._repeated_logged: set[str] = set()
         self._odometry_clock = OdometryClock(associator, node.get_logger().warning)
         self._sensor_clocks = SensorClocks(node.get_logger().warning)
         self._held: deque[tuple[RangeMessage | OdometryMessage | _InMapFrame, int, bool]] = deque()
@@ -99,7 +102,8 @@ class Intake:
         own = self._own
         try:
             for topic, losses in zip(self._topics, self.range_losses, strict=True):
-                self._subscribe(Range, topic, own.range_reliability, partial(self.on_range, losses), losses)
+                receive = partial(self._on_range_of, topic, losses)
+                self._subscribe(Range, topic, own.range_reliability, receive, losses)
             self._subscribe(Odometry, own.odom_topic, own.odom_reliability, self.on_odometry, self._odometry_losses)
         except BaseException:
             # otherwise the next call would subscribe twice
@@ -156,7 +160,7 @@ class Intake:
     def faults(self) -> list[str]:
         """Return the faults, in words; losses and clocks are logged as well, at most every few seconds."""
         clocks = [*self._odometry_clock.faults(), *self._sensor_clocks.faults(self._associator.odometry_stamp)]
-        return [*self._loss_faults(), *clocks]
+        return [*self._loss_faults(), *clocks, *self.repeated()]
 
     def _loss_faults(self) -> list[str]:
         now = time.monotonic()
@@ -190,7 +194,24 @@ class Intake:
             '(estimated); they are missing in the maps'
         ]
 
+    def repeated(self) -> list[str]:
+        """Return warnings about topics with the same readings; each is logged once."""
+        found = self._repeated.notes(
+            self._topics, lambda topics: f'To use one, set range_topics to {", ".join(topics)}'
+        )
+        for text in found:
+            if text not in self._repeated_logged:
+                self._repeated_logged.add(text)
+                self._node.get_logger().warning(text)
+        return found
+
     # messages
+
+    def _on_range_of(self, topic: str, losses: Losses, message: Range, info: dict[str, Any]) -> None:
+        if len(self._topics) > 1:
+            header = message.header
+            self._repeated.add(topic, header.frame_id, stamp_of(header), message.range)
+        self.on_range(losses, message, info)
 
     def on_range(self, losses: Losses, message: Range, info: dict[str, Any]) -> None:
         """Receive a Range."""
@@ -251,6 +272,8 @@ class Intake:
         for losses in (*self.range_losses, self._odometry_losses):
             losses.clear()
         self._losses_logged = 0
+        self._repeated = RepeatedTopics()
+        self._repeated_logged.clear()
         self._forget_senders()
 
     @property

@@ -30,7 +30,7 @@ class JournalKeeper:
     """Keeps a node's journal; does nothing if the folder is ''."""
 
     def __init__(self, node: Node, folder: str, associator: PoseAssociator) -> None:
-        """Open the journal; call `restore` before anything else.
+        """Prepare; call `open` and `restore` before anything else.
 
         Parameters
         ----------
@@ -38,11 +38,6 @@ class JournalKeeper:
             Its attribute `parameters` holds the parameters of the mapper.
         folder : str
         associator : PoseAssociator
-
-        Raises
-        ------
-        OutputError
-            If the journal belongs to another node, or cannot be opened for another reason than a full disk.
         """
         self._node = node
         self._associator = associator
@@ -53,11 +48,20 @@ class JournalKeeper:
         self._last_point: tuple[float, float] | None = None
         self._parameters: Parameters | None = None
         self._begun = False
-        if not folder:
+
+    def open(self) -> None:
+        """Open the journal, which locks its folder until `close`.
+
+        Raises
+        ------
+        OutputError
+            If the journal belongs to another node, or cannot be opened for another reason than a full disk.
+        """
+        if not self._folder:
             return
-        warn: Callable[[str], Any] = node.get_logger().warning
+        warn: Callable[[str], Any] = self._node.get_logger().warning
         try:
-            self._journal = Journal(folder, warn)
+            self._journal = Journal(self._folder, warn)
         except OutputError as error:
             cause = error.__cause__
             if not (isinstance(cause, OSError) and cause.errno in FULL):

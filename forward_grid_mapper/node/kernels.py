@@ -66,6 +66,12 @@ class Kernels:
             if stop():
                 raise Cancelled('cancelled while kernels were compiled')
 
+    def release(self) -> None:
+        """Let all who wait continue if the compilation has not begun, since it will not begin any more."""
+        if self not in self.at_work:
+            for done in self._done.values():
+                done.set()
+
     def has(self, name: str) -> bool:
         """Return whether the kernels of a step are compiled, or the step was left out."""
         return name not in self._done or self._done[name].is_set()
@@ -73,7 +79,7 @@ class Kernels:
     def _compile(self, name: str, ready: Callable[[], None], begin: float) -> None:
         self.stage = name
         self._steps[name]()
-        self._log(f'kernels of the {name} are ready after {time.monotonic() - begin:.1f} s')
+        self._log(f'{name} kernels are ready after {time.monotonic() - begin:.1f} s')
         self._done[name].set()
         if name == 'live map':
             ready()

@@ -16,10 +16,8 @@ from std_srvs.srv import SetBool, Trigger
 
 from ..core.common.errors import MapperError, ParameterError
 from ..core.common.parameters import Parameters
-from ..core.maps.log_odds_map import LogOddsMap
 from ..core.messages.message_types import NANOSECONDS
 from ..core.messages.pose_association import PoseAssociator
-from ..core.messages.reading_buffer import bounded
 from ..core.messages.rep117 import rejection_warnings, sensor_rejections
 from ..files.output_folder import unwritable
 from . import ros_parameters
@@ -28,15 +26,14 @@ from .complaints import of_ros
 from .deferred import DeferredService, Reply, answered
 from .diagnostics import Health
 from .em_service import EmService
+from .feeding import Feed
 from .following import Following
 from .frames import Extrinsics, MapFrame, Transforms
 from .intake import AT_ONCE, Intake
 from .journal_keeper import JournalKeeper
 from .kernels import Kernels
-from .live import LiveMap, LiveSnapshot
 from .managed import ManagedNode
 from .map_publishers import MapPublishers
-from .online import OnlineSnapshot, OnlineWorker
 from .reporter import Reporter
 from .saver import Account, Saver
 from .trajectory import Trajectory
@@ -87,9 +84,9 @@ class MapperNode(ManagedNode):
         self._started = self.mapping = False
         self._when_ready: list[Callable[[], None]] = []
         self._missing = {'journal', 'kernels'}
-        self._fed = {'live': 0, 'online': 0}
         self.workers: list[Worker] = []
         self._calls: list[DeferredService] = []
+        self._ends: list[Callable[[], object]] = []
 
     def configure(self) -> None:
         """Create topics and services, restore the journal, and compile; messages are received once the node is active.
@@ -126,21 +123,31 @@ class MapperNode(ManagedNode):
         kernels = self.kernels = Kernels(log.info, log.error, node.online, node.refine_poses)
         self.trajectory = trajectory = Trajectory(self, self.associator, self._steady)
         self.maps = MapPublishers(self, self.parameters.grid.resolution, lambda: trajectory.frame, self._up_to_date)
-        # last of what may fail: a journal that is not closed locks its folder
-        self.journal = JournalKeeper(self, node.journal, self.associator)
-        trajectory.publishing, trajectory.changed = self.maps.worker, self._change_trajectory
-        trajectory.following = Following(log, inbox, trajectory.follow) if node.online else None
+        self._ends.append(partial(self.maps.worker.close, 0.5))
+        trajectory.publishing = self.maps.worker
+        if node.online:
+            trajectory.following = Following(log, inbox, trajectory.follow)
+            self._ends.append(partial(trajectory.following.close, 2.0))
         trajectory.begin()
-        self.live = LiveMap(self.parameters, self._show_live, log.error, lambda: kernels.wait('live map'))
+        feed = self.feed = Feed(lambda: self.parameters, self.associator, trajectory, self.maps, inbox, kernels, log)
+        # the maps wait for kernels
+        self._ends += [feed.close, kernels.release]
+        trajectory.changed = feed.replace
+        self.live, self.online = feed.live, feed.online
         self.em = EmService(lambda: self.parameters, self.associator, trajectory, self.maps, inbox, kernels, log)
+        self._ends.append(partial(self.em.close, 2.0))
+        # during EM, its intermediate maps are shown
+        feed.shows_online = lambda: self.em.current is None
         trajectory.refine = lambda: self.mapping and self.em.run_by_itself()
         self._extrinsics = extrinsics
         self.em.range_topics, self.em.odom_topic = ranges, odometry
         self.em.no_map_frame = lambda: self._map_frame.lack
         self.em.extrinsics, self.em.mounts = lambda: extrinsics.fixed, lambda: extrinsics.known
-        self.online = self.em.online = self._online_worker(kernels) if node.online else None
+        self.em.online = self.online
         self.saver = Saver(self.em, self.live, self._account, log)
         self._readings_worker = Worker('readings', log.error)
+        self._ends += [partial(worker.close, 0.5) for worker in (self.saver.worker, self._readings_worker)]
+        self.journal = JournalKeeper(self, node.journal, self.associator)
         self.workers = [self._readings_worker, self.live.worker, self.maps.worker, self.em.worker.worker]
         self.workers += [part.worker for part in (self.saver, self.online, trajectory.following, kernels) if part]
         health = Health()
@@ -169,10 +176,15 @@ class MapperNode(ManagedNode):
         self._calls += [DeferredService(self, SetBool, '~/pause', self.pause), *self.maps.services]
         self.create_timer(1.0, self.reporter.report, clock=self._steady)
         self._live_timer = self.create_timer(1.0 / node.publish_rate, self.publish_live, clock=self._steady)
+        # a journal that is still being read must not add readings to the next configuration
+        self._ends.append(self.associator.buffer.before_thinning.clear)
+        # closed first, since other work may take as long as `stopping.GRACE`
+        self._ends.append(self.journal.close)
+        self.journal.open()
         self._started = True
         self._poses_from = 'parameters and TF' if transforms.available else 'parameters (tf2_ros is not installed)'
         # the live map contains every reading, also those that max_readings removes
-        self.associator.buffer.before_thinning.append(self._feed)
+        self.associator.buffer.before_thinning.append(feed.feed)
         kernels.begin(lambda: inbox.put(lambda: self._step_done('kernels')))
         self._readings_worker.put(
             partial(self._restore, self.journal, inbox), lambda why: inbox.put(lambda: self._fail(why))
@@ -200,22 +212,11 @@ class MapperNode(ManagedNode):
         self.get_logger().info('inactive: nothing is received; maps and services stay')
 
     def close(self) -> None:
-        """End the work in the background."""
-        if self._started:
-            self._started = self.mapping = False
-            # before work that may take as long as `stopping.GRACE`
-            self.journal.close()
-            # a journal that is still being read must not add readings to the next configuration
-            self.associator.buffer.before_thinning.clear()
-            self.em.close(2.0)
-            if self.online:
-                self.online.close(2.0)
-            if self.trajectory.following:
-                self.trajectory.following.close(2.0)
-            self.live.worker.close(0.5)
+        """End the work in the background, also of a configuration that failed."""
+        self._started = self.mapping = False
         # compilation is finished in any case, for the next configuration
-        for worker in self.workers[:-1]:
-            worker.close(0.5)
+        while self._ends:
+            self._ends.pop()()
         # calls that wait will get no result
         for service in self._calls:
             service.end('the node is being cleaned up')
@@ -245,7 +246,7 @@ class MapperNode(ManagedNode):
         if what == 'journal':
             self.associator.buffer.aside = self._thin_in_background
             self.journal.begin(self._steady)
-            self.create_timer(FEED_PERIOD, self._feed, clock=self._steady)
+            self.create_timer(FEED_PERIOD, self.feed.feed, clock=self._steady)
             self.intake.begin()
             self._map()
         self._missing.discard(what)
@@ -301,9 +302,9 @@ class MapperNode(ManagedNode):
             if (parameters.model, parameters.search) == (before.model, before.search):
                 pass
             elif self.mapping:
-                self._restart_online()
+                self.feed.restart_online()
             else:
-                self._when_ready.append(self._restart_online)
+                self._when_ready.append(self.feed.restart_online)
         if parameters.node.publish_rate != before.node.publish_rate:
             self._live_timer.timer_period_ns = round(NANOSECONDS / parameters.node.publish_rate)
             # otherwise the old period ends first
@@ -311,74 +312,18 @@ class MapperNode(ManagedNode):
 
     # maps
 
-    def _change_trajectory(self, live: LogOddsMap | None, count: int) -> None:
-        """Continue with another trajectory: with the live map of the first `count` readings, and a new online map.
-
-        Without a live map only the name of the frame has changed.
-        """
-        if live is None:
-            self.live.touch()
-            return
-        self.live.replace(live)
-        self._fed['live'] = count
-        self._restart_online()
-        self._feed()
-
-    def _feed(self) -> None:
-        """Give new readings to the maps; their threads add them."""
-        buffer = self.associator.buffer
-        if len(buffer) > self._fed['live']:
-            self.live.offer(buffer.snapshot(self._fed['live']), self.trajectory.place)
-            self._fed['live'] = len(buffer)
-        if self.online is None:
-            return
-        if len(buffer) > self._fed['online']:
-            if buffer.bound and self.online.kept > buffer.bound + buffer.bound // 4:
-                self._restart_online()
-            else:
-                self.online.offer(buffer.snapshot(self._fed['online']), self.trajectory.place)
-                self._fed['online'] = len(buffer)
-        self.online.tick()
-
     def publish_live(self) -> None:
         """Have the live map published if it has changed."""
         if self.mapping:
-            self._feed()
-            self.live.publish()
+            self.feed.publish()
             self.maps.refresh()
-
-    def _show_live(self, snapshot: LiveSnapshot) -> None:
-        self.maps.publish('live_map', snapshot.generation, snapshot.grid, snapshot.probability)
 
     def _up_to_date(self, name: str, answer: Callable[[], None], failed: Callable[[str], object]) -> None:
         """Call `answer` once a map contains all readings, if it is the live map; otherwise at once."""
         if name == 'live_map' and self.mapping:
-            self._feed()
-            self.live.publish(now=True)
-            self.live.when_added(answer, failed)
+            self.feed.when_up_to_date(answer, failed)
         else:
             answer()
-
-    def _online_worker(self, kernels: Kernels) -> OnlineWorker:
-        def publish(snapshot: OnlineSnapshot) -> None:
-            generation = self.maps.generation
-            self.inbox.put(lambda: self._show_online(snapshot, generation))
-
-        return OnlineWorker(self.parameters, publish, self.get_logger().error, lambda: kernels.wait('online map'))
-
-    def _show_online(self, snapshot: OnlineSnapshot, generation: int) -> None:
-        # during EM, its intermediate maps are shown
-        if self.online and snapshot.epoch == self.online.epoch and self.em.current is None:
-            self.maps.publish('ml_map', generation, snapshot.grid, snapshot.ml)
-            self.maps.publish('uncertainty_map', generation, snapshot.grid, snapshot.uncertainty)
-
-    def _restart_online(self) -> None:
-        """Begin the online map again, from the readings that are kept."""
-        if self.online:
-            buffer = self.associator.buffer
-            self._fed['online'] = len(buffer)
-            held, bound, place = buffer.snapshot(), buffer.bound, self.trajectory.place or (lambda readings: readings)
-            self.online.restart(self.parameters, (lambda: place(bounded(held, bound))) if len(held) else None)
 
     # services
 
@@ -394,9 +339,7 @@ class MapperNode(ManagedNode):
         self.trajectory.begin()
         self.maps.clear()
         self.em.reset()
-        self.live.restart(self.parameters, self.maps.generation)
-        self._fed = {'live': 0, 'online': 0}
-        self._restart_online()
+        self.feed.reset()
         reply.send(True, f'{forgotten} readings and all maps were deleted{kept}')
 
     def pause(self, reply: Reply) -> None:
@@ -407,7 +350,7 @@ class MapperNode(ManagedNode):
     def _account(self) -> Account:
         """Return the state of the node for a report."""
         associator, node, name = self.associator, self.parameters.node, self.get_fully_qualified_name()
-        self._feed()
+        self.feed.feed()
         rejections = [
             *rejection_warnings(associator.rejected, associator.received),
             *sensor_rejections(associator.rejected_by_frame, associator.buffer.counts()),
@@ -427,7 +370,12 @@ class MapperNode(ManagedNode):
                 'rejected': dict(associator.rejected),
                 'lost': self.intake.lost,
             },
-            'warnings': [*associator.limits.warnings(), *self.intake.loss_note(), *rejections],
+            'warnings': [
+                *associator.limits.warnings(),
+                *self.intake.loss_note(),
+                *self.intake.repeated(),
+                *rejections,
+            ],
         }
         path, odometry = list(associator.path), associator.odometry
         return Account(source, len(associator.buffer), path, odometry, node.save_directory, f'Maps of {name}')

@@ -124,7 +124,7 @@ class OnlineWorker:
             self._next = time.monotonic() + 1.0 / self._parameters.node.publish_rate
             self._publishing, self._changed = True, False
             wanted, epoch = self._map, self.epoch
-            self.worker.put(lambda: self._publish(wanted, epoch), lambda why: self._published())
+            self.worker.put(lambda: self._publish(wanted, epoch), self._not_published)
 
     def close(self, seconds: float) -> None:
         """Cancel the work, and wait at most so many seconds for the end of the thread."""
@@ -161,11 +161,11 @@ class OnlineWorker:
                 return
             self._changed = True
 
-    def _published(self) -> None:
-        self._publishing = False
+    def _not_published(self, why: str) -> None:
+        self._publishing, self._changed = False, True
 
     def _publish(self, wanted: OnlineMap, epoch: int) -> None:
-        self._published()
+        self._publishing = False
         if wanted is not self._map:
             return
         try:

@@ -1,4 +1,4 @@
-"""An orderly shutdown: any number of SIGINT and SIGTERM become a single request to stop."""
+"""An orderly shutdown: any number of SIGINT, SIGTERM and SIGHUP become a single request to stop."""
 
 from __future__ import annotations
 
@@ -7,8 +7,9 @@ import signal
 import sys
 import threading
 from collections.abc import Callable
+from contextlib import suppress
 
-SIGNALS = {signal.SIGINT, signal.SIGTERM}
+SIGNALS = {signal.SIGINT, signal.SIGTERM, signal.SIGHUP}
 GRACE = 5.0
 """Longest duration of an orderly shutdown, seconds; then the process is ended."""
 
@@ -24,7 +25,10 @@ class Stopper:
         self.requested = threading.Event()
         self._stop: Callable[[], None] | None = None
         self._lock = threading.Lock()
-        signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
+        # `nohup` ignores SIGHUP, but `sigwait` would receive it
+        nohup = signal.getsignal(signal.SIGHUP) == signal.SIG_IGN
+        self._signals = SIGNALS - {signal.SIGHUP} if nohup else SIGNALS
+        signal.pthread_sigmask(signal.SIG_BLOCK, self._signals)
         threading.Thread(target=self._wait, daemon=True, name='stopper').start()
 
     def call(self, stop: Callable[[], None]) -> None:
@@ -36,7 +40,7 @@ class Stopper:
             stop()
 
     def _wait(self) -> None:
-        signal.sigwait(SIGNALS)
+        signal.sigwait(self._signals)
         with self._lock:
             self.requested.set()
             stop = self._stop
@@ -49,6 +53,8 @@ class Stopper:
 
     @staticmethod
     def _exit(code: int) -> None:
-        sys.stdout.flush()
-        sys.stderr.flush()
+        # after SIGHUP there is no terminal
+        with suppress(OSError):
+            sys.stdout.flush()
+            sys.stderr.flush()
         os._exit(code)

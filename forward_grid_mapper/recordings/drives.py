@@ -129,7 +129,8 @@ def read_drives(
     for number, path in enumerate(paths, 1):
         say(f'reading {number} of {len(paths)}: {readable(path)}')
         try:
-            drives.append(read_drive(path, parameters, extrinsics, range_topics, odom_topic, None, part, poses))
+            others = [other for other in paths if other != path]
+            drives.append(read_drive(path, parameters, extrinsics, range_topics, odom_topic, None, part, poses, others))
         except (BagError, InputError) as error:
             errors.append((path, error))
     if errors:

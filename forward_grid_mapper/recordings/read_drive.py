@@ -26,6 +26,7 @@ from ..files.output_folder import readable
 from .drive import WHOLE, Drive, FullLiveMap, Part, Spans, alternation_note, length_of, thinning_note
 from .given_poses import GivenPoses
 from .journal_drive import read_journal
+from .other_bags import OtherBags
 
 __all__ = ['Drive', 'Extrinsics', 'read_drive']
 
@@ -34,7 +35,7 @@ POSES_MISSING = {'unknown_extrinsics', 'after_odometry'}
 
 NO_STATIC = (
     'the bag has no /tf_static (nodes publish it once, as they start: record it from the start; of a split bag the '
-    'first file has it, so give the whole folder)'
+    'first file has it, so give the whole folder, or that file as well)'
 )
 """Remedy if no transform is known."""
 
@@ -59,11 +60,19 @@ class Extrinsics:
     """
 
     def __init__(
-        self, given: Mapping[str, Pose2], transforms: StaticTransforms, more: Callable[[], StaticTransforms]
+        self,
+        given: Mapping[str, Pose2],
+        transforms: StaticTransforms,
+        more: Callable[[], StaticTransforms],
+        others: OtherBags | None = None,
     ) -> None:
-        """`more` returns transforms that are used if `transforms` do not connect a sensor to the robot."""
+        """`more` returns transforms that are used if `transforms` do not connect a sensor to the robot.
+
+        `others` are used if there are no `transforms`.
+        """
         self._given = {frame.lstrip('/'): pose for frame, pose in given.items()}
         self._transforms, self._more = transforms, cache(more)
+        self._others = others or OtherBags()
         self._found: dict[tuple[str, str], Pose2 | str | None] = {}
         self.steep: dict[str, str] = {}
         self.used: dict[str, str] = {}
@@ -89,6 +98,9 @@ class Extrinsics:
             if pose is None and base_frame:
                 transforms, where = self._more(), 'constant transforms on /tf'
                 pose = transforms.lookup(base_frame, frame)
+            if pose is None and base_frame and not len(self._transforms):
+                pose = self._others.lookup(base_frame, frame)
+                where = f'/tf_static of {self._others.used.get(frame)}'
         except SteepSensorError as error:
             self.steep[frame] = str(error)
             return STEEP
@@ -106,6 +118,11 @@ class Extrinsics:
         return {frame: pose for (_, frame), pose in self._found.items() if isinstance(pose, Pose2)}
 
     @property
+    def notes(self) -> list[str]:
+        """Warnings about the sources of poses."""
+        return [*self.doubts, *self._others.notes()]
+
+    @property
     def unused(self) -> list[str]:
         """Frames with a given pose that have no readings."""
         return sorted(set(self._given) - {frame.lstrip('/') for frame in self.used})
@@ -117,7 +134,7 @@ class Extrinsics:
         if not base_frame:
             joined += '; odometry has no child_frame_id, which is needed to look up transforms'
         reasons = ''.join(f' {self.unusable[frame]}' for frame in frames if frame in self.unusable)
-        reasons += self._on_joints(frames) + self._other_names(base_frame, frames)
+        reasons += self._on_joints(frames) + self._other_names(base_frame, frames) + self._others.advice()
         options = ' '.join(f'--sensor {quoted(f"{frame}=x,y,yaw")}' for frame in frames[:MOST_OPTIONS])
         more = ', and so on' if len(frames) > MOST_OPTIONS else ''
         return (
@@ -168,6 +185,7 @@ def read_drive(
     progress: Callable[[int, int], None] | None = None,
     part: Part = WHOLE,
     poses: GivenPoses | None = None,
+    others: Sequence[Path | str] = (),
 ) -> Drive:
     """Read a bag and transform its readings to the map frame, or read a journal.
 
@@ -185,6 +203,8 @@ def read_drive(
         The part to read, by stamps; the drive begins with its first message on these topics.
     poses : GivenPoses, optional
         They replace the bag's odometry.
+    others : sequence of Path or str
+        Other bags of the robot, whose `/tf_static` is used if the bag has none.
 
     Raises
     ------
@@ -205,7 +225,8 @@ def read_drive(
             topics = bag.choose_topics(range_topics, odom_topic, any_poses=True)
         else:
             topics = bag.choose_range_topics(range_topics)
-        lookup = Extrinsics(extrinsics, bag.static_transforms(topics), partial(_constant_transforms, path))
+        constant = partial(_constant_transforms, path)
+        lookup = Extrinsics(extrinsics, bag.static_transforms(topics), constant, OtherBags(others, topics))
         associator = BatchAssociator(lookup, parameters)
         live = FullLiveMap(associator, parameters)
         # a reading is placed by the poses before and after it
@@ -222,7 +243,8 @@ def read_drive(
         undecodable = dict(bag.undecodable)
         if topics.odom_type == TF_MESSAGE and not spans.odometry:
             lookup.moving = bag.moving_frames(topics.odom_topic)
-        warnings = topics.notes() + _warnings(bag, associator, lookup)
+        warnings = [*topics.notes(), *bag.repeated.notes(topics.range_topics, _choosing)]
+        warnings += _warnings(bag, associator, lookup)
     if not len(associator.buffer):
         if not associator.received and spans.left_out:
             first, last = spans.left_out
@@ -263,6 +285,10 @@ def _constant_transforms(path: Path | str) -> StaticTransforms:
         return bag.constant_transforms_on_tf()
 
 
+def _choosing(topics: Sequence[str]) -> str:
+    return f'To use one of them, add `--range-topics {" ".join(map(quoted, topics))}`'
+
+
 def _warnings(bag: Bag, associator: PoseAssociator, lookup: Extrinsics) -> list[str]:
     warnings = []
     if bag.truncated:
@@ -272,7 +298,7 @@ def _warnings(bag: Bag, associator: PoseAssociator, lookup: Extrinsics) -> list[
     if associator.unknown_frames:
         lookup.moving = bag.moving_frames()
         warnings.append(lookup.advice(associator.base_frame, sorted(associator.unknown_frames)))
-    warnings += [*lookup.steep.values(), *lookup.doubts, *far_mounts(lookup.poses)]
+    warnings += [*lookup.steep.values(), *lookup.notes, *far_mounts(lookup.poses)]
     if unused := lookup.unused:
         warnings.append(
             f'poses were given for {", ".join(unused)}, but no reading has such a frame; is the name right?'

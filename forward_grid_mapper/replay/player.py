@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 
 from ..bags.choice import ODOMETRY, RANGE, Topics
 from ..bags.reader import Bag
@@ -30,6 +30,8 @@ class Player:
         Rate of `/clock` in Hz.
     tell : callable
         Receives the progress of the replay.
+    transforms : collection of str
+        Topics of transforms. They are published between the messages around them: their stamps may be in the future.
 
     Attributes
     ----------
@@ -50,6 +52,7 @@ class Player:
         stop: StopSignal,
         clock: float | None,
         tell: Callable[[str], None],
+        transforms: Collection[str] = (),
     ) -> None:
         self.played: Counter[str] = Counter()
         self.unusable: Counter[str] = Counter()
@@ -62,6 +65,7 @@ class Player:
         self._period = 1 / clock if clock else math.inf
         self._next_tick = 0.0 if clock else math.inf
         self._tell = tell
+        self._transforms = transforms
         self._total = sum(count for topic, (_, count) in bag.topics().items() if topic in self._kinds)
 
     @property
@@ -78,14 +82,17 @@ class Player:
         """
         timeline = Timeline(rate)
         kinds, done = self._kinds, 0
-        for topic, message in self._bag.originals(self._topics):
+        for topic, message in self._bag.originals(self._topics, self._transforms):
             try:
-                self._wait(timeline, timeline.due(topic, stamp_of(message.header)))
+                if topic not in self._transforms:
+                    self._wait(timeline, timeline.due(topic, stamp_of(message.header)))
                 if self._stop.is_set():
                     break
                 self._publishers.publish(self._names[topic], message)
             except MISFITS:
                 self.unusable[topic] += 1
+                continue
+            if topic in self._transforms:
                 continue
             done += 1
             self.played[kinds[topic]] += 1

@@ -78,8 +78,10 @@ class Publishers:
             self._node.destroy_node()
         self._ros.try_shutdown()
 
-    def add(self, topic: str, msgtype: str, latched: bool = False) -> None:
+    def add(self, topic: str, msgtype: str, latched: bool = False, depth: int = 0) -> None:
         """Create the publisher of a topic, which keeps this name here even if it is remapped.
+
+        With a `depth` it is reliable, but keeps only so many messages for subscribers that are late.
 
         Raises
         ------
@@ -91,9 +93,11 @@ class Publishers:
 
         quality = QoSProfile(
             # messages without acknowledgement are kept until the history is full; then publishing waits
-            history=HistoryPolicy.KEEP_LAST if latched else HistoryPolicy.KEEP_ALL,
-            depth=1,
-            reliability=ReliabilityPolicy.RELIABLE if self._reliable or latched else ReliabilityPolicy.BEST_EFFORT,
+            history=HistoryPolicy.KEEP_LAST if latched or depth else HistoryPolicy.KEEP_ALL,
+            depth=depth or 1,
+            reliability=(
+                ReliabilityPolicy.RELIABLE if self._reliable or latched or depth else ReliabilityPolicy.BEST_EFFORT
+            ),
             durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
         )
         try:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable
 from functools import lru_cache
 from importlib import import_module
@@ -37,19 +38,22 @@ def filled(message: Any, source: Any) -> Any:
     """Copy every field of `message` from `source`, recursively; return `message`.
 
     Fields that only `source` has, such as ROS 1's `header.seq`, are ignored. Fields must be numbers, text, fixed arrays
-    of numbers, or messages of such.
+    of numbers, messages of such, or lists of messages.
 
     Raises
     ------
     *MISFITS
         If `source` lacks a field, or it has another type.
     """
-    for name in message.get_fields_and_field_types():
+    for name, kind in message.get_fields_and_field_types().items():
         if name in NEWER and not hasattr(source, name):
             continue
         current, value = getattr(message, name), getattr(source, name)
         if hasattr(current, 'get_fields_and_field_types'):
             filled(current, value)
+        elif listed := re.fullmatch(r'sequence<(\w+)/(\w+)>', kind):
+            item = message_class(f'{listed[1]}/msg/{listed[2]}')
+            setattr(message, name, [filled(item(), each) for each in value])
         elif isinstance(current, (bool, int, float, str)):
             # rosbags may decode to numpy's numbers, which rclpy refuses
             setattr(message, name, type(current)(value))

@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM as a request to stop, which ends every wait."""
+"""Ctrl-C, SIGTERM and SIGHUP as a request to stop, which ends every wait."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import time
 from types import FrameType, TracebackType
 from typing import Any
 
-SIGNALS = (signal.SIGINT, signal.SIGTERM)
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 class StopSignal:
@@ -30,7 +30,9 @@ class StopSignal:
         for end in self._pipe:
             os.set_blocking(end, False)
         signal.set_wakeup_fd(self._pipe[1], warn_on_full_buffer=False)
-        self._handlers = {number: signal.signal(number, self._request) for number in SIGNALS}
+        # `nohup` ignores SIGHUP
+        wanted = [number for number in SIGNALS if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN]
+        self._handlers = {number: signal.signal(number, self._request) for number in wanted}
         return self
 
     def __exit__(

@@ -40,7 +40,10 @@ def place(job: Job, number: int, recordings: Recordings) -> dict[str, Any]:
     path, p = Path(recordings.paths[number]), job.parameters
     topics = list(recordings.range_topics) if recordings.range_topics else None
     try:
-        drive = read_drive(path, p, recordings.extrinsics, topics, recordings.odom_topic, None, recordings.part)
+        others = [other for other in recordings.paths if other != recordings.paths[number]]
+        drive = read_drive(
+            path, p, recordings.extrinsics, topics, recordings.odom_topic, None, recordings.part, others=others
+        )
         readings = in_canonical_order(drive.associator.readings)
         grid = map_grid(readings, p)
     except (BagError, InputError) as error:

@@ -198,7 +198,7 @@ def test_lack_of_disk_space_is_not_reported_as_damage(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, full: str
 ) -> None:
     bag = packed_and_split(tmp_path)
-    assert read(bag) == (sample_messages() * 2, None)
+    assert read(bag) == ([message for message in sample_messages() for _ in range(2)], None)
     size = len(zstd.decompress((bag / 'bag_0.mcap.zstd').read_bytes()))
     temporary = tmp_path / 'temporary'
     temporary.mkdir()

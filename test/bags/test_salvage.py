@@ -79,6 +79,8 @@ def test_chunk_with_a_wrong_checksum_is_skipped(tmp_path: Path) -> None:
 class Reader:
     """A reader of rosbags that fails at damage."""
 
+    start_time, end_time = 0, 10
+
     def __init__(self, given: list[RawMessage]) -> None:
         self._given = given
         definition = MessageDefinition(MessageDefinitionFormat.NONE, '')

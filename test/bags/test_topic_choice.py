@@ -58,5 +58,12 @@ def test_bag_without_ranges_or_odometry_is_rejected(tmp_path: Path) -> None:
             bag.choose_topics()
         with pytest.raises(BagError, match=r"no topic 'odom', nor any other nav_msgs"):
             bag.choose_topics(odom_topic='odom')
+        for named in (None, 'odom'):
+            # only commands that take other poses than Odometry take them from a file
+            with pytest.raises(BagError, match=r'`--poses FILE` takes them from a TUM or CSV file'):
+                bag.choose_topics(odom_topic=named, any_poses=True)
+            with pytest.raises(BagError) as caught:
+                bag.choose_topics(odom_topic=named)
+            assert '--poses' not in str(caught.value)
     with Bag(tmp_path / 'c') as bag, pytest.raises(BagError, match='no topics at all'):
         bag.choose_topics()

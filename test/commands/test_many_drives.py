@@ -76,7 +76,7 @@ def names(drives: Drives) -> list[str]:
 
 def test_folder_pattern_and_paths_give_the_same_maps(days: Path, tmp_path: Path) -> None:
     paths = [days / 'day_0', days / 'day_1', days / 'day_2.bag']
-    one = mapped(days, tmp_path / 'a')
+    one = error_of(days, tmp_path / 'a')
     assert [Path(drive['bag']).name for drive in one['drives']] == ['day_0', 'day_1', 'day_2.bag']
     assert one['warnings'] == []
     for folder, words in (('b', [days / 'day_*']), ('c', paths), ('d', [paths[2], days / 'day_[01]'])):
@@ -102,6 +102,46 @@ def test_maps_do_not_depend_on_the_order_of_arguments(days: Path, tmp_path: Path
             np.testing.assert_array_equal(getattr(columns[0], name), getattr(columns[1], name))
 
 
+def test_a_bag_without_static_transforms_uses_those_of_another(days: Path, tmp_path: Path) -> None:
+    without = write_tape(tmp_path / 'without', day(1)._replace(extrinsics=()))
+    expected = read(days / 'day_0', days / 'day_1').readings
+    for order in ([days / 'day_0', without], [without, days / 'day_0'], [days / 'day_0', without, days / 'day_2.bag']):
+        drives = read(*order)
+        assert drives.source['mounts_from'] == f'/tf_static, /tf_static of {days / "day_0"}'
+        (warning,) = (text for text in drives.source['warnings'] if 'tf_static' in text)
+        assert warning.startswith(
+            f'{without}: the bag has no /tf_static, so that of {days / "day_0"} gives the poses of'
+        )
+        if len(order) == 2:
+            for column in ('x', 'y', 'yaw', 'z'):
+                np.testing.assert_array_equal(getattr(drives.readings, column), getattr(expected, column))
+
+
+def test_transforms_of_other_bags_that_differ_are_not_used(tmp_path: Path) -> None:
+    with_it, frame = day(0), day(0).extrinsics[0][0]
+    moved = [(name, pose._replace(x=pose.x + 0.1) if name == frame else pose) for name, pose in with_it.extrinsics]
+    one = write_tape(tmp_path / 'one', with_it)
+    other = write_tape(tmp_path / 'other', day(2)._replace(extrinsics=moved))
+    without = write_tape(tmp_path / 'without', day(1)._replace(extrinsics=()))
+    drives = read(one, without, other)
+    (warning,) = (text for text in drives.source['warnings'] if 'no pose on the robot' in text)
+    assert (
+        f'The other bags have different poses of {frame}, {one} and {other}: are they of different robots?' in warning
+    )
+    assert f'--sensor {frame}=x,y,yaw' in warning
+    # the other sensors of that bag have the same pose in both
+    (mapped_drive,) = (drive for drive in drives.drives if drive.source['bag'] == str(without))
+    assert frame not in mapped_drive.source['extrinsics'] and len(mapped_drive.source['extrinsics']) == len(moved) - 1
+
+
+def test_transforms_of_a_robot_with_other_frames_are_no_help(days: Path, tmp_path: Path) -> None:
+    renamed = day(1)
+    renamed = renamed._replace(extrinsics=(), ranges=[m._replace(frame_id=f'r2/{m.frame_id}') for m in renamed.ranges])
+    without = write_tape(tmp_path / 'without', renamed)
+    with pytest.raises(InputError, match=r'1 of 2 drives cannot be mapped.*\n.*without: no pose on the robot'):
+        read(days / 'day_0', without)
+
+
 def test_simultaneous_drives_have_a_defined_order(tmp_path: Path) -> None:
     paths = [write_tape(tmp_path / f'robot_{number}', day(number, 0)) for number in range(3)]
     orders = [names(read(*order)) for order in itertools.permutations(paths)]
@@ -113,7 +153,7 @@ def test_simultaneous_drives_have_a_defined_order(tmp_path: Path) -> None:
 
 
 def test_map_of_several_drives_is_that_of_all_readings(days: Path, tmp_path: Path) -> None:
-    mapped(days, tmp_path / 'maps')
+    error_of(days, tmp_path / 'maps')
     parts = [read(path).readings for path in sorted(days.iterdir())]
     whole = Readings.from_columns(
         parts[0].sensor_names,
@@ -152,7 +192,7 @@ def test_max_readings_is_the_sum_over_all_drives(days: Path, tmp_path: Path, bou
     assert report['result']['readings'] == bound < report['counts']['accepted']
     (note,) = report['warnings']
     assert note.startswith(f'EM used {bound} of {report["counts"]["accepted"]} readings')
-    whole = mapped(days, tmp_path / 'whole')
+    whole = error_of(days, tmp_path / 'whole')
     assert report['counts'] == whole['counts']
     np.testing.assert_array_equal(arrays_in(tmp_path / 'maps')['live_map'], arrays_in(tmp_path / 'whole')['live_map'])
 
@@ -166,7 +206,7 @@ def mapped_thinned(days: Path, folder: Path, bound: int) -> dict[str, Any]:
 
 
 def test_report_has_counts_of_each_drive(days: Path, tmp_path: Path) -> None:
-    report = mapped(days, tmp_path / 'maps')
+    report = error_of(days, tmp_path / 'maps')
     assert report['counts']['received'] == sum(drive['counts']['received'] for drive in report['drives'])
     for drive in report['drives']:
         sensors = drive['sensors']
@@ -183,7 +223,7 @@ def test_report_has_counts_of_each_drive(days: Path, tmp_path: Path) -> None:
 def test_picture_has_a_path_for_each_drive(days: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pictures = []
     monkeypatch.setattr(drawing, 'draw', lambda path, picture: (pictures.append(picture), path.write_bytes(b'')))
-    mapped(days, tmp_path / 'maps')
+    error_of(days, tmp_path / 'maps')
     paths = paths_of(pictures[0].path_xy)
     assert len(paths) == 3
     for path, bag in zip(paths, sorted(days.iterdir()), strict=True):
@@ -192,7 +232,7 @@ def test_picture_has_a_path_for_each_drive(days: Path, tmp_path: Path, monkeypat
 
 
 def test_bag_of_the_maps_of_several_drives(days: Path, tmp_path: Path) -> None:
-    mapped(days, tmp_path / 'maps', '--bag')
+    error_of(days, tmp_path / 'maps', '--bag')
     assert (tmp_path / 'maps' / 'maps.mcap_bag').is_dir()
 
 
@@ -268,7 +308,7 @@ def test_drives_in_different_map_frames_are_rejected(
     days: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     other = write_tape(tmp_path / 'other', framed(2, 'warehouse'))
-    error = error_of(capsys, tmp_path, days / 'day_0', days / 'day_1', other, '-o', tmp_path / 'maps')
+    error = mapped(capsys, tmp_path, days / 'day_0', days / 'day_1', other, '-o', tmp_path / 'maps')
     assert 'not in the same map frame' in error and f'warehouse: {other}' in error and f'leave out {other}' in error
 
 
@@ -347,7 +387,7 @@ def test_all_drives_that_cannot_be_mapped_are_named(
 ) -> None:
     absent = tmp_path / 'absent'
     silent = write_tape(tmp_path / 'silent', day(2)._replace(ranges=[]))
-    error = error_of(capsys, tmp_path, days / 'day_0', absent, silent, '-o', tmp_path / 'maps')
+    error = mapped(capsys, tmp_path, days / 'day_0', absent, silent, '-o', tmp_path / 'maps')
     assert error.startswith('2 of 3 drives cannot be mapped; leave them out')
     assert f'{absent} does not exist' in error and f'{silent}: The bag has no sensor_msgs/Range' in error
 
@@ -363,7 +403,7 @@ def test_error_lines_of_one_drive_are_indented() -> None:
 
 
 def test_pattern_without_match_is_rejected(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    error = error_of(capsys, tmp_path, f'{tmp_path}/monday_*', '-o', tmp_path / 'maps')
+    error = mapped(capsys, tmp_path, f'{tmp_path}/monday_*', '-o', tmp_path / 'maps')
     assert f'no file or folder matches {tmp_path}/monday_*' in error
 
 
@@ -374,7 +414,7 @@ def test_files_of_a_split_bag_without_metadata_are_rejected(
     folder.mkdir()
     for number in range(2):
         shutil.copy(next((days / 'day_0').glob('*.mcap')), folder / f'split_{number}.mcap')
-    error = error_of(capsys, tmp_path, folder, '-o', tmp_path / 'maps')
+    error = mapped(capsys, tmp_path, folder, '-o', tmp_path / 'maps')
     assert 'ros2 bag reindex' in error
 
 
@@ -406,17 +446,17 @@ def test_parts_of_a_drive_add_up_to_the_whole(days: Path) -> None:
 
 
 def test_part_is_taken_of_each_drive(days: Path, tmp_path: Path) -> None:
-    report = mapped(days, tmp_path / 'maps', '--start', 2, '--duration', 3)
+    report = error_of(days, tmp_path / 'maps', '--start', 2, '--duration', 3)
     for drive in report['drives']:
         assert 2.0 < drive['duration_s'] <= 3.0
-    one = mapped(days / 'day_1', tmp_path / 'one', '--start', 2, '--duration', 3)
+    one = error_of(days / 'day_1', tmp_path / 'one', '--start', 2, '--duration', 3)
     assert one['counts']['accepted'] == report['drives'][1]['counts']['accepted'] < len(day(1).ranges)
 
 
 def test_part_after_the_end_of_the_drive_is_rejected(
     days: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    error = error_of(capsys, tmp_path, days / 'day_0', '-o', tmp_path / 'maps', '--start', 900)
+    error = mapped(capsys, tmp_path, days / 'day_0', '-o', tmp_path / 'maps', '--start', 900)
     assert 'has no reading in the part --start 900; its messages span' in error
 
 

@@ -19,10 +19,10 @@ def test_second_warm_up_compiles_nothing() -> None:
         done = subprocess.run(COMMAND, capture_output=True, text=True, check=True, env=dict(os.environ), timeout=600)
     assert 'nothing to compile' in done.stdout
     assert [line.split(' …')[0] for line in done.stdout.splitlines()[:4]] == [
-        'kernels of the live map',
-        'kernels of the online map',
-        'kernels of the EM',
-        'kernels of the trajectory',
+        'live map kernels',
+        'online map kernels',
+        'EM kernels',
+        'trajectory kernels',
     ]
 
 

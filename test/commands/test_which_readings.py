@@ -36,6 +36,19 @@ def test_bag_and_one_of_its_files_are_read_as_the_bag(tmp_path: Path) -> None:
         assert sum('it is read once' in warning for warning in drives.source['warnings']) == len(words) - 1
 
 
+def test_a_topic_and_its_filtered_copy_are_named_with_the_option_to_choose(tmp_path: Path) -> None:
+    drive = tape()
+    filtered = [m._replace(range=m.range + 0.01) if math.isfinite(m.range) else m._replace() for m in drive.ranges]
+    copies = {id(message) for message in filtered}
+    both = drive._replace(ranges=[*drive.ranges, *filtered])
+    path = write_tape(tmp_path / 'bag', both, sonar_topic=lambda m: '/sonar_filtered' if id(m) in copies else '/sonar')
+    (warning,) = (text for text in read(path).source['warnings'] if 'counts twice' in text)
+    assert warning.startswith('/sonar and /sonar_filtered contain the same readings (frame ')
+    assert warning.endswith('is /sonar_filtered a filtered copy? To use one of them, add `--range-topics /sonar`')
+    drives = read(path, range_topics=['/sonar'])
+    assert len(drives.readings) == len(drive.ranges) and not drives.source['warnings']
+
+
 @pytest.mark.parametrize('first', [1_700_000_000_123_456_789, 1_700_000_000_123_456_790 + 100])
 def test_bounds_of_a_part_are_exact_to_the_nanosecond(first: int) -> None:
     assert Part(0.0, 60.0).bounds(first) == (first, first + 60 * NANOSECONDS)

@@ -21,7 +21,7 @@ from patience import PATIENCE, line_of
 
 from forward_grid_mapper.core.common.errors import BagError
 from forward_grid_mapper.files.journal import drive_file
-from forward_grid_mapper.files.journal_format import ROW
+from forward_grid_mapper.files.journal_format import ROW, Contents
 from forward_grid_mapper.files.journal_reader import log_of
 
 FORGE = 'import sqlite3, sys; d = sqlite3.connect(sys.argv[1]); d.execute(sys.argv[2]); d.commit(); d.close()'
@@ -194,6 +194,14 @@ def test_forged_values_are_skipped_or_reported(path: Path, sql: str, message: st
     assert message in result['error'] + result['harm'] or 'too big' in result['error'] + result['harm']
     assert bool(result['error'] + result['harm']) == bool(message)
     assert result['count'] == count
+
+
+@pytest.mark.parametrize('value', ['1' + 400 * '0', '-1' + 400 * '0', '1e999', 'NaN', '"0.5"', '[0.5]', 'null'])
+def test_a_parameter_that_cannot_be_used_does_not_hide_the_others(value: str) -> None:
+    contents = Contents()
+    contents.set_parameters(f'{{"p_hit": {value}, "max_iterations": {value}, "p_rand": 0.25}}'.encode())
+    assert contents.parameters == {'p_rand': 0.25}
+    assert not contents.harm
 
 
 PAGE = 4096

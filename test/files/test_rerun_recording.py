@@ -8,6 +8,7 @@ import sys
 from functools import cache
 from pathlib import Path
 from typing import Any
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
@@ -117,6 +118,46 @@ def test_maps_far_from_the_origin_are_exact(tmp_path: Path) -> None:
     mine = maps.readings.select(maps.readings.sensor == 0)
     places = [strip[0][0][:2] for strip in column(found[f'/sonar/{name}'], 'strips')]
     np.testing.assert_allclose(places + home, np.stack([mine.x, mine.y], 1), atol=1e-4)
+
+
+def coordinates(folder: Path, monkeypatch: pytest.MonkeyPatch, shift: Any) -> dict[str, Any]:
+    """What a stand-in for Rerun receives of a short drive that is moved by `shift`: x and y, by kind."""
+    rr = MagicMock()
+    rr.RecordingStream.return_value.binary_stream.return_value.read.return_value = b'recording'
+    monkeypatch.setitem(sys.modules, 'rerun', rr)
+    monkeypatch.setitem(sys.modules, 'rerun.blueprint', rr.blueprint)
+    # on maps that differ by rounding, a few readings have other causes
+    monkeypatch.setattr(rerun_recording, 'likeliest_causes', lambda maps: np.zeros(len(maps.readings), np.uint8))
+    near = corridor_drive(0).readings.select(slice(0, 1200))
+    maps = Mapper(Parameters()).run(dataclasses.replace(near, x=near.x + shift[0], y=near.y + shift[1]))
+    write_rerun(folder / 'drive.rrd', maps, 'the report', 'a drive', PATH + shift, PATH + shift + 0.25)
+    (eye,) = rr.blueprint.EyeControls3D.call_args_list
+    path, odometry = (np.concatenate(call.args[0])[:, :2] for call in rr.LineStrips3D.call_args_list)
+    found = {
+        'origin': np.array(maps.grid.origin),
+        'maps': np.array([call.kwargs['translation'][:2] for call in rr.GridMap.call_args_list]),
+        'path': path,
+        'odometry': odometry,
+        'cones': np.array(rr.LineStrips3D.columns.call_args_list[0].kwargs['strips'])[..., :2],
+        'dots': np.array(rr.Points3D.columns.call_args_list[0].kwargs['positions'])[..., :2],
+        'view from': np.array(eye.kwargs['position'][:2]),
+        'view to': np.array(eye.kwargs['look_target'][:2]),
+    }
+    found['report'] = rr.TextDocument.call_args.args[0]
+    return found
+
+
+def test_all_coordinates_far_from_the_origin_are_relative_to_the_same_place(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shift = np.array([500_000.0, 5_200_000.0])
+    near, far = (coordinates(tmp_path, monkeypatch, offset) for offset in (np.zeros(2), shift))
+    assert near.pop('report') == 'the report'
+    home = np.round(far['origin'])
+    assert far.pop('report').startswith(f'Coordinates are relative to x = {home[0]:.0f} m, y = {home[1]:.0f} m')
+    np.testing.assert_allclose(near.pop('origin'), far.pop('origin') - shift, atol=1e-6)
+    for kind, expected in near.items():
+        np.testing.assert_allclose(far[kind], expected + shift - home, atol=1e-3, err_msg=kind)
 
 
 def test_size_of_the_recording_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -8,10 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from forward_grid_mapper.core.common.readings import Readings
+from forward_grid_mapper.core.trajectory.certainty import Estimate
+from forward_grid_mapper.core.trajectory.outcome import Refinement
 from forward_grid_mapper.core.trajectory.windows import Odometry
 from forward_grid_mapper.files.pose_files import poses_from_tum
 from forward_grid_mapper.files.report_text import report_text
-from forward_grid_mapper.files.trajectory_text import calibration_words, tum_text
+from forward_grid_mapper.files.trajectory_text import calibration_words, trajectory_data, tum_text
 
 
 def test_tum_lines_hold_stamp_position_and_quaternion() -> None:
@@ -40,6 +43,15 @@ def test_calibration_in_words() -> None:
     assert '1.0° to the right of' in calibration_words({'heading': -math.radians(1.0)})
 
 
+def test_the_report_has_the_calibration_with_its_accuracy() -> None:
+    path = Odometry(np.array([0, 10**9]), np.zeros((2, 3)))
+    nothing = Readings.from_columns(x=[], y=[], yaw=[], z=[], z_max=[], half_angle=[])
+    outcome = Refinement(True, 'readings are predicted better', nothing, path, {'scale': 0.01})
+    data = trajectory_data(outcome, estimates={'scale': Estimate(0.01, 0.002)})
+    assert data['calibration_estimates'] == {'scale': {'value': 0.01, 'sigma': 0.002}}
+    assert 'measure a straight line' in ' '.join(report_text({'input': {'trajectory': data}}).split())
+
+
 def test_report_states_whether_the_trajectory_was_refined() -> None:
     refined = {
         'refined': True,
@@ -53,8 +65,10 @@ def test_report_states_whether_the_trajectory_was_refined() -> None:
     assert 'off by 5.43 m and 16.0°' in text
     assert '1 place recognised' in text
     assert 'Wheels' in text and 'measure a straight line and a full turn' in ' '.join(text.split())
-    refined |= {'told': {}, 'odometry': 'the drive does not show whether distances are measured too long'}
-    assert 'measure before' not in report_text({'input': {'trajectory': refined}})
+    unknown = 'the drive does not show whether distances are measured too long'
+    refined |= {'calibration_estimates': {}, 'odometry': unknown}
+    text = ' '.join(report_text({'input': {'trajectory': refined}}).split())
+    assert unknown in text and 'measure a straight line' not in text
     left = report_text({'input': {'trajectory': {'refined': False, 'reason': 'the drive is short'}}})
     assert "odometry's, not refined: the drive is short" in left
     assert 'Wheels' not in left

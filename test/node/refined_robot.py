@@ -44,7 +44,7 @@ def refined(robot: Inside, *, count: int = 200) -> tuple[Inside, Odometry]:
 
 def live_of(robot: Inside) -> tuple[Any, np.ndarray]:
     """The live map of all readings received by the node."""
-    robot.node._feed()
+    robot.node.feed.feed()
     snapshot = robot.node.live.snapshot()
     return snapshot.grid, snapshot.probability
 

@@ -11,6 +11,7 @@ import pytest
 pytest.importorskip('rclpy', reason='the intake takes messages of ROS')
 
 from rclpy.qos import ReliabilityPolicy
+from sensor_msgs.msg import Range
 from stand_ins import Taking
 
 from forward_grid_mapper.node import intake as module
@@ -174,6 +175,25 @@ def test_topics_are_subscribed_once_and_unsubscribed() -> None:
     robot.range(101.0, number=500)
     robot.range(101.0, number=500, topic=1)
     assert intake.lost == 0
+
+
+def test_topics_with_the_same_readings_are_named_until_it_forgets() -> None:
+    robot = Taking(range_topics=('front', 'front_filtered'))
+    robot.intake.subscribe()
+    for k in range(40):
+        for topic in ('front', 'front_filtered'):
+            made = Range(min_range=0.1, max_range=5.0, field_of_view=0.3, range=1.0 + 0.01 * k)
+            made.header.frame_id, made.header.stamp.sec = 'sonar', 100 + k
+            receive, _ = robot.node.subscribed[topic]
+            receive(made, {'source_timestamp': k, 'publication_sequence_number': k + 1})
+    assert robot.intake.received == 80
+    (text,) = robot.intake.repeated()
+    assert text.startswith('front and front_filtered contain the same readings') and text.endswith(
+        'range_topics to front'
+    )
+    assert text in robot.intake.faults() and robot.node.warned == [text]
+    robot.intake.forget()
+    assert robot.intake.repeated() == []
 
 
 @pytest.mark.parametrize(

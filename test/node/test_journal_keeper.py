@@ -45,6 +45,7 @@ class KeptJournal:
         self.node = Node(parameters)
         self.associator = PoseAssociator(lambda base, frame, stamp: SONAR, parameters)
         self.keeper = JournalKeeper(self.node, str(folder), self.associator)  # type: ignore[arg-type]
+        self.keeper.open()
 
     def start(self) -> KeptJournal:
         self.keeper.restore()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import itertools
 import re
 import subprocess
 import sys
@@ -27,6 +28,7 @@ from inside import Answer, Inside
 from lifecycle_msgs.msg import State, Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 from nav_msgs.msg import Odometry
+from rclpy._rclpy_pybind11 import RCLError
 from rclpy.lifecycle.node import TransitionCallbackReturn
 from rclpy.parameter import Parameter
 from robot import LATCHED, MAPS, Robot, environment
@@ -37,7 +39,7 @@ from test_mapper_node import RELIABLE
 
 from forward_grid_mapper.core.common.errors import MapperError
 from forward_grid_mapper.core.common.parameters import find
-from forward_grid_mapper.node import mapper_node
+from forward_grid_mapper.node import managed, mapper_node
 from forward_grid_mapper.node.intake import Intake
 from forward_grid_mapper.node.kernels import Kernels
 
@@ -114,7 +116,7 @@ def test_manager_starts_pauses_and_ends_the_node(start: Any, robot: Robot, manag
     robot.until(lambda: {f'/forward_grid_mapper/{name}' for name in MAPS} <= published(robot))
     robot.until(lambda: robot.diagnostics.get('readings', {}).get('message') == 'inactive: nothing is received')
     assert robot.range_out.get_subscription_count() == 0
-    node.wait_for('kernels of the EM are ready')
+    node.wait_for('EM kernels are ready')
     node.wait_for('ready: the live map is updated with the readings; activate the node to receive them')
     assert 'no Range message has been received on /sonar' in robot.call('run_em').message
     assert manager.change(Transition.TRANSITION_ACTIVATE)
@@ -389,6 +391,33 @@ def test_failed_configuration_releases_the_journal(
         patched.setattr(mapper_node, 'MapPublishers', refused)
         assert node.trigger_configure() == TransitionCallbackReturn.FAILURE
     assert node.trigger_configure() == TransitionCallbackReturn.SUCCESS
+
+
+def test_a_configuration_that_rcl_refuses_leaves_nothing(
+    inside: Callable[..., Inside], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    node = inside(journal=str(tmp_path / 'journal'), online=True, refine_poses=True).node
+    others, made = {*threading.enumerate()}, itertools.count()
+
+    def limited(create: Callable[..., Any], most: int) -> Callable[..., Any]:
+        def instead(*arguments: Any, **options: Any) -> Any:
+            if next(made) == most:
+                raise RCLError('no more memory')
+            return create(*arguments, **options)
+
+        return instead
+
+    for most in range(40):
+        made = itertools.count()
+        with monkeypatch.context() as patched:
+            for name in ('create_publisher', 'create_service', 'create_timer', 'create_guard_condition'):
+                patched.setattr(managed.Base, name, limited(getattr(managed.Base, name), most))
+            result = node.trigger_configure()
+        if result == TransitionCallbackReturn.SUCCESS:
+            break
+        assert {*threading.enumerate()} <= others
+        assert not node._created
+    assert result == TransitionCallbackReturn.SUCCESS and most > 15
 
 
 def test_clean_up_while_the_journal_is_read_leaves_no_parts(inside: Callable[..., Inside]) -> None:

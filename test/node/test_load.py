@@ -88,7 +88,7 @@ def test_first_start_loses_no_messages_and_shows_the_live_map_first(start: Any, 
     robot.until(lambda: robot.maps['live_map'], 240.0, 'a live map')
     assert not em.done()
     node.wait_for('ready:')
-    order = ('listening:', 'kernels of the live map are ready', 'kernels of the EM are ready')
+    order = ('listening:', 'live map kernels are ready', 'EM kernels are ready')
     node.wait_for(order[-1])
     assert sorted(order, key=node.output.index) == list(order), 'it listens before its kernels are compiled'
     answer = robot.until(em.result, 240.0, 'EM answers')

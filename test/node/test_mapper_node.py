@@ -364,11 +364,25 @@ def test_maps_have_stamps_of_simulated_time(start: Any, robot: Robot) -> None:
     assert robot.get_map('ml_map').header.stamp.sec == 42
 
 
-@pytest.mark.parametrize(('number', 'times'), [(signal.SIGINT, 1), (signal.SIGINT, 2), (signal.SIGTERM, 1)])
+@pytest.mark.parametrize(
+    ('number', 'times'), [(signal.SIGINT, 1), (signal.SIGINT, 2), (signal.SIGTERM, 1), (signal.SIGHUP, 1)]
+)
 def test_signals_end_the_node_normally(start: Any, number: signal.Signals, times: int) -> None:
     node = start()
     assert node.stop(number, times) == 0
     assert 'Traceback' not in node.output
+
+
+def test_a_node_under_nohup_survives_its_terminal(start: Any) -> None:
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        node = start()
+    finally:
+        signal.signal(signal.SIGHUP, before)
+    node.process.send_signal(signal.SIGHUP)
+    time.sleep(0.5)
+    assert node.process.poll() is None
+    assert node.stop() == 0
 
 
 def test_signal_during_compilation_ends_the_node(start: Any, tmp_path: Path) -> None:

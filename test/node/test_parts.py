@@ -427,7 +427,7 @@ def test_late_map_from_before_a_reset_is_dropped(inside: Callable[..., Inside]) 
     robot.drive(0, 5)
     snapshot = node.live.snapshot()
     assert robot.call(node.reset)[0]
-    node._show_live(snapshot)
+    node.feed.show_live(snapshot)
     node.maps.publish('ml_map', 0, snapshot.grid, np.zeros(snapshot.grid.shape, np.int8))
     node.maps.worker.ask(lambda: None)
     assert [message.info.width for message in node.maps.latest.values()] == [1, 1, 1]
@@ -514,7 +514,7 @@ def test_buffer_of_the_node_is_thinned_in_the_background(inside: Callable[..., I
     lone = inside(max_readings=0).start()
     lone.drive(0, 400)
     everything.add(lone.node.associator.readings)
-    node._feed()
+    node.feed.feed()
     found = node.live.snapshot()
     assert found.grid == everything.grid
     assert np.array_equal(found.probability, everything.probability(), equal_nan=True)

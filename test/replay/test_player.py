@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -30,10 +30,13 @@ class FakeBag:
     def topics(self) -> dict[str, tuple[str, int]]:
         return {'sonar': (RANGE, 9), 'odom': (ODOMETRY, 9), 'other': (RANGE, 9)}
 
-    def originals(self, topics: Topics) -> Iterator[tuple[str, Any]]:
+    def originals(self, topics: Topics, transforms: Collection[str]) -> Iterator[tuple[str, Any]]:
         assert topics == TOPICS
         for topic, stamp in self._stamps:
-            if stamp is None:
+            if topic in transforms:
+                # each of its transforms has a stamp, the message has none
+                yield topic, SimpleNamespace(transforms=stamp)
+            elif stamp is None:
                 yield topic, SimpleNamespace()
             else:
                 time = SimpleNamespace(sec=stamp // NANOSECONDS, nanosec=stamp % NANOSECONDS)
@@ -48,6 +51,9 @@ class Log:
         self._stop_after = stop_after
 
     def publish(self, topic: str, source: Any) -> None:
+        if hasattr(source, 'transforms'):
+            self.published.append((topic, source.transforms))
+            return
         self.published.append((topic, source.header.stamp.sec * NANOSECONDS + source.header.stamp.nanosec))
 
     def publish_clock(self, topic: str, stamp: int) -> None:
@@ -72,6 +78,26 @@ def test_messages_are_counted_and_published_on_renamed_topics() -> None:
     made.play(1.0, 'replaying')
     assert log.published == [('/odom', START), ('/sonar', START + 5), ('/odom', START + 9)]
     assert made.played == {RANGE: 1, ODOMETRY: 2}
+
+
+def test_transforms_go_out_between_the_messages_around_them() -> None:
+    log = Log()
+    # that of a broadcaster whose stamps are an hour ahead
+    later = START + 3600 * NANOSECONDS
+    bag: Any = FakeBag(
+        ('tf', START), ('odom', START), ('tf', later), ('sonar', START + NANOSECONDS // 10), ('tf', later)
+    )
+    doubles: Any = log
+    made = Player(bag, TOPICS, {**NAMES, 'tf': '/tf'}, doubles, doubles, None, lambda text: None, ['tf'])
+    made.play(1.0, 'replaying')
+    assert log.published == [
+        ('/tf', START),
+        ('/odom', START),
+        ('/tf', later),
+        ('/sonar', START + NANOSECONDS // 10),
+        ('/tf', later),
+    ]
+    assert made.played == {RANGE: 1, ODOMETRY: 1} and not made.jumps
 
 
 def test_message_of_another_definition_is_skipped() -> None:

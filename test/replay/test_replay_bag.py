@@ -143,7 +143,7 @@ def test_topics_can_be_remapped(dds: Wire, tmp_path: Path) -> None:
     assert listener.plain == messages_in(bag)
 
 
-@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_second_signal_ends_the_replay_normally(dds: Wire, tmp_path: Path, number: signal.Signals) -> None:
     listener = dds.listen()
     replay = dds.replay(write_bag(tmp_path), '--loop')

@@ -7,14 +7,17 @@ import sys
 import threading
 import time
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, ClassVar
 
 import pytest
 from replay_samples import ODOMETRY, RANGE, START, write_bag
 
 from forward_grid_mapper.bags.writer import BagWriter
 from forward_grid_mapper.commands import replay_bag
-from forward_grid_mapper.core.common.errors import ParameterError
+from forward_grid_mapper.core.common.errors import MapperError, ParameterError
 from forward_grid_mapper.core.messages.message_types import OdometryMessage, Pose2, RangeMessage
+from forward_grid_mapper.replay import publishers as publishing
 from forward_grid_mapper.replay.publishers import renamed
 from forward_grid_mapper.replay.stop_signal import StopSignal
 
@@ -103,21 +106,34 @@ def test_ros_arguments_are_split_as_in_ros() -> None:
     assert ros == ['--ros-args', '-r', 'a:=b', '--', '--ros-args', '--log-level', 'debug']
 
 
-def test_signal_ends_a_wait_at_once_and_a_second_one_has_no_effect() -> None:
-    before = signal.getsignal(signal.SIGTERM)
+@pytest.mark.parametrize('number', [signal.SIGTERM, signal.SIGHUP])
+def test_signal_ends_a_wait_at_once_and_a_second_one_has_no_effect(number: signal.Signals) -> None:
+    before = {each: signal.getsignal(each) for each in (signal.SIGTERM, signal.SIGHUP)}
     try:
         with StopSignal() as stop:
             assert not stop.wait(0.01)
-            threading.Timer(0.1, signal.raise_signal, [signal.SIGTERM]).start()
+            threading.Timer(0.1, signal.raise_signal, [number]).start()
             begin = time.monotonic()
             assert stop.wait(20.0)
             assert time.monotonic() - begin < 5.0
             signal.raise_signal(signal.SIGINT)
             assert stop.is_set()
-        signal.raise_signal(signal.SIGTERM)
+        signal.raise_signal(number)
     finally:
-        signal.signal(signal.SIGTERM, before)
+        for each, handler in before.items():
+            signal.signal(each, handler)
         signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def test_a_replay_under_nohup_survives_its_terminal() -> None:
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        with StopSignal() as stop:
+            signal.raise_signal(signal.SIGHUP)
+            assert not stop.wait(0.1)
+        assert signal.getsignal(signal.SIGHUP) == signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGHUP, before)
 
 
 def test_signal_handlers_are_restored() -> None:
@@ -126,3 +142,92 @@ def test_signal_handlers_are_restored() -> None:
         assert signal.getsignal(signal.SIGINT) != before
         assert not stop.is_set()
     assert signal.getsignal(signal.SIGINT) == before
+
+
+class Publishers:
+    """Records what the command publishes, without ROS."""
+
+    added: ClassVar[dict[str, tuple[str, bool, int]]] = {}
+    published: ClassVar[list[tuple[str, Any]]] = []
+
+    def __init__(self, *arguments: Any) -> None:
+        self.added.clear()
+        self.published.clear()
+
+    def __enter__(self) -> Publishers:
+        return self
+
+    def __exit__(self, *arguments: object) -> None:
+        pass
+
+    def add(self, topic: str, msgtype: str, latched: bool = False, depth: int = 0) -> None:
+        self.added[topic] = msgtype, latched, depth
+
+    def publish(self, topic: str, source: Any) -> None:
+        self.published.append((topic, source))
+
+    def finish(self) -> None:
+        pass
+
+
+class TransformWriter(BagWriter):
+    """Writes transforms to any topic."""
+
+    def write_transform(self, topic: str, child: str, pose: Pose2, stamp: int) -> None:
+        posed, kind = self._pose(pose), 'geometry_msgs/msg/TransformStamped'
+        offset = self._make('geometry_msgs/msg/Vector3', x=pose.x, y=pose.y, z=0.0)
+        transform = self._make('geometry_msgs/msg/Transform', translation=offset, rotation=posed.orientation)
+        item = self._make(
+            kind, header=self._header(topic, stamp, 'base_link'), child_frame_id=child, transform=transform
+        )
+        self._write(topic, 'tf2_msgs/msg/TFMessage', self._make('tf2_msgs/msg/TFMessage', transforms=[item]), stamp)
+
+
+def with_joint(folder: Path) -> Path:
+    """A bag of a sensor on a joint, whose transform is on /tf."""
+    with TransformWriter(folder / 'bag') as writer:
+        for k in range(4):
+            stamp = START + k * 1_000_000
+            writer.write_odometry('/odom', OdometryMessage(stamp, 'odom', 'base_link', Pose2(0.0, 0.0, 0.0)))
+            writer.write_transform('/tf', 'servo', Pose2(0.1, 0.0, 0.1 * k), stamp + 1)
+            writer.write_range('/sonar', RangeMessage(stamp + 2, 'servo', 1.0, 0.125, 5.0, 0.25))
+    return folder / 'bag'
+
+
+def test_moving_transforms_are_replayed_between_the_readings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(replay_bag, 'Publishers', Publishers)
+    monkeypatch.setattr(replay_bag, 'message_class', lambda msgtype: object)
+    options = ['--wait', '0', '-q', '--best-effort', '--remap', '/tf:=/robot/tf']
+    assert replay_bag.main([str(with_joint(tmp_path)), *options]) == 0
+    assert Publishers.added['/robot/tf'] == ('tf2_msgs/msg/TFMessage', False, replay_bag.TF_DEPTH)
+    assert [topic for topic, _ in Publishers.published] == ['/odom', '/robot/tf', '/sonar'] * 4
+    assert [m.transforms[0].child_frame_id for topic, m in Publishers.published if topic == '/robot/tf'] == [
+        'servo'
+    ] * 4
+
+
+def test_transforms_are_reliable_and_wait_for_nobody() -> None:
+    qos = pytest.importorskip('rclpy.qos', reason='rclpy is not installed')
+    made: list[Any] = []
+    publishers: Any = publishing.Publishers([], False, StopSignal())
+    publishers._node = SimpleNamespace(create_publisher=lambda kind, topic, quality: made.append(quality))
+    publishers.add('/tf', 'geometry_msgs/msg/TransformStamped', depth=100)
+    (quality,) = made
+    assert (quality.reliability, quality.durability) == (qos.ReliabilityPolicy.RELIABLE, qos.DurabilityPolicy.VOLATILE)
+    assert (quality.history, quality.depth) == (qos.HistoryPolicy.KEEP_LAST, 100)
+
+
+def test_without_tf2_a_warning_says_that_moving_transforms_are_missing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def missing(msgtype: str) -> type:
+        raise MapperError('No module named tf2_msgs')
+
+    monkeypatch.setattr(replay_bag, 'Publishers', Publishers)
+    monkeypatch.setattr(replay_bag, 'message_class', missing)
+    bag = str(with_joint(tmp_path))
+    assert replay_bag.main([bag, '--wait', '0']) == 0
+    assert '/tf is not replayed (No module named tf2_msgs)' in capsys.readouterr().err
+    assert [topic for topic, _ in Publishers.published] == ['/odom', '/sonar'] * 4
+    assert replay_bag.main([bag, '--wait', '0', '-q']) == 0
+    assert not capsys.readouterr().err

@@ -107,6 +107,20 @@ def test_last_transform_of_a_frame_is_used(maker: Maker) -> None:
     assert all(item.header.frame_id == 'base_link' and item.transform.translation.z == 0.5 for item in made)
 
 
+def test_lists_of_messages_are_copied(maker: Maker) -> None:
+    def pose(x: float) -> Any:
+        turn = maker.vector('Quaternion', x=0.0, y=0.0, z=0.0, w=1.0)
+        placed = maker.make(
+            'geometry_msgs/msg/Pose', position=maker.vector('Point', x=x, y=0.0, z=0.0), orientation=turn
+        )
+        return maker.make('geometry_msgs/msg/PoseStamped', header=maker.header('map'), pose=placed)
+
+    path = maker.make('nav_msgs/msg/Path', header=maker.header('map'), poses=[pose(1.0), pose(2.5)])
+    made = filled(message_class('nav_msgs/msg/Path')(), path)
+    assert [pose.pose.position.x for pose in made.poses] == [1.0, 2.5]
+    assert all(type(pose) is message_class('geometry_msgs/msg/PoseStamped') for pose in made.poses)
+
+
 def test_other_message_definition_is_rejected() -> None:
     class Other:
         range = 'far'

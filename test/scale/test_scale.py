@@ -544,6 +544,17 @@ def test_drives_that_cannot_be_mapped_are_named(drives: Path, tmp_path: Path) ->
 
 
 @scaled
+def test_a_bag_without_static_transforms_uses_those_of_another(drives: Path, tmp_path: Path) -> None:
+    from forward_grid_mapper.scale.placing import place
+
+    drive = dataclasses.replace(campus_drive(3, 1, 900, sonars=front_array()), extrinsics=())
+    write_bag(tmp_path / 'without', drive, 'mcap', False)
+    paths = (str(drives / 'drive_0'), str(tmp_path / 'without'))
+    placed = place(job_in(tmp_path / 'work'), 1, Recordings(paths, {}, None, None, WHOLE))
+    assert placed['source']['mounts_from'] == f'/tf_static of {paths[0]}'
+
+
+@scaled
 def test_copy_of_a_drive_is_left_out(drives: Path, one_process: Path, tmp_path: Path) -> None:
     copies = tmp_path / 'copies'
     shutil.copytree(drives, copies)

@@ -120,6 +120,7 @@ SCENARIOS: dict[str, tuple[Callable[[Messages], Messages], str]] = {
     ),
     'ranges a second late': (lambda m: m.late(1.0), r'readings seem to be about 1 s late against those of odometry'),
     'odometry half a second late': (lambda m: m.late(-0.5), r'readings seem to be about 0\.5 s early'),
+    'odometry 0.8 s late': (lambda m: m.late(-0.8), r'readings seem to be about 0\.75 s early against those of'),
     'odometry a second late': (
         lambda m: m.late(-1.0),
         r'seem to be about 1 s early against those of',
@@ -128,6 +129,7 @@ SCENARIOS: dict[str, tuple[Callable[[Messages], Messages], str]] = {
         lambda m: m.wide(4.0),
         r'field of view is stated as 60 degrees.*fit about 15 degrees;.*set the parameter field_of_view',
     ),
+    'cones of 87 degrees for 15': (lambda m: m.wide(1.5 / 0.26), r'is stated as 87 degrees.*fit about 14 degrees;'),
     'half of the field of view': (lambda m: m.wide(0.5), r'field of view is stated as 7 degrees.*fit about 15'),
     'odometry in feet': (
         lambda m: m.driven(lambda p: Pose2(3.281 * p.x, 3.281 * p.y, p.yaw)),
@@ -237,6 +239,17 @@ def test_real_recordings_give_no_warning(shared: Path, name: str, odometry: str)
     found = read_drive(bag, Parameters(), {}, None, odometry)
     assert len(found.source['extrinsics']) >= 8
     assert consistency_warnings(found.associator.readings, found.source['extrinsics']) == []
+
+
+@pytest.mark.slow
+def test_wide_cones_are_named_on_a_recording_whose_odometry_drifts(shared: Path) -> None:
+    from forward_grid_mapper.recordings.read_drive import read_drive
+
+    found = read_drive(shared / 'data' / 'building_b' / 'bag', Parameters(), {}, None, '/odom')
+    readings = found.associator.readings
+    wide = dataclasses.replace(readings, half_angle=np.full(len(readings), 0.75))
+    (warning,) = consistency_warnings(wide, found.source['extrinsics'])
+    assert re.search(r'the field of view is stated as 86 degrees, but the readings fit about (21|43) degrees', warning)
 
 
 def test_few_readings_or_unknown_sensors_give_no_warning() -> None:

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from forward_grid_mapper.core.common.parameters import Parameters
+from forward_grid_mapper.core.common.readings import Readings
 from forward_grid_mapper.core.learning.input_warnings import input_warnings
 from forward_grid_mapper.core.messages.message_types import OdometryMessage, Pose2, RangeMessage
 from forward_grid_mapper.simulation.drive import building_drive, corridor_drive, door_drive
@@ -246,6 +247,25 @@ def test_simulated_worlds_give_no_warning(noise: object, sonars: Callable[[], So
         ):
             # ten poses a second
             assert warnings_of(Messages(dict(recording.extrinsics), recording.odometry[::5], recording.ranges)) == []
+
+
+def test_few_readings_may_have_a_period_at_random() -> None:
+    def alternating(count: int) -> bool:
+        k = np.arange(count)
+        ranges = Readings.from_columns(
+            ('sonar',),
+            x=0.05 * k,
+            y=0.0,
+            yaw=0.0,
+            z=1.0 + k % 3,
+            z_max=5.0,
+            half_angle=0.13,
+            stamp=k * 10**8 + 7 * 10**6,
+        )
+        return any('alternate like' in text for text in input_warnings(ranges))
+
+    assert not alternating(100)
+    assert alternating(101)
 
 
 @pytest.mark.parametrize('odometry', ['/odom', '/odom_corrected'])

@@ -126,6 +126,35 @@ def test_doubtful_step_longer_than_the_examined_path_is_no_jump(bent: tuple[Read
     assert found.tolist() == jumped_to.tolist() == []
 
 
+def test_a_doubtful_step_is_judged_by_the_readings_up_to_the_next_jump(monkeypatch: pytest.MonkeyPatch) -> None:
+    judged: list[tuple[int, int]] = []
+
+    class Check:
+        """Records the poses of the part after the step, and finds that it does not fit."""
+
+        def __init__(self, part: jumping.Part, parameters: Parameters, stop: np.ndarray) -> None:
+            judged.append((len(part.odometry.stamp), len(part.readings)))
+
+        def fits(self, around: object, begin: np.ndarray, least: float) -> bool:
+            return False
+
+    monkeypatch.setattr(jumping, '_FitCheck', Check)
+    monkeypatch.setattr(jumping, 'OnMap', lambda *arguments: None)
+    # 0.01 m and 0.1 s between two poses; a turn that is too fast at 200, and jumps at 350 and 500
+    pose = np.zeros((700, 3))
+    pose[:, 0] = 0.01 * np.arange(700)
+    pose[200:, 2] += 1.0
+    pose[350:, 1] += 2.0
+    pose[500:, 1] += 2.0
+    odometry = Odometry.of(np.arange(700) * 100_000_000, pose)
+    assert doubtful_steps(odometry).tolist() == [200] and jumps(odometry).tolist() == [350, 500]
+    ranges = Readings.from_columns(
+        ('sonar',), x=pose[:, 0], y=0.0, yaw=0.0, z=np.ones(700), z_max=5.0, half_angle=0.1, stamp=odometry.stamp
+    )
+    jumping.with_doubtful(ranges, odometry, jumps(odometry), Parameters(), np.zeros(1, np.uint8))
+    assert judged == [(150, 150)]
+
+
 def test_drive_without_jumps_has_no_jumps(bent: tuple[Readings, Odometry]) -> None:
     _, odometry = bent
     assert not len(jumps(odometry))
