@@ -102,7 +102,7 @@ def test_maps_do_not_depend_on_the_order_of_arguments(days: Path, tmp_path: Path
             np.testing.assert_array_equal(getattr(columns[0], name), getattr(columns[1], name))
 
 
-def test_a_bag_without_static_transforms_uses_those_of_another(days: Path, tmp_path: Path) -> None:
+def test_bag_without_static_transforms_uses_those_of_another(days: Path, tmp_path: Path) -> None:
     without = write_tape(tmp_path / 'without', day(1)._replace(extrinsics=()))
     expected = read(days / 'day_0', days / 'day_1').readings
     for order in ([days / 'day_0', without], [without, days / 'day_0'], [days / 'day_0', without, days / 'day_2.bag']):
@@ -134,7 +134,7 @@ def test_transforms_of_other_bags_that_differ_are_not_used(tmp_path: Path) -> No
     assert frame not in mapped_drive.source['extrinsics'] and len(mapped_drive.source['extrinsics']) == len(moved) - 1
 
 
-def test_transforms_of_a_robot_with_other_frames_are_no_help(days: Path, tmp_path: Path) -> None:
+def test_transforms_of_a_robot_with_other_frames_are_not_used(days: Path, tmp_path: Path) -> None:
     renamed = day(1)
     renamed = renamed._replace(extrinsics=(), ranges=[m._replace(frame_id=f'r2/{m.frame_id}') for m in renamed.ranges])
     without = write_tape(tmp_path / 'without', renamed)

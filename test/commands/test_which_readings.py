@@ -36,7 +36,7 @@ def test_bag_and_one_of_its_files_are_read_as_the_bag(tmp_path: Path) -> None:
         assert sum('it is read once' in warning for warning in drives.source['warnings']) == len(words) - 1
 
 
-def test_a_topic_and_its_filtered_copy_are_named_with_the_option_to_choose(tmp_path: Path) -> None:
+def test_topic_and_its_filtered_copy_are_named_with_an_option(tmp_path: Path) -> None:
     drive = tape()
     filtered = [m._replace(range=m.range + 0.01) if math.isfinite(m.range) else m._replace() for m in drive.ranges]
     copies = {id(message) for message in filtered}

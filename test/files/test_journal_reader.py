@@ -197,7 +197,7 @@ def test_forged_values_are_skipped_or_reported(path: Path, sql: str, message: st
 
 
 @pytest.mark.parametrize('value', ['1' + 400 * '0', '-1' + 400 * '0', '1e999', 'NaN', '"0.5"', '[0.5]', 'null'])
-def test_a_parameter_that_cannot_be_used_does_not_hide_the_others(value: str) -> None:
+def test_invalid_parameter_does_not_hide_the_others(value: str) -> None:
     contents = Contents()
     contents.set_parameters(f'{{"p_hit": {value}, "max_iterations": {value}, "p_rand": 0.25}}'.encode())
     assert contents.parameters == {'p_rand': 0.25}

@@ -121,7 +121,7 @@ def test_maps_far_from_the_origin_are_exact(tmp_path: Path) -> None:
 
 
 def coordinates(folder: Path, monkeypatch: pytest.MonkeyPatch, shift: Any) -> dict[str, Any]:
-    """What a stand-in for Rerun receives of a short drive that is moved by `shift`: x and y, by kind."""
+    """Data that a stand-in for Rerun receives of a short drive, moved by `shift`: x and y, by kind."""
     rr = MagicMock()
     rr.RecordingStream.return_value.binary_stream.return_value.read.return_value = b'recording'
     monkeypatch.setitem(sys.modules, 'rerun', rr)

@@ -43,7 +43,7 @@ def test_calibration_in_words() -> None:
     assert '1.0° to the right of' in calibration_words({'heading': -math.radians(1.0)})
 
 
-def test_the_report_has_the_calibration_with_its_accuracy() -> None:
+def test_report_has_the_calibration_with_its_accuracy() -> None:
     path = Odometry(np.array([0, 10**9]), np.zeros((2, 3)))
     nothing = Readings.from_columns(x=[], y=[], yaw=[], z=[], z_max=[], half_angle=[])
     outcome = Refinement(True, 'readings are predicted better', nothing, path, {'scale': 0.01})

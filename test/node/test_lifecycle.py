@@ -393,7 +393,7 @@ def test_failed_configuration_releases_the_journal(
     assert node.trigger_configure() == TransitionCallbackReturn.SUCCESS
 
 
-def test_a_configuration_that_rcl_refuses_leaves_nothing(
+def test_configuration_rejected_by_rcl_leaves_no_parts(
     inside: Callable[..., Inside], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     node = inside(journal=str(tmp_path / 'journal'), online=True, refine_poses=True).node

@@ -373,7 +373,7 @@ def test_signals_end_the_node_normally(start: Any, number: signal.Signals, times
     assert 'Traceback' not in node.output
 
 
-def test_a_node_under_nohup_survives_its_terminal(start: Any) -> None:
+def test_node_under_nohup_survives_its_terminal(start: Any) -> None:
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:
         node = start()

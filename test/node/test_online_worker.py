@@ -292,7 +292,7 @@ def test_added_readings_are_not_reported_as_missing(node: Node, maps: type[Plain
     assert node.worker.worker.trouble == '' and node.worker.kept == 3
 
 
-def test_a_map_that_cannot_be_shown_is_shown_later_without_further_readings(node: Node, maps: type[PlainMap]) -> None:
+def test_failed_map_is_published_later_without_new_readings(node: Node, maps: type[PlainMap]) -> None:
     node.worker.offer(readings(1))
     node.settle()
     maps.error = MemoryError()

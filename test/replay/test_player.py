@@ -80,7 +80,7 @@ def test_messages_are_counted_and_published_on_renamed_topics() -> None:
     assert made.played == {RANGE: 1, ODOMETRY: 2}
 
 
-def test_transforms_go_out_between_the_messages_around_them() -> None:
+def test_transforms_are_published_between_other_messages() -> None:
     log = Log()
     # that of a broadcaster whose stamps are an hour ahead
     later = START + 3600 * NANOSECONDS

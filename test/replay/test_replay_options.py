@@ -125,7 +125,7 @@ def test_signal_ends_a_wait_at_once_and_a_second_one_has_no_effect(number: signa
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
-def test_a_replay_under_nohup_survives_its_terminal() -> None:
+def test_replay_under_nohup_survives_its_terminal() -> None:
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:
         with StopSignal() as stop:
@@ -206,7 +206,7 @@ def test_moving_transforms_are_replayed_between_the_readings(tmp_path: Path, mon
     ] * 4
 
 
-def test_transforms_are_reliable_and_wait_for_nobody() -> None:
+def test_transforms_are_reliable_and_wait_for_no_subscribers() -> None:
     qos = pytest.importorskip('rclpy.qos', reason='rclpy is not installed')
     made: list[Any] = []
     publishers: Any = publishing.Publishers([], False, StopSignal())
@@ -217,7 +217,7 @@ def test_transforms_are_reliable_and_wait_for_nobody() -> None:
     assert (quality.history, quality.depth) == (qos.HistoryPolicy.KEEP_LAST, 100)
 
 
-def test_without_tf2_a_warning_says_that_moving_transforms_are_missing(
+def test_missing_tf2_gives_a_warning_about_moving_transforms(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def missing(msgtype: str) -> type:

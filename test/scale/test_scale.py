@@ -544,7 +544,7 @@ def test_drives_that_cannot_be_mapped_are_named(drives: Path, tmp_path: Path) ->
 
 
 @scaled
-def test_a_bag_without_static_transforms_uses_those_of_another(drives: Path, tmp_path: Path) -> None:
+def test_bag_without_static_transforms_uses_those_of_another(drives: Path, tmp_path: Path) -> None:
     from forward_grid_mapper.scale.placing import place
 
     drive = dataclasses.replace(campus_drive(3, 1, 900, sonars=front_array()), extrinsics=())

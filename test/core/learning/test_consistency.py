@@ -242,7 +242,7 @@ def test_real_recordings_give_no_warning(shared: Path, name: str, odometry: str)
 
 
 @pytest.mark.slow
-def test_wide_cones_are_named_on_a_recording_whose_odometry_drifts(shared: Path) -> None:
+def test_wide_cones_are_named_on_a_recording_with_drift(shared: Path) -> None:
     from forward_grid_mapper.recordings.read_drive import read_drive
 
     found = read_drive(shared / 'data' / 'building_b' / 'bag', Parameters(), {}, None, '/odom')

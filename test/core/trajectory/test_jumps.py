@@ -126,7 +126,7 @@ def test_doubtful_step_longer_than_the_examined_path_is_no_jump(bent: tuple[Read
     assert found.tolist() == jumped_to.tolist() == []
 
 
-def test_a_doubtful_step_is_judged_by_the_readings_up_to_the_next_jump(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_doubtful_step_is_judged_by_readings_up_to_the_next_jump(monkeypatch: pytest.MonkeyPatch) -> None:
     judged: list[tuple[int, int]] = []
 
     class Check:
