@@ -76,7 +76,7 @@ def names(drives: Drives) -> list[str]:
 
 def test_folder_pattern_and_paths_give_the_same_maps(days: Path, tmp_path: Path) -> None:
     paths = [days / 'day_0', days / 'day_1', days / 'day_2.bag']
-    one = error_of(days, tmp_path / 'a')
+    one = mapped(days, tmp_path / 'a')
     assert [Path(drive['bag']).name for drive in one['drives']] == ['day_0', 'day_1', 'day_2.bag']
     assert one['warnings'] == []
     for folder, words in (('b', [days / 'day_*']), ('c', paths), ('d', [paths[2], days / 'day_[01]'])):
@@ -153,7 +153,7 @@ def test_simultaneous_drives_have_a_defined_order(tmp_path: Path) -> None:
 
 
 def test_map_of_several_drives_is_that_of_all_readings(days: Path, tmp_path: Path) -> None:
-    error_of(days, tmp_path / 'maps')
+    mapped(days, tmp_path / 'maps')
     parts = [read(path).readings for path in sorted(days.iterdir())]
     whole = Readings.from_columns(
         parts[0].sensor_names,
@@ -192,7 +192,7 @@ def test_max_readings_is_the_sum_over_all_drives(days: Path, tmp_path: Path, bou
     assert report['result']['readings'] == bound < report['counts']['accepted']
     (note,) = report['warnings']
     assert note.startswith(f'EM used {bound} of {report["counts"]["accepted"]} readings')
-    whole = error_of(days, tmp_path / 'whole')
+    whole = mapped(days, tmp_path / 'whole')
     assert report['counts'] == whole['counts']
     np.testing.assert_array_equal(arrays_in(tmp_path / 'maps')['live_map'], arrays_in(tmp_path / 'whole')['live_map'])
 
@@ -206,7 +206,7 @@ def mapped_thinned(days: Path, folder: Path, bound: int) -> dict[str, Any]:
 
 
 def test_report_has_counts_of_each_drive(days: Path, tmp_path: Path) -> None:
-    report = error_of(days, tmp_path / 'maps')
+    report = mapped(days, tmp_path / 'maps')
     assert report['counts']['received'] == sum(drive['counts']['received'] for drive in report['drives'])
     for drive in report['drives']:
         sensors = drive['sensors']
@@ -223,7 +223,7 @@ def test_report_has_counts_of_each_drive(days: Path, tmp_path: Path) -> None:
 def test_picture_has_a_path_for_each_drive(days: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pictures = []
     monkeypatch.setattr(drawing, 'draw', lambda path, picture: (pictures.append(picture), path.write_bytes(b'')))
-    error_of(days, tmp_path / 'maps')
+    mapped(days, tmp_path / 'maps')
     paths = paths_of(pictures[0].path_xy)
     assert len(paths) == 3
     for path, bag in zip(paths, sorted(days.iterdir()), strict=True):
@@ -232,7 +232,7 @@ def test_picture_has_a_path_for_each_drive(days: Path, tmp_path: Path, monkeypat
 
 
 def test_bag_of_the_maps_of_several_drives(days: Path, tmp_path: Path) -> None:
-    error_of(days, tmp_path / 'maps', '--bag')
+    mapped(days, tmp_path / 'maps', '--bag')
     assert (tmp_path / 'maps' / 'maps.mcap_bag').is_dir()
 
 
@@ -308,7 +308,7 @@ def test_drives_in_different_map_frames_are_rejected(
     days: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     other = write_tape(tmp_path / 'other', framed(2, 'warehouse'))
-    error = mapped(capsys, tmp_path, days / 'day_0', days / 'day_1', other, '-o', tmp_path / 'maps')
+    error = error_of(capsys, tmp_path, days / 'day_0', days / 'day_1', other, '-o', tmp_path / 'maps')
     assert 'not in the same map frame' in error and f'warehouse: {other}' in error and f'leave out {other}' in error
 
 
@@ -387,7 +387,7 @@ def test_all_drives_that_cannot_be_mapped_are_named(
 ) -> None:
     absent = tmp_path / 'absent'
     silent = write_tape(tmp_path / 'silent', day(2)._replace(ranges=[]))
-    error = mapped(capsys, tmp_path, days / 'day_0', absent, silent, '-o', tmp_path / 'maps')
+    error = error_of(capsys, tmp_path, days / 'day_0', absent, silent, '-o', tmp_path / 'maps')
     assert error.startswith('2 of 3 drives cannot be mapped; leave them out')
     assert f'{absent} does not exist' in error and f'{silent}: The bag has no sensor_msgs/Range' in error
 
@@ -403,7 +403,7 @@ def test_error_lines_of_one_drive_are_indented() -> None:
 
 
 def test_pattern_without_match_is_rejected(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    error = mapped(capsys, tmp_path, f'{tmp_path}/monday_*', '-o', tmp_path / 'maps')
+    error = error_of(capsys, tmp_path, f'{tmp_path}/monday_*', '-o', tmp_path / 'maps')
     assert f'no file or folder matches {tmp_path}/monday_*' in error
 
 
@@ -414,7 +414,7 @@ def test_files_of_a_split_bag_without_metadata_are_rejected(
     folder.mkdir()
     for number in range(2):
         shutil.copy(next((days / 'day_0').glob('*.mcap')), folder / f'split_{number}.mcap')
-    error = mapped(capsys, tmp_path, folder, '-o', tmp_path / 'maps')
+    error = error_of(capsys, tmp_path, folder, '-o', tmp_path / 'maps')
     assert 'ros2 bag reindex' in error
 
 
@@ -446,17 +446,17 @@ def test_parts_of_a_drive_add_up_to_the_whole(days: Path) -> None:
 
 
 def test_part_is_taken_of_each_drive(days: Path, tmp_path: Path) -> None:
-    report = error_of(days, tmp_path / 'maps', '--start', 2, '--duration', 3)
+    report = mapped(days, tmp_path / 'maps', '--start', 2, '--duration', 3)
     for drive in report['drives']:
         assert 2.0 < drive['duration_s'] <= 3.0
-    one = error_of(days / 'day_1', tmp_path / 'one', '--start', 2, '--duration', 3)
+    one = mapped(days / 'day_1', tmp_path / 'one', '--start', 2, '--duration', 3)
     assert one['counts']['accepted'] == report['drives'][1]['counts']['accepted'] < len(day(1).ranges)
 
 
 def test_part_after_the_end_of_the_drive_is_rejected(
     days: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    error = mapped(capsys, tmp_path, days / 'day_0', '-o', tmp_path / 'maps', '--start', 900)
+    error = error_of(capsys, tmp_path, days / 'day_0', '-o', tmp_path / 'maps', '--start', 900)
     assert 'has no reading in the part --start 900; its messages span' in error
 
 
